@@ -1,0 +1,3 @@
+"""boxplus: state estimation on manifolds for SLAM."""
+
+__version__ = "0.1.0"

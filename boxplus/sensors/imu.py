@@ -1,0 +1,59 @@
+"""What an IMU delivers: time-stamped angular velocity and specific force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """A block of IMU samples in SI units, IMU frame, in order of arrival.
+
+    Attributes:
+        time_ns: (N,) int64, absolute time in nanoseconds.
+        gyro: (N, 3) float64, angular velocity [rad/s].
+        accel: (N, 3) float64, specific force [m/s²]; +9.81 upwards at rest (SPEC.md section 0).
+    """
+
+    time_ns: NDArray[np.int64]
+    gyro: NDArray[np.float64]
+    accel: NDArray[np.float64]
+
+    @classmethod
+    def from_arrays(cls, time_ns: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> ImuSamples:
+        """Check shapes and types. Values (NaN, order of time) are the sequencer's business: it counts what it rejects.
+
+        Args:
+            time_ns: (N,) integers, absolute nanoseconds; a single sample may be given as a scalar.
+            gyro: (N, 3) or (3,), rad/s.
+            accel: (N, 3) or (3,), m/s².
+
+        Raises:
+            InputError: wrong shape, or times that are not integers.
+        """
+        time = np.atleast_1d(np.asarray(time_ns))
+        if time.ndim != 1 or time.dtype.kind not in "iu":
+            raise InputError(
+                "time_ns as integer nanoseconds of shape (N,)",
+                f"{time.dtype} of shape {time.shape}",
+                "convert seconds with np.round(seconds * 1e9).astype(np.int64)",
+            )
+        vectors = []
+        for name, values in (("gyro", gyro), ("accel", accel)):
+            array = np.atleast_2d(np.asarray(values, dtype=np.float64))
+            if array.shape != (time.size, 3):
+                raise InputError(
+                    f"{name} of shape ({time.size}, 3), one row per time stamp",
+                    f"shape {np.shape(values)}",
+                    "give one row (x, y, z) for every entry of time_ns",
+                )
+            vectors.append(np.ascontiguousarray(array))
+        return cls(time.astype(np.int64), vectors[0], vectors[1])
+
+    def __len__(self) -> int:
+        return int(self.time_ns.size)

@@ -1,0 +1,99 @@
+"""What a LiDAR delivers: points with a time each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One sweep of a LiDAR: only valid points, with everything that belongs to a point kept in step.
+
+    Attributes:
+        p_lidar: (N, 3) float32, LiDAR frame [m].
+        time_ns: (N,) int64, absolute time of each point [ns].
+        intensity: (N,) float32 or None, in the sensor's own unit.
+        start_ns, end_ns: first and last instant of the sweep (of its points, rejected ones included).
+        rejected: how many points were dropped on construction, by reason.
+    """
+
+    p_lidar: NDArray[np.float32]
+    time_ns: NDArray[np.int64]
+    intensity: NDArray[np.float32] | None
+    start_ns: int
+    end_ns: int
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        p_lidar: ArrayLike,
+        time_ns: ArrayLike,
+        intensity: ArrayLike | None = None,
+        *,
+        min_range: float = 0.0,
+        max_range: float = np.inf,
+    ) -> Scan:
+        """Build a scan from arrays and drop, together with their times and intensities, the points that are not returns.
+
+        Args:
+            p_lidar: (N, 3), LiDAR frame, metres.
+            time_ns: (N,) integers, absolute nanoseconds, in any order.
+            intensity: (N,) or None.
+            min_range: points nearer than this are dropped (the robot itself) [m].
+            max_range: points farther than this are dropped [m].
+
+        Raises:
+            InputError: wrong shape, counts that do not match, or times that are not integers.
+        """
+        points = np.asarray(p_lidar)
+        if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+            raise InputError(
+                "p_lidar as numbers of shape (N, 3)", f"{points.dtype} of shape {points.shape}", "give one row x, y, z per point"
+            )
+        time = np.asarray(time_ns)
+        if time.dtype.kind not in "iu" or time.shape != (len(points),):
+            raise InputError(
+                f"time_ns as integer nanoseconds of shape ({len(points)},), one per point",
+                f"{time.dtype} of shape {time.shape}",
+                "give every point its own absolute time; points without times cannot be corrected for motion",
+            )
+        time = time.astype(np.int64, copy=False)
+        strength = None
+        if intensity is not None:
+            strength = np.asarray(intensity, dtype=np.float32)
+            if strength.shape != (len(points),):
+                raise InputError(
+                    f"intensity of shape ({len(points)},), one per point", f"shape {strength.shape}", "give one value per point or None"
+                )
+        xyz = points.astype(np.float32, copy=False)
+        squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
+        not_finite = ~np.isfinite(squared)
+        zero = squared == 0.0
+        near = (squared < min_range**2) & ~zero
+        far = (squared > max_range**2) & ~not_finite
+        keep = ~(not_finite | zero | near | far)
+        rejected = {
+            reason: count
+            for reason, count in (
+                ("not finite", int(not_finite.sum())),
+                ("zero (no return)", int(zero.sum())),
+                ("nearer than min_range", int(near.sum())),
+                ("farther than max_range", int(far.sum())),
+            )
+            if count
+        }
+        start, end = (int(time.min()), int(time.max())) if len(time) else (0, 0)
+        if rejected:
+            xyz, time = xyz[keep], time[keep]
+            strength = None if strength is None else strength[keep]
+        return cls(np.ascontiguousarray(xyz), np.ascontiguousarray(time), strength, start, end, rejected)
+
+    def __len__(self) -> int:
+        return int(self.time_ns.size)
