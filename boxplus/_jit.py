@@ -8,6 +8,7 @@ impossible, and editing one file recompiles only what depends on it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -16,9 +17,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numba
 from numba.core import config as numba_config
@@ -55,7 +55,7 @@ def _module_file(dotted_name: str) -> Path | None:
 @functools.cache
 def _imported_files(file: Path) -> frozenset[Path]:
     """The boxplus files that `file` imports directly."""
-    found = set()
+    found: set[Path] = set()
     for package, names, module in _IMPORT.findall(file.read_text(encoding="utf-8")):
         candidates = [module] if module else [package]
         candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
@@ -106,14 +106,14 @@ class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _KeyedLocator | None:
         locator = cls(py_func, py_file)
         try:
-            locator.ensure_cache_path()
+            locator.ensure_cache_path()  # type: ignore[no-untyped-call]
         except OSError:
             return None
         return locator
 
 
 class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = [_KeyedLocator]
+    _locator_classes: ClassVar = [_KeyedLocator]
 
 
 class _KeyedCache(FunctionCache):  # type: ignore[misc]
@@ -133,15 +133,14 @@ def kernel(function: _Function | None = None, *, fastmath: bool = False, inline:
     if inline:
         options["forceinline"] = True
     dispatcher = numba.njit(**options)(function)
-    if not numba_config.DISABLE_JIT:
-        try:
-            dispatcher._cache = _KeyedCache(dispatcher.py_func)
-        except RuntimeError:
-            pass  # no writable cache folder: the kernel still works, it compiles again in the next process
+    if not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
+        # Without a writable cache folder the kernel still works; it compiles again in the next process.
+        with contextlib.suppress(RuntimeError):
+            dispatcher._cache = _KeyedCache(dispatcher.py_func)  # type: ignore[no-untyped-call]
     return dispatcher
 
 
-@contextmanager
+@contextlib.contextmanager
 def on_compilation(callback: Callable[[str], None]) -> Iterator[None]:
     """While the block runs, call `callback(kernel_name)` whenever a kernel has to be compiled (not when it is cached)."""
 

@@ -70,7 +70,9 @@ class Scan:
             strength = np.asarray(intensity, dtype=np.float32)
             if strength.shape != (len(points),):
                 raise InputError(
-                    f"intensity of shape ({len(points)},), one per point", f"shape {strength.shape}", "give one value per point or None"
+                    f"intensity of shape ({len(points)},), one per point",
+                    f"shape {strength.shape}",
+                    "give one value per point or None",
                 )
         xyz = points.astype(np.float32, copy=False)
         squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)

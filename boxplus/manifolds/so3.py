@@ -1,0 +1,213 @@
+"""Rotations SO(3): Exp, Log and their Jacobians (SPEC.md 1.1, 1.2, 1.4).
+
+Kernels take scalars or write into arrays of their caller; the functions without underscore are batch-first NumPy fronts.
+A rotation vector `w` is axis times angle [rad].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._jit import kernel
+from boxplus.manifolds._batch import as_batch, map_batch
+
+SERIES_SWITCH = 1.0  # angle [rad] below which A, B, C come from their series (SPEC.md 1.1)
+D_SERIES_SWITCH = 0.5
+
+
+@kernel(inline=True)
+def exp_coefficients(angle_sq: float) -> tuple[float, float, float]:
+    """A = sin θ/θ, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ from θ² (SPEC.md 1.1)."""
+    if angle_sq < SERIES_SWITCH:
+        t = angle_sq
+        a = 1.0 - t / 6.0 * (
+            1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0 * (1.0 - t / 156.0 * (1.0 - t / 210.0)))))
+        )
+        b = 0.5 * (
+            1.0
+            - t
+            / 12.0
+            * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0 * (1.0 - t / 132.0 * (1.0 - t / 182.0 * (1.0 - t / 240.0))))))
+        )
+        c = (
+            1.0
+            - t
+            / 20.0
+            * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0 * (1.0 - t / 156.0 * (1.0 - t / 210.0 * (1.0 - t / 272.0))))))
+        ) / 6.0
+        return a, b, c
+    angle = math.sqrt(angle_sq)
+    half_sin = math.sin(0.5 * angle)
+    return math.sin(angle) / angle, 2.0 * half_sin * half_sin / angle_sq, (angle - math.sin(angle)) / (angle * angle_sq)
+
+
+@kernel(inline=True)
+def inverse_jacobian_coefficient(angle_sq: float) -> float:
+    """D = (1 − θ/2 cot(θ/2))/θ² from θ² (SPEC.md 1.1); regular at π."""
+    if angle_sq < D_SERIES_SWITCH * D_SERIES_SWITCH:
+        t = angle_sq
+        return 1.0 / 12.0 + t * (
+            1.0 / 720.0 + t * (1.0 / 30240.0 + t * (1.0 / 1209600.0 + t * (1.0 / 47900160.0 + t * 691.0 / 1307674368000.0)))
+        )
+    half = 0.5 * math.sqrt(angle_sq)
+    return (1.0 - half * math.cos(half) / math.sin(half)) / angle_sq
+
+
+@kernel(inline=True)
+def _quadratic(wx: float, wy: float, wz: float, a: float, b: float, out: NDArray[np.float64]) -> None:
+    """out = I + a [w]x + b [w]x²."""
+    out[0, 0] = 1.0 - b * (wy * wy + wz * wz)
+    out[1, 1] = 1.0 - b * (wx * wx + wz * wz)
+    out[2, 2] = 1.0 - b * (wx * wx + wy * wy)
+    out[0, 1] = b * wx * wy - a * wz
+    out[1, 0] = b * wx * wy + a * wz
+    out[0, 2] = b * wx * wz + a * wy
+    out[2, 0] = b * wx * wz - a * wy
+    out[1, 2] = b * wy * wz - a * wx
+    out[2, 1] = b * wy * wz + a * wx
+
+
+@kernel(inline=True)
+def exp_into(wx: float, wy: float, wz: float, R: NDArray[np.float64]) -> None:
+    """R = Exp(w), (3, 3)."""
+    a, b, _ = exp_coefficients(wx * wx + wy * wy + wz * wz)
+    _quadratic(wx, wy, wz, a, b, R)
+
+
+@kernel(inline=True)
+def right_jacobian_into(wx: float, wy: float, wz: float, J: NDArray[np.float64]) -> None:
+    """J = J_r(w), (3, 3): Exp(w + d) = Exp(w) Exp(J_r(w) d). J_l(w) is J_r(−w)."""
+    _, b, c = exp_coefficients(wx * wx + wy * wy + wz * wz)
+    _quadratic(wx, wy, wz, -b, c, J)
+
+
+@kernel(inline=True)
+def right_jacobian_inverse_into(wx: float, wy: float, wz: float, J: NDArray[np.float64]) -> None:
+    """J = J_r(w)⁻¹, (3, 3). J_l(w)⁻¹ is J_r(−w)⁻¹."""
+    _quadratic(wx, wy, wz, 0.5, inverse_jacobian_coefficient(wx * wx + wy * wy + wz * wz), J)
+
+
+@kernel
+def quaternion_into(R: NDArray[np.float64], q_wxyz: NDArray[np.float64]) -> None:
+    """Unit quaternion of R with w ≥ 0, by the largest element (Shepperd; SPEC.md 1.2)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
+        q_wxyz[0] = 1.0 + trace
+        q_wxyz[1] = R[2, 1] - R[1, 2]
+        q_wxyz[2] = R[0, 2] - R[2, 0]
+        q_wxyz[3] = R[1, 0] - R[0, 1]
+    elif R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2]:
+        q_wxyz[0] = R[2, 1] - R[1, 2]
+        q_wxyz[1] = 1.0 + R[0, 0] - R[1, 1] - R[2, 2]
+        q_wxyz[2] = R[0, 1] + R[1, 0]
+        q_wxyz[3] = R[0, 2] + R[2, 0]
+    elif R[1, 1] >= R[2, 2]:
+        q_wxyz[0] = R[0, 2] - R[2, 0]
+        q_wxyz[1] = R[0, 1] + R[1, 0]
+        q_wxyz[2] = 1.0 + R[1, 1] - R[0, 0] - R[2, 2]
+        q_wxyz[3] = R[1, 2] + R[2, 1]
+    else:
+        q_wxyz[0] = R[1, 0] - R[0, 1]
+        q_wxyz[1] = R[0, 2] + R[2, 0]
+        q_wxyz[2] = R[1, 2] + R[2, 1]
+        q_wxyz[3] = 1.0 + R[2, 2] - R[0, 0] - R[1, 1]
+    scale = 1.0 / math.sqrt(q_wxyz[0] ** 2 + q_wxyz[1] ** 2 + q_wxyz[2] ** 2 + q_wxyz[3] ** 2)
+    if q_wxyz[0] < 0.0:
+        scale = -scale
+    for i in range(4):
+        q_wxyz[i] *= scale
+
+
+@kernel
+def log_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Rotation vector of the unit quaternion (w, x, y, z), angle in [0, π] (SPEC.md 1.2)."""
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    norm_sq = x * x + y * y + z * z
+    if norm_sq < 1e-12:
+        factor = 2.0 / w * (1.0 - norm_sq / (3.0 * w * w))
+    else:
+        norm = math.sqrt(norm_sq)
+        factor = 2.0 * math.atan2(norm, w) / norm
+    return factor * x, factor * y, factor * z
+
+
+@kernel
+def log_into(R: NDArray[np.float64], w: NDArray[np.float64]) -> None:
+    """w = Log(R), (3,)."""
+    q = np.empty(4)
+    quaternion_into(R, q)
+    w[0], w[1], w[2] = log_quaternion(q[0], q[1], q[2], q[3])
+
+
+@kernel
+def _exp_batch(w: NDArray[np.float64], R: NDArray[np.float64]) -> None:
+    for i in range(w.shape[0]):
+        exp_into(w[i, 0], w[i, 1], w[i, 2], R[i])
+
+
+@kernel
+def _log_batch(R: NDArray[np.float64], w: NDArray[np.float64]) -> None:
+    for i in range(R.shape[0]):
+        log_into(R[i], w[i])
+
+
+@kernel
+def _right_jacobian_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    for i in range(w.shape[0]):
+        right_jacobian_into(w[i, 0], w[i, 1], w[i, 2], J[i])
+
+
+@kernel
+def _right_jacobian_inverse_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    for i in range(w.shape[0]):
+        right_jacobian_inverse_into(w[i, 0], w[i, 1], w[i, 2], J[i])
+
+
+def exp(w: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    return map_batch(_exp_batch, "w", w, (3,), (3, 3))
+
+
+def log(R: ArrayLike) -> NDArray[np.float64]:
+    """Rotation vectors (..., 3) [rad], angle in [0, π], of rotation matrices (..., 3, 3)."""
+    return map_batch(_log_batch, "R", R, (3, 3), (3,))
+
+
+def right_jacobian(w: ArrayLike) -> NDArray[np.float64]:
+    """J_r (..., 3, 3) at w (..., 3): Exp(w + d) ≈ Exp(w) Exp(J_r(w) d). J_l(w) = right_jacobian(−w)."""
+    return map_batch(_right_jacobian_batch, "w", w, (3,), (3, 3))
+
+
+def right_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
+    """J_r⁻¹ (..., 3, 3) at w (..., 3): Log(Exp(w) Exp(d)) ≈ w + J_r⁻¹(w) d."""
+    return map_batch(_right_jacobian_inverse_batch, "w", w, (3,), (3, 3))
+
+
+def hat(w: ArrayLike) -> NDArray[np.float64]:
+    """Cross-product matrices [w]x (..., 3, 3) of vectors (..., 3)."""
+    vectors, lead = as_batch("w", w, (3,))
+    matrices = np.zeros((len(vectors), 3, 3))
+    for row, column, component, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (2, 1, 0, 1)):
+        matrices[:, row, column] = sign * vectors[:, component]
+    return matrices.reshape((*lead, 3, 3))
+
+
+def boxplus(R: ArrayLike, w: ArrayLike) -> NDArray[np.float64]:
+    """R ⊞ w = R Exp(w): right (local) update."""
+    return np.asarray(np.asarray(R, dtype=np.float64) @ exp(w))
+
+
+def boxminus(R: ArrayLike, R_base: ArrayLike) -> NDArray[np.float64]:
+    """R ⊟ R_base = Log(R_baseᵀ R): the w with R_base ⊞ w = R."""
+    return log(np.swapaxes(np.asarray(R_base, dtype=np.float64), -1, -2) @ np.asarray(R, dtype=np.float64))
+
+
+def is_rotation(R: ArrayLike, tolerance: float = 1e-6) -> bool:
+    """Whether every (3, 3) matrix is orthonormal with determinant +1 within `tolerance` per entry."""
+    matrices, _ = as_batch("R", R, (3, 3))
+    orthonormal = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(initial=0.0) <= tolerance
+    return bool(np.isfinite(matrices).all() and orthonormal and (np.linalg.det(matrices) > 0).all())
