@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numba
 from numba.core import config as numba_config
@@ -113,7 +113,7 @@ class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
 
 
 class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes: ClassVar = [_KeyedLocator]
+    _locator_classes = [_KeyedLocator]  # noqa: RUF012
 
 
 class _KeyedCache(FunctionCache):  # type: ignore[misc]

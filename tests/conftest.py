@@ -3,6 +3,11 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The first call of a kernel compiles it, so a single example may take seconds; the same examples run every time.
+settings.register_profile("boxplus", deadline=None, derandomize=True)
+settings.load_profile("boxplus")
 
 SHARED_DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 

@@ -50,4 +50,5 @@ def multiply(p_wxyz: ArrayLike, q_wxyz: ArrayLike) -> NDArray[np.float64]:
 
 def conjugate(q_wxyz: ArrayLike) -> NDArray[np.float64]:
     """Conjugate (..., 4): the inverse of a unit quaternion."""
-    return np.asarray(q_wxyz, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    conjugated: NDArray[np.float64] = np.asarray(q_wxyz, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    return conjugated

@@ -49,9 +49,8 @@ def inverse_jacobian_coefficient(angle_sq: float) -> float:
     """D = (1 − θ/2 cot(θ/2))/θ² from θ² (SPEC.md 1.1); regular at π."""
     if angle_sq < D_SERIES_SWITCH * D_SERIES_SWITCH:
         t = angle_sq
-        return 1.0 / 12.0 + t * (
-            1.0 / 720.0 + t * (1.0 / 30240.0 + t * (1.0 / 1209600.0 + t * (1.0 / 47900160.0 + t * 691.0 / 1307674368000.0)))
-        )
+        high = 1.0 / 1209600.0 + t * (1.0 / 47900160.0 + t * 691.0 / 1307674368000.0)
+        return 1.0 / 12.0 + t * (1.0 / 720.0 + t * (1.0 / 30240.0 + t * high))
     half = 0.5 * math.sqrt(angle_sq)
     return (1.0 - half * math.cos(half) / math.sin(half)) / angle_sq
 
