@@ -1,0 +1,94 @@
+"""What is known about a recording, and on which evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.recordings.options import AccelUnit, GyroUnit, TimeReference, TimeUnit
+
+Verdict = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One finding: what was looked at, what came out, and whether it is fine.
+
+    Attributes:
+        key: what the finding is about, stable (`point_time_unit`).
+        value: the result, short (`ns`).
+        verdict: `ok`, `warning` (works, look at it) or `error` (the result cannot be trusted).
+        text: one sentence with the numbers, and what to do if it is not fine.
+    """
+
+    key: str
+    value: str
+    verdict: Verdict
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One stream of messages of a recording."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class PointTimeReading:
+    """How the point times of a recording are read.
+
+    Attributes:
+        field: name of the field, or None when every point is taken at the stamp of its message.
+        unit: unit of its values.
+        reference: instant from which they count.
+        anchor: what is added to the values: `stamp` (times relative to the message's stamp), `first` or `last` (the first
+            or last point of each scan is moved onto the stamp), `clock` (the values are absolute).
+    """
+
+    field: str | None
+    unit: TimeUnit
+    reference: TimeReference
+    anchor: Literal["stamp", "first", "last", "clock"]
+
+
+@dataclass(slots=True)
+class RecordingInfo:
+    """What a recording contains and how it is read.
+
+    Attributes:
+        path: the file or folder.
+        format: `ROS 1 bag`, `ROS 2 bag (mcap)`, `KITTI raw folder` …
+        topics: all streams found.
+        duration_s: time between the first and the last message [s].
+        message_count: messages that will be read (LiDAR and IMU).
+        lidar_topic, imu_topic: the streams in use.
+        lidar_frame, imu_frame: the names of their frames, empty when the format has none.
+        point_time: how point times are read.
+        gyro_unit, accel_unit: units in the recording (samples are delivered in SI units).
+        T_imu_lidar: (4, 4) float64, LiDAR coordinates to IMU coordinates, or None when the recording does not say.
+        T_imu_lidar_source: where it comes from; empty when unknown.
+        evidence: every decision with its reasons; grows while a damaged file is read.
+    """
+
+    path: Path
+    format: str
+    topics: list[Topic]
+    duration_s: float
+    message_count: int
+    lidar_topic: str
+    imu_topic: str
+    lidar_frame: str
+    imu_frame: str
+    point_time: PointTimeReading
+    gyro_unit: GyroUnit
+    accel_unit: AccelUnit
+    T_imu_lidar: NDArray[np.float64] | None = None
+    T_imu_lidar_source: str = ""
+    evidence: list[Evidence] = field(default_factory=list)

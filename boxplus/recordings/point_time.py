@@ -1,0 +1,242 @@
+"""Finding out in which unit, and from which instant, the times of the points count; and turning them into nanoseconds.
+
+A scan takes about one scan period. The four units lie a factor of 1000 apart, so the span of a scan's times names the
+unit; where the values lie relative to the message's stamp names the reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import AmbiguityError, RecordingError
+from boxplus.recordings.info import Evidence, PointTimeReading
+from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions, TimeReference, TimeUnit
+
+UNIT_NS: dict[TimeUnit, int] = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+_SHORTEST_SPAN, _LONGEST_SPAN = 0.05, 1.5
+"""A scan's times span this fraction of the scan period: a sector of a turn up to a scan that overlaps the next one."""
+_LIKELY_PERIODS_S = (0.02, 0.5)
+_FARTHEST_FROM_STAMP_NS = 10_000_000_000
+_SAME_CLOCK_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class CloudTimes:
+    """What detection needs of one cloud: its stamp, when it was received, and the extent of its time values (raw unit)."""
+
+    stamp_ns: int
+    received_ns: int
+    low: float | int
+    high: float | int
+
+
+def times_of_cloud(stamp_ns: int, received_ns: int, values: NDArray[np.generic]) -> CloudTimes | None:
+    """The extent of the time values (N,) of one cloud, or None when no value is finite."""
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    if not len(finite):
+        return None
+    return CloudTimes(stamp_ns, received_ns, finite.min().item(), finite.max().item())
+
+
+def choose_time_field(fields: tuple[str, ...], candidates: tuple[str, ...], options: RecordingOptions) -> str | None:
+    """The field that holds the point times; None when the options say to do without.
+
+    Raises:
+        RecordingError: no such field.
+        AmbiguityError: several.
+    """
+    listed = ", ".join(fields) or "none"
+    if options.point_time_field == NO_POINT_TIME:
+        return None
+    if options.point_time_field is not None:
+        if options.point_time_field not in fields:
+            raise RecordingError(
+                f"the point time field {options.point_time_field!r}",
+                f"a cloud with the fields {listed}",
+                "give --point-time-field one of these",
+            )
+        return options.point_time_field
+    if not candidates:
+        raise RecordingError(
+            "a time for every point (a field such as t, time, timestamp or offset_time), to correct the scan for motion",
+            f"a cloud with the fields {listed}",
+            "switch point times on in the LiDAR driver; if one of these fields is the time give --point-time-field NAME; "
+            "--point-time-field none treats each scan as taken in one instant",
+        )
+    if len(candidates) > 1:
+        raise AmbiguityError(
+            "one field with the time of each point",
+            f"several that may be it: {', '.join(candidates)}",
+            "choose one with --point-time-field NAME",
+        )
+    return candidates[0]
+
+
+def scan_period_s(clouds: list[CloudTimes]) -> float | None:
+    """Median time between the stamps of consecutive clouds [s], None when fewer than three clouds or no progress."""
+    steps = np.diff(np.array([cloud.stamp_ns for cloud in clouds], dtype=np.int64))
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * 1e-9 if len(steps) >= 2 else None
+
+
+def read_point_time(
+    field: str, clouds: list[CloudTimes], imu_delay_ns: float | None, options: RecordingOptions
+) -> tuple[PointTimeReading, list[Evidence]]:
+    """Unit and reference of the point times, with the evidence.
+
+    Args:
+        field: name of the time field, for the messages.
+        clouds: the first clouds of the recording.
+        imu_delay_ns: median time between the stamp of an IMU message and its reception, or None when it is not known:
+            the yardstick that tells a delay of the LiDAR's messages from an offset of the clocks.
+        options: what the user decided.
+
+    Raises:
+        RecordingError: the values are constant, or fit no unit.
+        AmbiguityError: two references fit.
+    """
+    if not clouds:
+        raise RecordingError(
+            f"finite times in the field {field!r}", "none in the first scans", "choose another --point-time-field"
+        )
+    period = scan_period_s(clouds)
+    unit, unit_evidence = _read_unit(field, clouds, period, options)
+    reference, anchor, text = _read_reference(field, clouds, unit, period, imu_delay_ns, options)
+    evidence = Evidence("point_time_reference", reference, "ok", text)
+    return PointTimeReading(field, unit, reference, anchor), [unit_evidence, evidence]
+
+
+def _read_unit(
+    field: str, clouds: list[CloudTimes], period: float | None, options: RecordingOptions
+) -> tuple[TimeUnit, Evidence]:
+    span = float(np.median([cloud.high - cloud.low for cloud in clouds]))
+    if period is not None:
+        least, most = _SHORTEST_SPAN * period, _LONGEST_SPAN * period
+        expected = f"scans come every {period:.4g} s"
+    else:
+        least, most = _LIKELY_PERIODS_S
+        expected = "the scan rate is unknown, 2 to 50 Hz assumed"
+    fitting = [unit for unit, scale in UNIT_NS.items() if least <= span * scale * 1e-9 <= most]
+    if options.point_time_unit is not None:
+        unit = options.point_time_unit
+        seconds = span * UNIT_NS[unit] * 1e-9
+        verdict: Literal["ok", "warning"] = "ok" if unit in fitting else "warning"
+        doubt = "" if verdict == "ok" else "; this does not look like the duration of a scan: check --point-time-unit"
+        return unit, Evidence(
+            "point_time_unit", unit, verdict, f"given; field {field} then spans {seconds:.4g} s a scan, {expected}{doubt}"
+        )
+    if span == 0:
+        raise RecordingError(
+            f"times in the field {field!r} that differ from point to point",
+            f"the same value {clouds[0].low:g} for all points of a scan",
+            "switch point times on in the LiDAR driver, choose another --point-time-field, or accept distorted scans with "
+            "--point-time-field none",
+        )
+    if not fitting:
+        raise RecordingError(
+            f"times in the field {field!r} that span about one scan in s, ms, us or ns ({expected})",
+            f"a span of {span:g} a scan, which is no scan in any of these units",
+            "check the field with --point-time-field, or decide with --point-time-unit",
+        )
+    unit = fitting[0]
+    seconds = span * UNIT_NS[unit] * 1e-9
+    return unit, Evidence(
+        "point_time_unit", unit, "ok", f"field {field} spans {span:g} {unit} = {seconds:.4g} s a scan, {expected}"
+    )
+
+
+_Anchor = Literal["stamp", "first", "last", "clock"]
+
+
+def _read_reference(
+    field: str,
+    clouds: list[CloudTimes],
+    unit: TimeUnit,
+    period: float | None,
+    imu_delay_ns: float | None,
+    options: RecordingOptions,
+) -> tuple[TimeReference, _Anchor, str]:
+    scale = UNIT_NS[unit]
+    first = float(np.median([cloud.low * scale for cloud in clouds]))
+    last = float(np.median([cloud.high * scale for cloud in clouds]))
+    span = last - first
+    near = 2.0 * max(period or 0.0, span * 1e-9) * 1e9
+    relative = max(abs(first), abs(last)) <= near
+    seconds = f"from {first * 1e-9:.4g} to {last * 1e-9:.4g} s"
+    given = options.point_time_reference
+    if given == "absolute":
+        return given, "clock", f"given; the values run {seconds}"
+    if given == "scan_start":
+        signed = relative and first >= -0.1 * span
+        return given, "stamp" if signed else "first", f"given; the values run {seconds}"
+    if given == "scan_end":
+        signed = relative and abs(last) <= 0.1 * span
+        return given, "stamp" if signed else "last", f"given; the values run {seconds}"
+    if not relative:
+        offset_ns = float(np.median([cloud.low * scale - cloud.stamp_ns for cloud in clouds]))
+        if abs(offset_ns) > _SAME_CLOCK_NS:
+            raise AmbiguityError(
+                "absolute point times in the clock of the message stamps",
+                f"times in {field!r} that lie {offset_ns * 1e-9:.6g} s from the stamps: another clock",
+                "--point-time-reference scan_start puts the first point of each scan on its stamp, scan_end the last",
+            )
+        return (
+            "absolute",
+            "clock",
+            f"the values are absolute times; the first point lies {offset_ns * 1e-9:+.4f} s from the stamp",
+        )
+    if first < -0.1 * span:
+        where = "the stamp is the end of the scan" if last <= 0.1 * span else "the stamp lies within the scan"
+        return ("scan_end" if abs(last) < abs(first) else "scan_start"), "stamp", f"the values run {seconds}: {where}"
+    return "scan_start", "stamp", _confirm_scan_start(clouds, seconds, last, imu_delay_ns)
+
+
+def _confirm_scan_start(clouds: list[CloudTimes], seconds: str, last_ns: float, imu_delay_ns: float | None) -> str:
+    """Check positive times against reception: no message arrives before its last point was measured."""
+    delay = float(np.median([cloud.received_ns - cloud.stamp_ns for cloud in clouds]))
+    if abs(delay) < 1e-3 * last_ns:
+        return f"the values run {seconds}, from the stamp; messages were recorded with their stamps, which confirms nothing"
+    relative_delay = delay - (imu_delay_ns or 0.0)
+    if relative_delay >= 0.9 * last_ns:
+        arrived = f"the messages arrived {relative_delay * 1e-9:.3f} s after their stamps, when the scan was over"
+        return f"the values run {seconds}, and {arrived}"
+    raise AmbiguityError(
+        f"scans received after their last point, {last_ns * 1e-9:.3f} s after the stamp if times count from it",
+        f"messages received {relative_delay * 1e-9:.3f} s after their stamps: these may be the end of the scan",
+        "decide with --point-time-reference scan_start (the usual case) or scan_end; 'boxplus inspect' then measures the offset",
+    )
+
+
+def absolute_times(
+    reading: PointTimeReading, stamp_ns: int, values: NDArray[np.generic]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Absolute times of the points of one cloud.
+
+    Args:
+        reading: how the values are read.
+        stamp_ns: the stamp of the cloud's message [ns].
+        values: (N,) point times as recorded.
+
+    Returns:
+        (N,) int64 absolute nanoseconds, and (N,) bool: False where the value is not finite or farther than 10 s from the
+        stamp (the time is then the stamp).
+    """
+    scale = UNIT_NS[reading.unit]
+    whole, rest = divmod(stamp_ns, scale) if reading.anchor == "clock" else (0, 0)
+    if values.dtype.kind == "f":
+        offset = (values.astype(np.float64) - whole) * scale - rest
+    else:
+        offset = (values.astype(np.int64) - whole).astype(np.float64) * scale - rest
+    valid = np.isfinite(offset)
+    if reading.anchor in ("first", "last") and valid.any():
+        offset = offset - (offset[valid].min() if reading.anchor == "first" else offset[valid].max())
+    with np.errstate(invalid="ignore"):
+        valid &= np.abs(offset) <= _FARTHEST_FROM_STAMP_NS
+    if not valid.all():
+        offset = np.where(valid, offset, 0.0)
+    return np.rint(offset).astype(np.int64) + stamp_ns, valid

@@ -1,0 +1,151 @@
+"""A recording as a stream of scans and IMU samples."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.info import Evidence, RecordingInfo
+from boxplus.recordings.options import RecordingOptions
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+_LOG = logging.getLogger(__name__)
+
+Event = Scan | ImuSamples
+
+
+@dataclass(slots=True)
+class Tally:
+    """What a reader counts while it reads.
+
+    Attributes:
+        rejected: dropped points and messages by reason (`points: not finite`, `messages: malformed cloud`).
+        done: messages read so far, for the progress.
+        damage: what of the file could not be read, one sentence each.
+    """
+
+    rejected: Counter[str] = field(default_factory=Counter)
+    done: int = 0
+    damage: list[str] = field(default_factory=list)
+
+    def count_scan(self, scan: Scan) -> None:
+        """Add the points a scan dropped on construction."""
+        for reason, count in scan.rejected.items():
+            self.rejected[f"points: {reason}"] += count
+
+
+class Recording:
+    """An opened recording. Iterating yields its scans and IMU samples in the order of the file, in constant memory.
+
+    Every iteration starts at the beginning and resets the counters. Times are those of the messages' stamps; neither their
+    order nor gaps are touched, that is the sequencer's business.
+
+    Attributes:
+        info: what the recording contains, how it is read, and why.
+    """
+
+    def __init__(self, info: RecordingInfo, read: Callable[[Tally], Iterator[Event]], close: Callable[[], None]) -> None:
+        self.info = info
+        self._read = read
+        self._close = close
+        self._tally = Tally()
+        self._finished = False
+
+    def events(self) -> Iterator[Event]:
+        """Scans and blocks of IMU samples in file order. What cannot be read is counted in `rejected` and logged.
+
+        Raises:
+            RecordingError: nothing at all could be read.
+        """
+        self._tally = tally = Tally()
+        self._finished = False
+        seen = 0
+        for event in self._read(tally):
+            seen += 1
+            if isinstance(event, Scan):
+                tally.count_scan(event)
+            yield event
+        self._finished = True
+        self._report_damage(tally)
+        if not seen:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in tally.rejected.items()) or "; ".join(tally.damage)
+            raise RecordingError(
+                "scans and IMU samples",
+                f"none in {self.info.path.name} ({reasons or 'no messages'})",
+                "inspect the file with 'boxplus inspect'",
+            )
+
+    def __iter__(self) -> Iterator[Event]:
+        return self.events()
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Points and messages dropped so far in the current iteration, by reason."""
+        return dict(self._tally.rejected)
+
+    @property
+    def progress(self) -> float:
+        """How much of the current iteration is done, in [0, 1]."""
+        if self._finished:
+            return 1.0
+        return min(self._tally.done / max(self.info.message_count, 1), 1.0)
+
+    def _report_damage(self, tally: Tally) -> None:
+        for text in dict.fromkeys(tally.damage):
+            tally.rejected["unreadable stretches of the file"] += 1
+            evidence = Evidence("file", "damaged", "warning", text)
+            if evidence not in self.info.evidence:
+                self.info.evidence.append(evidence)
+                _LOG.warning("%s: %s", self.info.path.name, text)
+
+    def close(self) -> None:
+        """Release the files."""
+        self._close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def open_recording(path: str | Path, options: RecordingOptions | None = None) -> Recording:
+    """Open a recording: a ROS 1 bag, a ROS 2 folder or file, a KITTI raw folder, or a vendor's pcap.
+
+    The format is found from the content, topics, times and units from the first seconds of data; `info.evidence` says how.
+
+    Args:
+        path: file or folder.
+        options: what is decided by the user; the rest is found.
+
+    Raises:
+        RecordingError: no such file, unknown format, missing topics or point times, unreadable.
+        AmbiguityError: two readings fit; the message names the option that decides.
+    """
+    options = options or RecordingOptions()
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError("a recording", f"no file or folder {path}", "check the path")
+    if path.is_dir() and (path / "velodyne_points").is_dir():
+        from boxplus.recordings.kitti import open_kitti
+
+        return open_kitti(path, options)
+    if path.suffix.lower() in (".pcap", ".pcapng"):
+        from boxplus.recordings.pcap import open_pcap
+
+        return open_pcap(path, options)
+    if path.is_dir() or path.suffix.lower() in (".bag", ".mcap", ".db3", ".active"):
+        from boxplus.recordings.bag import open_bag
+
+        return open_bag(path, options)
+    raise RecordingError(
+        "a ROS 1 bag (.bag), a ROS 2 folder or file (.mcap, .db3), a KITTI raw folder (velodyne_points/, oxts/) or a pcap",
+        f"{path.name}",
+        "convert the recording, or push arrays from Python (boxplus.sensors)",
+    )
