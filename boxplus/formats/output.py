@@ -1,0 +1,67 @@
+"""Writing files so that they are either whole or not there, and saying in a sentence why a write failed."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from boxplus.errors import OutputError
+
+TEMPORARY_SUFFIX = ".boxplus-tmp"
+"""Ending of files that are being written; such a file is never complete."""
+
+
+def output_error(path: str | Path, error: OSError) -> OutputError:
+    """The error to raise when writing `path` failed with `error`: what was expected, what came, what to do."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        got, advice = "a full disk", "free some space or choose another output folder; everything written before is intact"
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        got, advice = "no permission to write there", "choose another output folder or change its permissions"
+    elif error.errno in (errno.ENOTDIR, errno.EISDIR, errno.EEXIST):
+        got, advice = f"something else of that name in the way ({error.strerror})", "choose another output path"
+    else:
+        got, advice = str(error), "check the output folder"
+    return OutputError(f"expected to write {path} – got {got} – {advice}")
+
+
+def make_folder(folder: str | Path) -> Path:
+    """Create `folder` (and its parents) where it does not exist.
+
+    Raises:
+        OutputError: it cannot be created.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(path, error) from error
+    return path
+
+
+@contextmanager
+def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a temporary file beside `path`; when the block ends well, flush it to the disk and rename it to `path`.
+
+    When the block raises, the temporary file is removed and whatever was at `path` before stays as it was.
+
+    Raises:
+        OutputError: the file cannot be created, written or renamed (full disk, no permission).
+    """
+    target = Path(path)
+    temporary = target.with_name(target.name + TEMPORARY_SUFFIX)
+    try:
+        with temporary.open("w+b") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError) and not isinstance(error, OutputError):
+            raise output_error(target, error) from error
+        raise

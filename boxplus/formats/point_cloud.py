@@ -1,0 +1,134 @@
+"""A point cloud as files carry it: positions and, where present, one intensity each; and what its readers share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+HEADER_LIMIT = 64 * 1024
+"""A point cloud header is shorter than this [bytes]; what is longer is no header."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """N points.
+
+    Attributes:
+        points: (N, 3) float32, in the file's frame [m].
+        intensity: (N,) float32 in the sensor's unit, or None.
+    """
+
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def as_records(points: ArrayLike, intensity: ArrayLike | None) -> NDArray[np.float32]:
+    """Points and intensities side by side, little-endian float32 of shape (N, 3) or (N, 4), ready to be written.
+
+    Raises:
+        InputError: shapes that do not match.
+    """
+    xyz = np.asarray(points)
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
+        raise InputError(
+            "points as numbers of shape (N, 3)", f"{xyz.dtype} of shape {xyz.shape}", "give one row x, y, z per point"
+        )
+    if intensity is None:
+        return np.ascontiguousarray(xyz, dtype="<f4")
+    strength = np.asarray(intensity)
+    if strength.shape != (len(xyz),):
+        raise InputError(
+            f"intensity of shape ({len(xyz)},), one per point", f"shape {strength.shape}", "give one value per point or None"
+        )
+    records = np.empty((len(xyz), 4), dtype="<f4")
+    records[:, :3] = xyz
+    records[:, 3] = strength
+    return records
+
+
+def read_header(file: BinaryIO, path: Path, last_line: str) -> list[str]:
+    """The header lines of a point cloud file, up to and with the one that begins with `last_line`.
+
+    Raises:
+        InputError: there is no such line near the beginning.
+    """
+    lines: list[str] = []
+    size = 0
+    while size < HEADER_LIMIT:
+        raw = file.readline(HEADER_LIMIT)
+        if not raw:
+            break
+        size += len(raw)
+        lines.append(raw.decode("ascii", errors="replace").strip())
+        if lines[-1].split(" ")[0] == last_line:
+            return lines
+    got = f"none ({path}, line {len(lines)})"
+    raise InputError(f"a header that ends with {last_line!r}", got, "the file is cut or of another kind")
+
+
+def read_records(file: BinaryIO, path: Path, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """`count` binary records from the file's position on.
+
+    Raises:
+        InputError: the file holds fewer.
+    """
+    begin = file.tell()
+    left = file.seek(0, 2) - begin
+    if left < count * dtype.itemsize:
+        raise InputError(
+            f"{count} points of {dtype.itemsize} bytes, as the header says",
+            f"{left // dtype.itemsize} ({path})",
+            "the file was cut; write it again or correct the count in its header",
+        )
+    file.seek(begin)
+    return np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype, count=count)
+
+
+def read_text_table(file: BinaryIO, path: Path, columns: int, count: int, first_line: int) -> NDArray[np.float64]:
+    """`count` lines of `columns` numbers from the file's position on.
+
+    Raises:
+        InputError: too few lines, or a line that does not hold that many numbers; the message names the line.
+    """
+    rows: list[NDArray[np.float64]] = []
+    for row in range(count):
+        raw = file.readline()
+        where = f"{path}, line {first_line + row}"
+        if not raw:
+            raise InputError(f"{count} points, as the header says", f"{row} ({where})", "the file was cut; write it again")
+        try:
+            values = np.array(raw.split(), dtype=np.float64)
+        except ValueError:
+            values = np.empty(0)
+        if values.size != columns:
+            raise InputError(
+                f"{columns} numbers", f"{raw[:60].decode('ascii', 'replace').strip()!r} ({where})", "correct the line"
+            )
+        rows.append(values)
+    return np.stack(rows) if rows else np.empty((0, columns))
+
+
+def cloud_from_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> PointCloud:
+    """Pick x, y, z and intensity out of a file's columns.
+
+    Raises:
+        InputError: no x, y and z.
+    """
+    lower = {name.lower(): values for name, values in columns.items()}
+    if not {"x", "y", "z"} <= lower.keys():
+        raise InputError("points with x, y and z", f"{', '.join(columns) or 'nothing'} ({path})", "name the coordinates x, y, z")
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite
+        points = np.stack([lower[axis].astype(np.float32) for axis in "xyz"], axis=1)
+    for name in ("intensity", "scalar_intensity", "reflectivity", "i"):
+        if name in lower:
+            return PointCloud(points, np.ascontiguousarray(lower[name], dtype=np.float32))
+    return PointCloud(points, None)
