@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from boxplus.recordings.messages import NUMPY_CODE, CloudMessage, MalformedMessageError, PointField
 
 _TIME_NAMES = frozenset(
-    "t ts dt time timestamp timestamps stamp offsettime timeoffset timeoffsetns toffset pointtimeoffset pointtime reltime "
-    "relativetime timens timeus timesec tns tus".split()
+    (
+        *("t", "ts", "dt", "time", "timestamp", "timestamps", "stamp", "offsettime", "timeoffset", "timeoffsetns", "toffset"),
+        *("pointtimeoffset", "pointtime", "reltime", "relativetime", "timens", "timeus", "timesec", "tns", "tus"),
+    )
 )
 _INTENSITY_NAMES = ("intensity", "intensities", "reflectivity", "reflectance", "i", "signal")
 

@@ -71,33 +71,32 @@ def open_container(path: Path) -> Container:
         reason = str(error) or type(error).__name__
     _LOG.info("%s has no usable index (%s): reading it from front to back", path, reason)
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix == ".mcap")
-    container = open_sequential([file for file in files if file.suffix != ".db3"])
+        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    container = open_sequential(files)
     if container is None:
         raise RecordingError(
             "a readable ROS bag or MCAP file",
             f"{path.name}: {reason}",
-            "copy the recording again, or check it with 'boxplus inspect'",
+            "copy the recording again; nothing in this file can be read",
         )
-    if not _needs_no_index(reason):
+    if container.damage or not any(benign in reason for benign in _HEALTHY_ALL_THE_SAME):
         container.damage.append(f"the index cannot be used ({reason}); the messages were collected from front to back")
     return container
 
 
-def _needs_no_index(reason: str) -> bool:
-    """Whether rosbags declined a healthy file: MCAP files of ROS 1, and single files in versions that only know folders."""
-    return "Profile is not ros2" in reason or "metadata" in reason.lower()
+_HEALTHY_ALL_THE_SAME = ("Profile is not ros2", "not supported", "metadata")
+"""Why rosbags declines healthy files: ROS 1 in MCAP, and, in older versions, newer metadata and files without any."""
 
 
 def _rosbags_errors() -> tuple[type[Exception], ...]:
     from rosbags.rosbag1 import ReaderError as Ros1Error
     from rosbags.rosbag2 import ReaderError as Ros2Error
 
-    return Ros1Error, Ros2Error, *_compression_errors()
+    return Ros1Error, Ros2Error, *foreign_errors()
 
 
-def _compression_errors() -> tuple[type[Exception], ...]:
-    """The error classes of the decompressors and of SQLite that do not derive from Python's own."""
+def foreign_errors() -> tuple[type[Exception], ...]:
+    """The error classes of the decompressors and of SQLite, which do not derive from the built-in ones above."""
     import importlib
 
     errors: list[type[Exception]] = []

@@ -1,21 +1,25 @@
-"""Bags and MCAP files read from front to back, without their index.
+"""Bags, MCAP and SQLite files read from front to back, without rosbags and without an index.
 
-For recordings that were cut off (a full disk, a dead battery, an interrupted copy: the index is written last) and for MCAP files
-rosbags does not take (ROS 1 messages in MCAP). Formats: ROS bag 2.0 (wiki.ros.org/Bags/Format/2.0) and mcap.dev/spec.
+For recordings that were cut off (a full disk, a dead battery, an interrupted copy: the index is written last) and for files
+some versions of rosbags do not take (ROS 1 messages in MCAP, files without their metadata.yaml). Formats: ROS bag 2.0
+(wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the tables of rosbag2's SQLite storage.
 """
 
 from __future__ import annotations
 
 import bz2
+import sqlite3
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from boxplus.recordings.containers import READ_ERRORS, Channel, _compression_errors
+from boxplus.recordings.containers import READ_ERRORS, Channel, foreign_errors
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+SQLITE_MAGIC = b"SQLite format"
 _LARGEST_RECORD = 1 << 31
 
 
@@ -51,7 +55,7 @@ class SequentialContainer:
 
     def __init__(self, files: list[Path]) -> None:
         self._files = files
-        self._errors = READ_ERRORS + _compression_errors()
+        self._errors = READ_ERRORS + foreign_errors()
         self.damage: list[str] = []
         self.start_ns, self.end_ns = 2**63 - 1, 0
         counts: dict[tuple[str, str, str], int] = {}
@@ -64,8 +68,8 @@ class SequentialContainer:
             for (topic, kind, encoding), count in sorted(counts.items())
         }
         self.channels = list(self._channels.values())
-        ros1 = any(file.suffix == ".bag" for file in files)
-        self.format = "ROS 1 bag" if ros1 else "MCAP"
+        kinds = {".mcap": "MCAP", ".db3": "ROS 2 bag (sqlite3)"}
+        self.format = kinds.get(files[0].suffix, "ROS 1 bag") if files else ""
 
     def messages(self, topics: frozenset[str], start_ns: int, stop_ns: int) -> Iterator[tuple[Channel, int, bytes]]:
         for connection, time_ns, data in self._read([]):
@@ -101,7 +105,9 @@ def _scanner(stream: BinaryIO) -> _Scanner:
     if magic.startswith(MCAP_MAGIC):
         stream.seek(len(MCAP_MAGIC))
         return _scan_mcap
-    raise DamagedRecordError("neither a ROS 1 bag (version 2.0) nor an MCAP file")
+    if magic.startswith(SQLITE_MAGIC):
+        return _scan_sqlite
+    raise DamagedRecordError("neither a ROS 1 bag (version 2.0) nor an MCAP or SQLite file")
 
 
 def _take(stream: BinaryIO, size: int) -> bytes:
@@ -215,11 +221,23 @@ def _mcap_record(operation: int, content: bytes, schemas: dict[int, str]) -> Ite
         yield _Message(key, log_time, content[22:])
 
 
+# --- ROS 2 in SQLite: tables `topics` and `messages`. ---
+
+
+def _scan_sqlite(stream: BinaryIO) -> Iterator[_Record | None]:
+    database = sqlite3.connect(f"{Path(stream.name).resolve().as_uri()}?immutable=1", uri=True)
+    with closing(database):
+        for key, topic, kind in database.execute("SELECT id, name, type FROM topics"):
+            yield _Connection(key, topic, kind.replace("/msg/", "/"), "cdr")
+        for key, time_ns, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+            yield _Message(key, time_ns, bytes(data))
+
+
 def _skipping_damage(records: Iterator[_Record]) -> Iterator[_Record | None]:
     """The records of a chunk; None in the end when its rest makes no sense (the file goes on behind the chunk)."""
     try:
         yield from records
-    except READ_ERRORS + _compression_errors():
+    except READ_ERRORS + foreign_errors():
         yield None
 
 

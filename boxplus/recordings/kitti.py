@@ -1,0 +1,215 @@
+"""KITTI raw drives as recordings (Geiger et al., IJRR 2013; layout of the raw data development kit).
+
+velodyne_points/data/*.bin (float32 x, y, z, reflectance), velodyne_points/timestamps{,_start,_end}.txt
+oxts/data/*.txt (30 columns), oxts/timestamps.txt
+calib_imu_to_velo.txt beside the drive, above it, or inside: p_velodyne = R p_imu + T
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, Verdict
+from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions
+from boxplus.recordings.recording import Event, Recording, Tally
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+_ACCEL_COLUMNS = slice(11, 14)
+_GYRO_COLUMNS = slice(17, 20)
+_OXTS_COLUMNS = 30
+_POINT_BYTES = 16
+_CALIBRATION = "calib_imu_to_velo.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    """File names and times of one sensor; a line of the time file without its data file is left out and counted."""
+
+    paths: list[Path]
+    time_ns: NDArray[np.int64]
+    start_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
+    missing: int
+
+
+def open_kitti(path: Path, options: RecordingOptions) -> Recording:
+    """Open a KITTI raw drive: the folder that holds `velodyne_points` and `oxts`.
+
+    Raises:
+        RecordingError: a sensor or its times are missing, or the times cannot be read.
+    """
+    scans = _scan_files(path / "velodyne_points", options)
+    imu = _sensor_files(path / "oxts", ".txt")
+    first = int(min(scans.start_ns.min(), imu.time_ns.min()))
+    last = int(max(scans.end_ns.max(), imu.time_ns.max()))
+    T_imu_lidar, source = _calibration(path)
+    evidence = [_point_time_evidence(scans, options)]
+    for name, files in (("velodyne_points", scans), ("oxts", imu)):
+        if files.missing:
+            text = f"{files.missing} of the {files.missing + len(files.paths)} times in {name} have no data file: these are gaps"
+            evidence.append(Evidence("file", "incomplete", "warning", text))
+    rate = (len(imu.time_ns) - 1) / max((imu.time_ns.max() - imu.time_ns.min()) * 1e-9, 1e-9)
+    if rate < 50:
+        text = f"{rate:.1f} Hz (a synchronised drive): the unsynchronised 'extract' drives have 100 Hz"
+        evidence.append(Evidence("imu_rate", f"{rate:.1f} Hz", "warning", text))
+    found: Verdict = "ok" if source else "warning"
+    text = f"from {source}" if source else f"no {_CALIBRATION} in, beside or above the drive: give --T-imu-lidar"
+    evidence.append(Evidence("T_imu_lidar", source or "unknown", found, text))
+    info = RecordingInfo(
+        path=path,
+        format="KITTI raw folder",
+        topics=[Topic("velodyne_points", "Velodyne HDL-64E", len(scans.paths)), Topic("oxts", "OXTS RT3003", len(imu.paths))],
+        duration_s=(last - first) * 1e-9,
+        message_count=len(scans.paths) + len(imu.paths),
+        lidar_topic="velodyne_points",
+        imu_topic="oxts",
+        lidar_frame="velodyne",
+        imu_frame="imu",
+        point_time=PointTimeReading(None if options.point_time_field == NO_POINT_TIME else "azimuth", "ns", "absolute", "clock"),
+        gyro_unit="rad/s",
+        accel_unit="m/s2",
+        T_imu_lidar=T_imu_lidar,
+        T_imu_lidar_source=source,
+        evidence=evidence,
+    )
+    start_ns = first + round(options.start_s * 1e9)
+    stop_ns = last + 1 if options.duration_s is None else start_ns + round(options.duration_s * 1e9)
+
+    def read(tally: Tally) -> Iterator[Event]:
+        return _events(scans, imu, options, start_ns, stop_ns, tally)
+
+    return Recording(info, read, lambda: None)
+
+
+def read_times(file: Path) -> NDArray[np.int64]:
+    """Times of a KITTI time file, (N,) int64 nanoseconds since 1970.
+
+    Raises:
+        RecordingError: no such file, or a line that is no time.
+    """
+    if not file.is_file():
+        raise RecordingError(f"the times {file.name}", f"none in {file.parent}", "unpack the whole drive, with its time files")
+    lines = [line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()]
+    try:
+        return np.array([line.replace(" ", "T") for line in lines], dtype="datetime64[ns]").astype(np.int64)
+    except ValueError as error:
+        raise RecordingError(
+            "lines like 2011-09-26 13:02:25.594360375", f"{error} in {file}", "unpack the drive again"
+        ) from error
+
+
+def _sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") -> _Files:
+    time_ns = read_times(folder / time_file)
+    paths = [folder / "data" / f"{index:010d}{suffix}" for index in range(len(time_ns))]
+    present = np.array([path.is_file() for path in paths], dtype=bool)
+    if not present.any():
+        raise RecordingError(f"data files like 0000000000{suffix}", f"none in {folder / 'data'}", "unpack the whole drive")
+    kept = [path for path, there in zip(paths, present, strict=True) if there]
+    time_ns = time_ns[present]
+    return _Files(kept, time_ns, time_ns, time_ns, int((~present).sum()))
+
+
+def _scan_files(folder: Path, options: RecordingOptions) -> _Files:
+    if options.point_time_field == NO_POINT_TIME:
+        return _sensor_files(folder, ".bin")
+    if not (folder / "timestamps_start.txt").is_file() or not (folder / "timestamps_end.txt").is_file():
+        raise RecordingError(
+            "timestamps_start.txt and timestamps_end.txt, from which every point gets its time by its azimuth",
+            f"not both of them in {folder}",
+            "unpack the whole drive, or accept distorted scans with --point-time-field none",
+        )
+    starts = _sensor_files(folder, ".bin", "timestamps_start.txt")
+    ends = _sensor_files(folder, ".bin", "timestamps_end.txt")
+    if len(starts.time_ns) != len(ends.time_ns):
+        raise RecordingError(
+            "as many start times as end times of the scans",
+            f"{len(starts.time_ns)} and {len(ends.time_ns)} in {folder}",
+            "unpack the drive again",
+        )
+    return _Files(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing)
+
+
+def _point_time_evidence(scans: _Files, options: RecordingOptions) -> Evidence:
+    if options.point_time_field == NO_POINT_TIME:
+        text = "every point is taken at the time of its scan, as asked for: motion within a scan is not corrected"
+        return Evidence("point_time_field", "none", "warning", text)
+    duration = float(np.median(scans.end_ns - scans.start_ns)) * 1e-9
+    text = f"a turn takes {duration:.4f} s from timestamps_start to timestamps_end; the laser turns clockwise from the rear"
+    return Evidence("point_time_field", "azimuth", "ok" if 0.02 < duration < 0.5 else "warning", text)
+
+
+def _calibration(path: Path) -> tuple[NDArray[np.float64] | None, str]:
+    folders = (path, path.parent, path.parent.parent)
+    for file in [folder / _CALIBRATION for folder in folders] + [path.parent / f"{path.name}.{_CALIBRATION}"]:
+        if not file.is_file():
+            continue
+        values = {}
+        for line in file.read_text(errors="replace").splitlines():
+            name, _, numbers = line.partition(":")
+            if name in ("R", "T"):
+                try:
+                    values[name] = np.array(numbers.split(), dtype=np.float64)
+                except ValueError:
+                    continue
+        R, T = values.get("R", np.empty(0)), values.get("T", np.empty(0))
+        rotates = R.size == 9 and T.size == 3 and np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), atol=1e-3)
+        if not rotates or np.linalg.det(R.reshape(3, 3)) < 0:
+            raise RecordingError(
+                "R (9 numbers, a rotation) and T (3 numbers)", f"something else in {file}", "download the calibration again"
+            )
+        T_imu_lidar = np.eye(4)
+        T_imu_lidar[:3, :3] = R.reshape(3, 3).T
+        T_imu_lidar[:3, 3] = -R.reshape(3, 3).T @ T
+        return T_imu_lidar, file.name
+    return None, ""
+
+
+def _events(scans: _Files, imu: _Files, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally) -> Iterator[Event]:
+    lidar_order = ((int(end), 1, index) for index, end in enumerate(scans.end_ns))
+    imu_order = ((int(time), 0, index) for index, time in enumerate(imu.time_ns))
+    for received_ns, is_scan, index in heapq.merge(imu_order, lidar_order):
+        tally.done += 1
+        if not start_ns <= received_ns < stop_ns:
+            continue
+        event = _read_scan(scans, index, options, tally) if is_scan else _read_imu(imu, index, tally)
+        if event is not None:
+            yield event
+
+
+def _read_scan(scans: _Files, index: int, options: RecordingOptions, tally: Tally) -> Scan | None:
+    try:
+        raw = scans.paths[index].read_bytes()
+    except OSError:
+        tally.rejected["messages: unreadable scan file"] += 1
+        return None
+    if len(raw) % _POINT_BYTES:
+        tally.rejected[f"messages: scan file is not a multiple of {_POINT_BYTES} bytes"] += 1
+        return None
+    points = np.frombuffer(raw, "<f4").reshape(-1, 4)
+    start_ns, end_ns = int(scans.start_ns[index]), int(scans.end_ns[index])
+    turned = 0.5 - np.arctan2(points[:, 1], points[:, 0], dtype=np.float64) * (0.5 / np.pi)
+    offset = np.where(np.isfinite(turned), turned, 0.0) * (end_ns - start_ns)
+    time_ns = start_ns + np.rint(offset).astype(np.int64)
+    if not len(points):
+        return Scan(np.empty((0, 3), np.float32), time_ns, None, start_ns, start_ns, {})
+    return Scan.from_arrays(points[:, :3], time_ns, points[:, 3], min_range=options.min_range, max_range=options.max_range)
+
+
+def _read_imu(imu: _Files, index: int, tally: Tally) -> ImuSamples | None:
+    try:
+        values = np.array(imu.paths[index].read_text(errors="replace").split(), dtype=np.float64)
+    except (OSError, ValueError):
+        tally.rejected["messages: unreadable oxts file"] += 1
+        return None
+    if len(values) < _OXTS_COLUMNS:
+        tally.rejected[f"messages: oxts file without its {_OXTS_COLUMNS} columns"] += 1
+        return None
+    return ImuSamples.from_arrays(imu.time_ns[index : index + 1], values[_GYRO_COLUMNS], values[_ACCEL_COLUMNS])
