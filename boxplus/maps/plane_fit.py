@@ -1,0 +1,76 @@
+"""A plane through a handful of points, by principal components (SPEC.md 9.6, step 2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+
+COINCIDENT_M = 1e-6
+COLLINEAR_RATIO = 0.05
+
+
+@kernel(inline=True)
+def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float, plane: NDArray[np.float64]) -> bool:
+    """Fit a plane to `points[:count]` (n, 3); False if they are coincident, collinear or off the plane by `max_distance`.
+
+    `plane` (≥ 7,) receives the unit normal u, the offset uᵀq, and the centroid q.
+    """
+    qx, qy, qz = 0.0, 0.0, 0.0
+    for i in range(count):
+        qx += points[i, 0]
+        qy += points[i, 1]
+        qz += points[i, 2]
+    qx /= count
+    qy /= count
+    qz /= count
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        dx, dy, dz = points[i, 0] - qx, points[i, 1] - qy, points[i, 2] - qz
+        xx += dx * dx
+        xy += dx * dy
+        xz += dx * dz
+        yy += dy * dy
+        yz += dy * dz
+        zz += dz * dz
+    # Eigenvalues of the scatter matrix in closed form (trigonometric solution of the characteristic cubic).
+    mean = (xx + yy + zz) / 3.0
+    ax, ay, az = xx - mean, yy - mean, zz - mean
+    off = xy * xy + xz * xz + yz * yz
+    scale = math.sqrt((ax * ax + ay * ay + az * az + 2.0 * off) / 6.0)
+    if 3.0 * mean < COINCIDENT_M * COINCIDENT_M or scale <= 0.0:
+        return False
+    half_det = (ax * (ay * az - yz * yz) - xy * (xy * az - yz * xz) + xz * (xy * yz - ay * xz)) / (2.0 * scale**3)
+    angle = math.acos(min(1.0, max(-1.0, half_det))) / 3.0
+    largest = mean + 2.0 * scale * math.cos(angle)
+    smallest = mean + 2.0 * scale * math.cos(angle + 2.0943951023931953)
+    middle = 3.0 * mean - largest - smallest
+    if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest:
+        return False
+    # The normal is orthogonal to the rows of M − λI: the longest of their three cross products.
+    ax, ay, az = xx - smallest, yy - smallest, zz - smallest
+    ux, uy, uz = xy * yz - xz * ay, xz * xy - ax * yz, ax * ay - xy * xy
+    best = ux * ux + uy * uy + uz * uz
+    vx, vy, vz = xy * az - xz * yz, xz * xz - ax * az, ax * yz - xy * xz
+    norm = vx * vx + vy * vy + vz * vz
+    if norm > best:
+        ux, uy, uz, best = vx, vy, vz, norm
+    vx, vy, vz = ay * az - yz * yz, yz * xz - xy * az, xy * yz - ay * xz
+    norm = vx * vx + vy * vy + vz * vz
+    if norm > best:
+        ux, uy, uz, best = vx, vy, vz, norm
+    if not best > 0.0:
+        return False
+    inverse = 1.0 / math.sqrt(best)
+    ux, uy, uz = ux * inverse, uy * inverse, uz * inverse
+    for i in range(count):
+        distance = ux * (points[i, 0] - qx) + uy * (points[i, 1] - qy) + uz * (points[i, 2] - qz)
+        if not abs(distance) <= max_distance:
+            return False
+    plane[0], plane[1], plane[2] = ux, uy, uz
+    plane[3] = ux * qx + uy * qy + uz * qz
+    plane[4], plane[5], plane[6] = qx, qy, qz
+    return True

@@ -1,0 +1,98 @@
+"""Voxel filter of a scan: the centroid of the points in every occupied voxel (SPEC.md 9.11, step 5)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.errors import InputError
+
+_EMPTY = np.int32(-1)
+# Large odd factors spread neighbouring voxels over the table.
+_HASH_X, _HASH_Y, _HASH_Z = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9)
+
+
+@kernel
+def voxel_centroids(
+    points: NDArray[np.float32],
+    inverse_size: float,
+    table: NDArray[np.int32],
+    keys: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    counts: NDArray[np.int32],
+) -> int:
+    """Centroids of the occupied voxels, in the order in which the voxels are first seen; returns their number.
+
+    Args:
+        points: (n, 3); inverse_size: one over the voxel's side [1/m].
+        table: (power of two ≥ 2 n,) filled with −1; keys: (n,), sums: (n, 3), counts: (n,) scratch.
+        sums: receives the centroids.
+    """
+    mask = np.uint64(table.shape[0] - 1)
+    used = 0
+    for n in range(points.shape[0]):
+        ix = np.int64(math.floor(points[n, 0] * inverse_size))
+        iy = np.int64(math.floor(points[n, 1] * inverse_size))
+        iz = np.int64(math.floor(points[n, 2] * inverse_size))
+        key = (ix & 0x1FFFFF) | ((iy & 0x1FFFFF) << 21) | ((iz & 0x1FFFFF) << 42)
+        mixed = np.uint64(ix) * _HASH_X ^ np.uint64(iy) * _HASH_Y ^ np.uint64(iz) * _HASH_Z
+        slot = (mixed ^ (mixed >> np.uint64(29))) & mask
+        while True:
+            voxel = table[slot]
+            if voxel == _EMPTY:
+                voxel = np.int32(used)
+                table[slot] = voxel
+                keys[used] = key
+                sums[used, 0] = points[n, 0]
+                sums[used, 1] = points[n, 1]
+                sums[used, 2] = points[n, 2]
+                counts[used] = 1
+                used += 1
+                break
+            if keys[voxel] == key:
+                sums[voxel, 0] += points[n, 0]
+                sums[voxel, 1] += points[n, 1]
+                sums[voxel, 2] += points[n, 2]
+                counts[voxel] += 1
+                break
+            slot = (slot + np.uint64(1)) & mask
+    for voxel in range(used):
+        share = np.float32(1.0) / np.float32(counts[voxel])
+        sums[voxel, 0] *= share
+        sums[voxel, 1] *= share
+        sums[voxel, 2] *= share
+    return used
+
+
+class VoxelFilter:
+    """Keeps its scratch memory from scan to scan.
+
+    Args:
+        voxel_size: side of a voxel [m].
+
+    Raises:
+        InputError: `voxel_size` is not positive.
+    """
+
+    def __init__(self, voxel_size: float) -> None:
+        if not (np.isfinite(voxel_size) and voxel_size > 0):
+            raise InputError("voxel_size as a positive length in metres", f"{voxel_size}", "typical values are 0.2 to 1.0")
+        self.voxel_size = voxel_size
+        self._reserve(1024)
+
+    def _reserve(self, points: int) -> None:
+        self._table = np.full(1 << (2 * points - 1).bit_length(), _EMPTY, dtype=np.int32)
+        self._keys = np.zeros(points, dtype=np.int64)
+        self._sums = np.zeros((points, 3), dtype=np.float32)
+        self._counts = np.zeros(points, dtype=np.int32)
+
+    def __call__(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Centroids (m, 3) float32 of `points` (n, 3) float32, finite, within ±2^20 voxels of the origin."""
+        if len(points) > len(self._counts):
+            self._reserve(2 * len(points))
+        self._table.fill(_EMPTY)
+        used = voxel_centroids(points, 1.0 / self.voxel_size, self._table, self._keys, self._sums, self._counts)
+        return self._sums[:used].copy()

@@ -1,0 +1,101 @@
+"""What LiDAR-inertial odometry says about one scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import NavState
+
+Status = Literal["ok", "weak", "lost"]
+
+# The six axes of a pose, in the order of its covariance: rotation about the IMU's axes, then position along the world's.
+AXES = ("rotation x", "rotation y", "rotation z", "position x", "position y", "position z")
+
+
+@dataclass(frozen=True, slots=True)
+class WeakDirection:
+    """A direction of the pose that the scan does not determine; there the filter keeps its prediction.
+
+    Attributes:
+        rotation_imu: (3,) part of the unit direction that turns, about the IMU's axes (scaled by `lever_arm`).
+        translation_world: (3,) part that moves, along the world's axes.
+        information_share: information along it, as a fraction of what all points would give if every one measured it.
+    """
+
+    rotation_imu: NDArray[np.float64]
+    translation_world: NDArray[np.float64]
+    information_share: float
+
+    def __str__(self) -> str:
+        parts = []
+        for name, vector, frame in (("position", self.translation_world, "world"), ("rotation", self.rotation_imu, "IMU")):
+            if np.linalg.norm(vector) > 0.3:
+                parts.append(f"{name} along ({vector[0]:+.2f}, {vector[1]:+.2f}, {vector[2]:+.2f}) in the {frame} frame")
+        return " with ".join(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """State, covariance and diagnosis at the end of one scan.
+
+    Attributes:
+        time_ns: the instant the estimate holds for: the last point of the scan, absolute [ns].
+        state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
+        covariance: (24, 24) float64 of the tangent `[θ, p, v, b_ω, b_a, g, θ_L, p_L]` at `state` (SPEC.md 9.1): rotations
+            perturbed on the right (IMU frame) [rad], position and velocity along the world's axes.
+        status: "ok"; "weak": some directions were predicted only (see `weak_directions`); "lost": no update was possible.
+        weak_directions: the directions the scan did not determine.
+        lidar_share: (6,) for each of `AXES`, how much of the information came from the LiDAR: 1 − posterior / prior
+            variance. 1 is measured, 0 is predicted only.
+        points_raw: points of the scan; points_filtered: after the voxel filter; points_used: in the last iteration.
+        rejected: filtered points that were not used, by reason; they add up with `points_used` to `points_filtered`.
+        residual_rms: root mean square point-to-plane distance of the used points [m].
+        iterations: Gauss-Newton steps taken; converged: whether the last one was below the threshold.
+        warnings: what went wrong on the way to this scan (gaps in the IMU, missing cover, …), one sentence each.
+        timing_s: seconds spent, by stage of the pipeline.
+        p_lidar: (N, 3) float32, all points of the scan in the LiDAR frame at `time_ns`, corrected for motion.
+        intensity: (N,) float32 or None.
+    """
+
+    time_ns: int
+    state: NavState
+    covariance: NDArray[np.float64]
+    status: Status
+    weak_directions: tuple[WeakDirection, ...]
+    lidar_share: NDArray[np.float64]
+    points_raw: int
+    points_filtered: int
+    points_used: int
+    rejected: Mapping[str, int]
+    residual_rms: float
+    iterations: int
+    converged: bool
+    warnings: tuple[str, ...]
+    timing_s: Mapping[str, float]
+    p_lidar: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None
+
+    @property
+    def T_world_imu(self) -> NDArray[np.float64]:
+        """(4, 4) pose of the IMU in the world."""
+        T = np.eye(4)
+        T[:3, :3] = self.state.R_world_imu
+        T[:3, 3] = self.state.p_world_imu
+        return T
+
+    @property
+    def pose_covariance(self) -> NDArray[np.float64]:
+        """(6, 6) covariance of the pose, rotation first: [θ about the IMU's axes (rad), p along the world's axes (m)]."""
+        return self.covariance[:6, :6]
+
+    def points_world(self) -> NDArray[np.float64]:
+        """(N, 3) float64, the scan's points registered in the world."""
+        R_world_lidar = self.state.R_world_imu @ self.state.R_imu_lidar
+        p_world_lidar = self.state.R_world_imu @ self.state.p_imu_lidar + self.state.p_world_imu
+        registered: NDArray[np.float64] = self.p_lidar @ R_world_lidar.T + p_world_lidar
+        return registered

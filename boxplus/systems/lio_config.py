@@ -1,0 +1,62 @@
+"""The settings of LiDAR-inertial odometry. None has to be given."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from boxplus.errors import InputError
+from boxplus.filtering.nav_state import check_transform
+
+
+class LioConfig(BaseModel):
+    """Settings of `LidarInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
+
+    T_imu_lidar: tuple[tuple[float, ...], ...] | None = Field(
+        None, description="pose of the LiDAR in the IMU frame, 4×4 row-major: p_imu = T_imu_lidar p_lidar; None is the identity"
+    )
+    extrinsic_estimation: Literal["off", "on", "gated"] = Field(
+        "off", description="refine T_imu_lidar while running: never, always, or only while the motion makes it observable"
+    )
+    scan_voxel: float = Field(0.25, gt=0, description="side of the voxels that thin a scan before the update [m]")
+    map_cell: float = Field(0.25, gt=0, description="side of the map's cells, each keeps one point [m]")
+    max_iterations: int = Field(4, ge=1, le=50, description="most Gauss-Newton steps after the first, per scan")
+    max_neighbour_distance: float = Field(2.236, gt=0, description="the fifth neighbour of a point lies within this [m]")
+    plane_threshold: float = Field(0.1, gt=0, description="a plane's five points lie within this of it [m]")
+    range_sigma: float = Field(0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal [m]")
+    map_sigma: float = Field(0.02, ge=0, description="standard deviation of a map point along a plane's normal [m]")
+    gyro_noise: float = Field(2e-3, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included")
+    accel_noise: float = Field(2e-2, gt=0, description="accelerometer noise [m/s²/√Hz], vibration included")
+    gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
+    accel_bias_walk: float = Field(1e-3, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]")
+    max_imu_gap: float = Field(0.15, gt=0, description="longest interval between IMU samples that is integrated over [s]")
+    gravity_aligned: bool = Field(True, description="world frame with z up; False: the first IMU frame is the world")
+    start_duration: float = Field(1.0, gt=0, description="time over which the start is observed, at rest or moving [s]")
+    box_side: float = Field(1000.0, gt=0, description="side of the box around the sensor within which the map is kept [m]")
+    detection_range: float = Field(100.0, gt=0, description="range of the LiDAR, for moving the map box [m]")
+    min_points: int = Field(20, ge=6, description="fewest used points for an update; with fewer the scan is lost")
+    weak_threshold: float = Field(
+        0.004, ge=0, lt=1, description="a direction with less than this share of the points' information is only predicted"
+    )
+    threads: int = Field(1, ge=1, description="threads that share the work of a scan; the result does not depend on it")
+
+    @field_validator("T_imu_lidar")
+    @classmethod
+    def _rigid(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        if value is None:
+            return None
+        return tuple(tuple(float(x) for x in row) for row in check_transform("T_imu_lidar", np.array(value)))
+
+    @model_validator(mode="after")
+    def _box_is_large_enough(self) -> LioConfig:
+        if self.box_side <= 3.5 * self.detection_range:
+            raise InputError(
+                f"box_side above 3.5 × detection_range = {3.5 * self.detection_range:g} m",
+                f"{self.box_side:g} m",
+                "enlarge box_side or lower detection_range; a smaller box oscillates and deletes map on every scan",
+            )
+        return self
