@@ -1,0 +1,48 @@
+"""`boxplus map`: look into a map folder and merge its tiles into one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+map_app = typer.Typer(name="map", help="Look into a map folder, or merge its tiles into one file.", no_args_is_help=True)
+
+_Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote.", metavar="FOLDER")]
+
+
+@map_app.command("info")
+def info_command(folder: _Folder) -> None:
+    """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
+    from boxplus.maps.tile_store import TileStore
+
+    store = TileStore.open(folder)
+    size = store.manifest.tile_size_m
+    thinning = "every point" if store.manifest.voxel_m is None else f"one point per {store.manifest.voxel_m:g} m voxel"
+    typer.echo(f"{folder}: {store.point_count:,} points in {len(store.counts)} tiles of {size:g} m, {thinning}")
+    if store.counts:
+        low = [min(index[axis] for index in store.counts) * size for axis in range(3)]
+        high = [(max(index[axis] for index in store.counts) + 1) * size for axis in range(3)]
+        extent = ", ".join(f"{name} {a:g} … {b:g} m" for name, a, b in zip("xyz", low, high, strict=True))
+        typer.echo(f"tiles span {extent}")
+    for sentence in store.report or ("whole: the run that wrote it closed it, and every file is complete",):
+        typer.echo(sentence)
+
+
+@map_app.command("merge")
+def merge_command(
+    folder: _Folder,
+    ply: Annotated[Path | None, typer.Option(help="PLY file to write; default without --pcd: FOLDER.ply.")] = None,
+    pcd: Annotated[Path | None, typer.Option(help="PCD file to write.")] = None,
+    voxel: Annotated[float | None, typer.Option(help="Keep one point per voxel of this edge [m].")] = None,
+) -> None:
+    """Write all tiles of a map into one PLY and/or PCD file."""
+    from boxplus.maps.tile_store import TileStore, merge
+
+    for sentence in TileStore.open(folder).report:
+        typer.echo(f"warning: {sentence}", err=True)
+    if ply is None and pcd is None:
+        ply = folder.resolve().with_suffix(".ply")
+    count = merge(folder, ply, pcd, voxel)
+    typer.echo(f"{count:,} points → {' and '.join(str(path) for path in (ply, pcd) if path is not None)}")

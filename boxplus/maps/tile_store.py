@@ -1,0 +1,168 @@
+"""Reading a map folder: tile by tile, with a word on what an interrupted run left incomplete."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.cloud_writer import CloudWriter
+from boxplus.formats.output import TEMPORARY_SUFFIX
+from boxplus.formats.pcd import PcdWriter
+from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
+from boxplus.formats.point_cloud import as_records
+from boxplus.maps.tile_journal import read_journal
+from boxplus.maps.tile_layout import (
+    Manifest,
+    TileIndex,
+    list_journals,
+    list_segments,
+    list_tiles,
+    read_manifest,
+    split_by_tile,
+    tile_folder,
+)
+from boxplus.maps.voxel_thinning import first_per_voxel
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """The points of one tile.
+
+    Attributes:
+        index: (i, j, k); the tile begins at index · tile_size in the world frame.
+        points: (N, 3) float32, world frame [m].
+        intensity: (N,) float32 or None.
+    """
+
+    index: TileIndex
+    points: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True, slots=True)
+class TileStore:
+    """A map folder opened for reading; make one with `TileStore.open`.
+
+    Attributes:
+        folder: the map folder.
+        manifest: its settings; `manifest.closed` says whether the run that wrote it came to its regular end.
+        counts: points per tile, before thinning across segments.
+        report: one sentence for everything that is torn, incomplete or was recovered; empty for a whole map.
+    """
+
+    folder: Path
+    manifest: Manifest
+    counts: dict[TileIndex, int]
+    report: tuple[str, ...]
+    _segments: dict[TileIndex, list[Path]]
+    _unsorted: dict[TileIndex, list[NDArray[np.float32]]]
+
+    @classmethod
+    def open(cls, folder: str | Path) -> TileStore:
+        """Look through a map folder without changing it.
+
+        Raises:
+            InputError: not a map folder.
+        """
+        base = Path(folder)
+        manifest = read_manifest(base)
+        report: list[str] = []
+        if not manifest.closed:
+            report.append("the run that wrote this map did not close it: it was interrupted, or is still going on")
+        segments: dict[TileIndex, list[Path]] = {}
+        counts: dict[TileIndex, int] = {}
+        written: set[tuple[TileIndex, int]] = set()
+        for index in list_tiles(base):
+            for generation, path in list_segments(base, index).items():
+                try:
+                    count = ply_vertex_count(path)
+                except InputError as error:
+                    report.append(f"a segment is damaged and left out: {error}")
+                    continue
+                written.add((index, generation))
+                segments.setdefault(index, []).append(path)
+                counts[index] = counts.get(index, 0) + count
+            torn = list(tile_folder(base, index).glob(f"*{TEMPORARY_SUFFIX}"))
+            if torn:
+                report.append(f"{torn[0]} was being written when the run ended; its points are read from the journal")
+        unsorted: dict[TileIndex, list[NDArray[np.float32]]] = {}
+        for generation, path in list_journals(base).items():
+            records, cut = read_journal(path)
+            taken = 0
+            for index, rows in split_by_tile(records, manifest.tile_size_m):
+                if (index, generation) not in written:
+                    unsorted.setdefault(index, []).append(rows)
+                    counts[index] = counts.get(index, 0) + len(rows)
+                    taken += len(rows)
+            report.append(
+                f"{taken} points were read from {path.name}, not yet sorted into tiles"
+                + ("; its last block was cut and is lost" if cut else "")
+            )
+        return cls(base, manifest, dict(sorted(counts.items())), tuple(report), segments, unsorted)
+
+    @property
+    def point_count(self) -> int:
+        """Points in all tiles, before thinning across segments."""
+        return sum(self.counts.values())
+
+    def iter_tiles(self, voxel: float | None = None) -> Iterator[Tile]:
+        """One tile after the other, in order of their index; memory holds one tile.
+
+        Args:
+            voxel: keep one point per voxel of this edge [m], the one that was written first; None: as the map was
+                written. Voxels end at the border of their tile.
+
+        Raises:
+            InputError: a segment was removed or damaged since the map was opened.
+        """
+        edge = self.manifest.voxel_m if voxel is None else voxel
+        for index in self.counts:
+            parts = [as_records(cloud.points, cloud.intensity) for cloud in map(read_ply, self._segments.get(index, []))]
+            records = np.concatenate(parts + self._unsorted.get(index, []))
+            if edge is not None:
+                records = records[first_per_voxel(records, edge)]
+            intensity = np.ascontiguousarray(records[:, 3]) if records.shape[1] == 4 else None
+            yield Tile(index, np.ascontiguousarray(records[:, :3]), intensity)
+
+
+def merge(
+    folder: str | Path, out_ply: str | Path | None = None, out_pcd: str | Path | None = None, voxel: float | None = None
+) -> int:
+    """Write all tiles of a map folder into one PLY and/or PCD file, holding one tile in memory at a time.
+
+    Args:
+        folder: the map folder; it is not changed.
+        out_ply, out_pcd: files to write; None leaves that format out.
+        voxel: keep one point per voxel of this edge [m]; None: as the map was written.
+
+    Returns:
+        The number of points written.
+
+    Raises:
+        InputError: not a map folder, a voxel that is not positive, or neither output named.
+        OutputError: a file cannot be written; nothing incomplete is left behind.
+    """
+    outputs = [(PlyWriter, out_ply), (PcdWriter, out_pcd)]
+    if out_ply is None and out_pcd is None:
+        raise InputError("an output file", "neither out_ply nor out_pcd", "name at least one")
+    store = TileStore.open(folder)
+    if voxel is not None and not voxel * 2**20 > store.manifest.tile_size_m:
+        raise InputError(
+            f"voxel above {store.manifest.tile_size_m / 2**20:.3g} m for tiles of {store.manifest.tile_size_m} m",
+            f"{voxel} m",
+            "give a larger voxel, or none to keep all points",
+        )
+    count = 0
+    with ExitStack() as stack:
+        writers: list[CloudWriter] = [stack.enter_context(kind(path)) for kind, path in outputs if path is not None]
+        for tile in store.iter_tiles(voxel):
+            for writer in writers:
+                writer.append(tile.points, tile.intensity)
+            count += len(tile.points)
+    return count
