@@ -1,0 +1,219 @@
+"""How the LiDAR turned from scan to scan, from the scans alone.
+
+A small point-to-plane ICP against the last few scans, in NumPy and SciPy: a second opinion on the gyroscope for the check of units,
+time bases and extrinsics, not an odometry. Each scan is undistorted with its own motion (constant velocity), and its pose
+belongs to the middle of the scan.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from boxplus.manifolds import so3
+from boxplus.sensors.scan import Scan
+
+_SCANS_IN_MAP = 4
+_POINTS = 1500
+_MOST_POINTS = 20_000
+_CELL = 0.03
+"""Size of the grid on which points are averaged, as a share of the median range; coarser where that makes too many cells."""
+_MOST_CELLS = 2500
+_NEIGHBOURS = 12
+_THICKEST_PLANE = 0.15
+"""Largest variance across a neighbourhood, as a share of its second one, that still makes a plane."""
+_THINNEST_PLANE = 0.02
+"""Smallest second variance as a share of the first: below it the neighbours lie on one ring and have no normal."""
+_REACH_M = (1.0, 0.5, 0.3)
+_ITERATIONS = 5
+_FEWEST_MATCHES = 100
+_SAME_PLANE = 0.9
+"""Cosine between the normals of two matched points."""
+_CONVERGED = 2e-4
+
+
+@dataclass(frozen=True, slots=True)
+class LidarRotations:
+    """Relative rotations between the middles of consecutive scans, registered scans only.
+
+    Attributes:
+        begin_ns, end_ns: (K,) int64, middle of the earlier and the later scan.
+        rotation: (K, 3) float64, rotation vector Log(R_earlier_later) in the LiDAR frame [rad].
+        failed: scans that could not be registered.
+    """
+
+    begin_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
+    rotation: NDArray[np.float64]
+    failed: int
+
+
+def lidar_rotations(scans: Iterable[Scan]) -> LidarRotations:
+    """Register every scan to the few before it.
+
+    Args:
+        scans: in order of time; streamed, only a few are held at once.
+    """
+    tracker = _Tracker()
+    steps = [step for scan in scans if (step := tracker.add(scan)) is not None]
+    begin = np.array([step[0] for step in steps], np.int64)
+    end = np.array([step[1] for step in steps], np.int64)
+    return LidarRotations(begin, end, np.array([step[2] for step in steps]).reshape(-1, 3), tracker.failed)
+
+
+@dataclass(slots=True)
+class _Patch:
+    """Points of one scan with normals, in the frame of the first scan."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+
+class _Tracker:
+    """The poses of the scans so far, as far as the next one needs them."""
+
+    def __init__(self) -> None:
+        self.failed = 0
+        self._patches: deque[_Patch] = deque(maxlen=_SCANS_IN_MAP)
+        self._R, self._t = np.eye(3), np.zeros(3)
+        self._turn, self._move = np.zeros(3), np.zeros(3)
+        self._previous_ns: int | None = None
+
+    def add(self, scan: Scan) -> tuple[int, int, NDArray[np.float64]] | None:
+        """(middle of the previous scan, of this one, rotation vector between them), or None when there is none to tell."""
+        if len(scan) < _FEWEST_MATCHES:
+            self._restart()
+            return None
+        raw, share = _cell_means(scan)
+        middle_ns = (scan.start_ns + scan.end_ns) // 2
+        step_s = 0.0 if self._previous_ns is None else (middle_ns - self._previous_ns) * 1e-9
+        if self._previous_ns is None or not 0.0 < step_s < 1.0:
+            self._restart()
+            self._previous_ns = middle_ns
+            planar, normals = _normals(raw)
+            self._patches.append(_Patch(raw[planar], normals))
+            return None
+        share *= (scan.end_ns - scan.start_ns) * 1e-9 / step_s
+        turn, move = self._turn, self._move
+        planar, normals = _normals(_undistort(raw, share, turn, move))
+        raw, share = raw[planar], share[planar]
+        # Twice: the motion found first undistorts the scan better than the previous scan's motion.
+        for reach in (_REACH_M, _REACH_M[1:]):
+            still = _undistort(raw, share, turn, move)
+            found = self._register(still, normals, turn, move, reach)
+            if found is None:
+                self.failed += 1
+                self._restart()
+                return None
+            turn, move = found
+        self._t = self._t + self._R @ move
+        self._R = self._R @ so3.exp(turn)
+        self._patches.append(_Patch(still @ self._R.T + self._t, normals @ self._R.T))
+        begin_ns, self._previous_ns = self._previous_ns, middle_ns
+        self._turn, self._move = turn, move
+        return begin_ns, middle_ns, turn
+
+    def _restart(self) -> None:
+        self._patches.clear()
+        self._R, self._t = np.eye(3), np.zeros(3)
+        self._turn, self._move = np.zeros(3), np.zeros(3)
+        self._previous_ns = None
+
+    def _register(
+        self,
+        points: NDArray[np.float64],
+        normals: NDArray[np.float64],
+        turn: NDArray[np.float64],
+        move: NDArray[np.float64],
+        reach: tuple[float, ...],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Rotation vector and translation from the previous scan, from a first guess of both."""
+        stride = -(-len(points) // _POINTS) or 1
+        points, normals = points[::stride], normals[::stride]
+        target = np.concatenate([patch.points for patch in self._patches])
+        target_normals = np.concatenate([patch.normals for patch in self._patches])
+        if len(target) < _FEWEST_MATCHES or len(points) < _FEWEST_MATCHES:
+            return None
+        tree = cKDTree(target)
+        R, t = self._R @ so3.exp(turn), self._t + self._R @ move
+        for distance in reach:
+            for _ in range(_ITERATIONS):
+                world = points @ R.T + t
+                gap, index = tree.query(world, distance_upper_bound=distance)
+                hit = np.isfinite(gap)
+                index[~hit] = 0
+                plane = target_normals[index]
+                hit &= np.abs(np.einsum("ij,ij->i", plane, normals @ R.T)) > _SAME_PLANE
+                if hit.sum() < _FEWEST_MATCHES:
+                    return None
+                change = _gauss_newton_step(world[hit], target[index[hit]], plane[hit])
+                if change is None:
+                    return None
+                dR = so3.exp(change[:3])
+                R, t = dR @ R, dR @ t + change[3:]
+                if np.abs(change).max() < _CONVERGED:
+                    break
+        return so3.log(self._R.T @ R), self._R.T @ (t - self._t)
+
+
+def _gauss_newton_step(
+    points: NDArray[np.float64], target: NDArray[np.float64], normals: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """(6,) rotation vector and translation, on the left, that bring the points onto their planes; None when undetermined."""
+    residual = np.einsum("ij,ij->i", normals, points - target)
+    sigma = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+    weight = 1.0 / (1.0 + (residual / (3.0 * sigma)) ** 2) ** 2
+    J = np.concatenate((np.cross(points, normals), normals), axis=1)
+    H = J.T @ (J * weight[:, None])
+    if np.linalg.eigvalsh(H[:3, :3])[0] < 1e-6 * len(points):
+        return None
+    H[np.diag_indices(6)] += 1e-6 * np.trace(H)  # a corridor leaves a translation free; the rotation is what counts here
+    return -np.linalg.solve(H, J.T @ (weight * residual))
+
+
+def _undistort(
+    points: NDArray[np.float64], share: NDArray[np.float64], turn: NDArray[np.float64], move: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The points as seen from the sensor in the middle of the scan, to second order in the rotation."""
+    part = share[:, None]
+    once = np.cross(turn, points)
+    return points + part * (once + move) + 0.5 * part**2 * np.cross(turn, once)
+
+
+def _cell_means(scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The mean of the points in every cell of a grid, and when in the scan it was taken, from -0.5 to 0.5.
+
+    Even over the surfaces where points crowd near the sensor, and with less noise than single points.
+    """
+    stride = -(-len(scan) // _MOST_POINTS)
+    points = scan.p_lidar[::stride].astype(np.float64)
+    share = (scan.time_ns[::stride] - scan.start_ns) / max(scan.end_ns - scan.start_ns, 1) - 0.5
+    size = max(_CELL * float(np.median(np.linalg.norm(points, axis=1))), 1e-3)
+    cell, count = _grid(points, size)
+    if len(count) > _MOST_CELLS:
+        cell, count = _grid(points, size * float(np.sqrt(len(count) / _MOST_CELLS)))
+    means = np.stack([np.bincount(cell, values) for values in (*points.T, share)], axis=1) / count[:, None]
+    return means[:, :3], means[:, 3]
+
+
+def _grid(points: NDArray[np.float64], size: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The cell (N,) of every point, and how many points each cell holds (M,)."""
+    cells = np.floor(points / size).astype(np.int64)
+    key = (cells[:, 0] * 73_856_093) ^ (cells[:, 1] * 19_349_663) ^ (cells[:, 2] * 83_492_791)
+    _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
+    return cell, count
+
+
+def _normals(points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Which of the points (N, 3) have neighbours that form a plane (N,), and the normals of those (M, 3)."""
+    _, index = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    neighbours = points[index]
+    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
+    plane = (variance[:, 0] < _THICKEST_PLANE * variance[:, 1]) & (variance[:, 1] > _THINNEST_PLANE * variance[:, 2])
+    return plane, axes[plane][:, :, 0]
