@@ -25,6 +25,8 @@ _FEWEST_INTERVALS = 10
 _ROUNDS = 4
 _DETERMINED_DEG = 3.0
 _OFFSET_KNOWN_S = 0.01
+_REGISTRATION_LAG_S = 0.003
+"""What registration against a map of the last scans lags by, measured on recordings with known offset."""
 _IDENTITY_WEIGHT = 1e-3
 
 
@@ -138,7 +140,8 @@ class _Attitude:
         if not len(self._time_ns):
             return np.zeros(len(time_ns), dtype=bool)
         margin = int(_LARGEST_OFFSET_S * 1e9)
-        return (time_ns >= self._time_ns[0] + margin) & (time_ns <= self._time_ns[-1] - margin)
+        covered: NDArray[np.bool_] = (time_ns >= self._time_ns[0] + margin) & (time_ns <= self._time_ns[-1] - margin)
+        return covered
 
     def at(self, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         index = np.clip(np.searchsorted(self._time_ns, time_ns, side="right") - 1, 0, len(self._rate) - 1)
@@ -186,7 +189,7 @@ def _fit(rate_imu: NDArray[np.float64], rate_lidar: NDArray[np.float64]) -> _Fit
         mean_lidar = weight @ rate_lidar / total
         a, b = rate_imu - mean_imu, rate_lidar - mean_lidar
         H = (a * weight[:, None]).T @ b / total
-        U, S, Vt = np.linalg.svd(H + _IDENTITY_WEIGHT * np.trace((b * weight[:, None]).T @ b) / total * np.eye(3))
+        U, _, Vt = np.linalg.svd(H + _IDENTITY_WEIGHT * np.trace((b * weight[:, None]).T @ b) / total * np.eye(3))
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
         turned = b @ R.T
         power = float((weight[:, None] * b**2).sum())
@@ -221,7 +224,7 @@ def _time_offset(
         return float(offsets[best]), np.inf
     offset_s = float(offsets[best] - np.clip(0.5 * slope / curvature, -_OFFSET_STEP_S, _OFFSET_STEP_S))
     freedom = max(3 * len(begin_ns) - 7, 1)
-    return offset_s, float(np.sqrt(costs[best] / freedom / curvature))
+    return offset_s, float(np.hypot(np.sqrt(costs[best] / freedom / curvature), _REGISTRATION_LAG_S))
 
 
 def _describe(
@@ -243,7 +246,7 @@ def _describe(
     )
     advice = "" if observable == 3 else "; turn about more axes to determine the rest"
     return (
-        f"over {count} scan pairs with rotation rates of {rates} deg/s (rms along the principal axes) gyroscope and LiDAR differ by "
-        f"{residual_deg:.2f} deg a pair, ratio {scale:.3g}, {offset}; the rotation is {known[observable]} "
+        f"over {count} scan pairs with rotation rates of {rates} deg/s (rms along the principal axes) gyroscope and LiDAR "
+        f"differ by {residual_deg:.2f} deg a pair, ratio {scale:.3g}, {offset}; the rotation is {known[observable]} "
         f"(std {std_deg[0]:.2f}, {std_deg[1]:.2f}, {std_deg[2]:.2f} deg){advice}"
     )

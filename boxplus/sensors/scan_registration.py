@@ -1,6 +1,6 @@
 """How the LiDAR turned from scan to scan, from the scans alone.
 
-A small point-to-plane ICP against the last few scans, in NumPy and SciPy: a second opinion on the gyroscope for the check of units,
+A small point-to-plane ICP against the last few scans, in NumPy and SciPy: a second opinion on the IMU for the check of units,
 time bases and extrinsics, not an odometry. Each scan is undistorted with its own motion (constant velocity), and its pose
 belongs to the middle of the scan.
 """
@@ -39,17 +39,19 @@ _CONVERGED = 2e-4
 
 @dataclass(frozen=True, slots=True)
 class LidarRotations:
-    """Relative rotations between the middles of consecutive scans, registered scans only.
+    """Relative motions between the middles of consecutive scans, registered scans only.
 
     Attributes:
         begin_ns, end_ns: (K,) int64, middle of the earlier and the later scan.
         rotation: (K, 3) float64, rotation vector Log(R_earlier_later) in the LiDAR frame [rad].
+        translation: (K, 3) float64, the later position in the earlier scan's frame [m].
         failed: scans that could not be registered.
     """
 
     begin_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
     rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
     failed: int
 
 
@@ -63,7 +65,9 @@ def lidar_rotations(scans: Iterable[Scan]) -> LidarRotations:
     steps = [step for scan in scans if (step := tracker.add(scan)) is not None]
     begin = np.array([step[0] for step in steps], np.int64)
     end = np.array([step[1] for step in steps], np.int64)
-    return LidarRotations(begin, end, np.array([step[2] for step in steps]).reshape(-1, 3), tracker.failed)
+    rotation = np.array([step[2] for step in steps]).reshape(-1, 3)
+    translation = np.array([step[3] for step in steps]).reshape(-1, 3)
+    return LidarRotations(begin, end, rotation, translation, tracker.failed)
 
 
 @dataclass(slots=True)
@@ -74,6 +78,10 @@ class _Patch:
     normals: NDArray[np.float64]
 
 
+_Step = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
+"""Middle of the earlier and of the later scan, rotation vector and translation between them."""
+
+
 class _Tracker:
     """The poses of the scans so far, as far as the next one needs them."""
 
@@ -81,11 +89,11 @@ class _Tracker:
         self.failed = 0
         self._patches: deque[_Patch] = deque(maxlen=_SCANS_IN_MAP)
         self._R, self._t = np.eye(3), np.zeros(3)
-        self._turn, self._move = np.zeros(3), np.zeros(3)
+        self._turn, self._move, self._turned = np.zeros(3), np.zeros(3), False
         self._previous_ns: int | None = None
 
-    def add(self, scan: Scan) -> tuple[int, int, NDArray[np.float64]] | None:
-        """(middle of the previous scan, of this one, rotation vector between them), or None when there is none to tell."""
+    def add(self, scan: Scan) -> _Step | None:
+        """The motion from the previous scan to this one, or None when there is none to tell."""
         if len(scan) < _FEWEST_MATCHES:
             self._restart()
             return None
@@ -104,7 +112,9 @@ class _Tracker:
         raw, share = raw[planar], share[planar]
         # Twice: the motion found first undistorts the scan better than the previous scan's motion.
         for reach in (_REACH_M, _REACH_M[1:]):
-            still = _undistort(raw, share, turn, move)
+            # `turn` is the mean between the middles of two scans; in the middle of this one it has changed by half a step more.
+            now = turn + 0.5 * (turn - self._turn) if self._turned else turn
+            still = _undistort(raw, share, now, move)
             found = self._register(still, normals, turn, move, reach)
             if found is None:
                 self.failed += 1
@@ -115,13 +125,13 @@ class _Tracker:
         self._R = self._R @ so3.exp(turn)
         self._patches.append(_Patch(still @ self._R.T + self._t, normals @ self._R.T))
         begin_ns, self._previous_ns = self._previous_ns, middle_ns
-        self._turn, self._move = turn, move
-        return begin_ns, middle_ns, turn
+        self._turn, self._move, self._turned = turn, move, True
+        return begin_ns, middle_ns, turn, move
 
     def _restart(self) -> None:
         self._patches.clear()
         self._R, self._t = np.eye(3), np.zeros(3)
-        self._turn, self._move = np.zeros(3), np.zeros(3)
+        self._turn, self._move, self._turned = np.zeros(3), np.zeros(3), False
         self._previous_ns = None
 
     def _register(
