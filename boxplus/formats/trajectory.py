@@ -42,6 +42,7 @@ class Trajectory:
         q_wxyz: (N, 4) float64, unit Hamilton quaternions of `R_world_body`.
         covariance: (N, 6, 6) float64 or None, of the pose error, rotation first [rad², rad·m, m²].
         status: N words or None, the estimator's verdict on each pose.
+        matrices: (N, 3, 3) the rotations digit by digit as a KITTI file has them, or None; `q_wxyz` is the same, normalised.
         source: where the poses come from; error messages begin with it.
         warnings: what the reader had to leave out, one sentence each.
 
@@ -55,6 +56,7 @@ class Trajectory:
     q_wxyz: NDArray[np.float64]
     covariance: NDArray[np.float64] | None = None
     status: tuple[str, ...] | None = None
+    matrices: NDArray[np.float64] | None = None
     source: str = "trajectory"
     warnings: tuple[str, ...] = ()
     lines: InitVar[ArrayLike | None] = None
@@ -87,6 +89,8 @@ class Trajectory:
             object.__setattr__(self, "time_ns", _times(self.time_ns, count, self.source, where))
         if self.covariance is not None:
             object.__setattr__(self, "covariance", _array(self.covariance, (count, 6, 6), "covariances", self.source))
+        if self.matrices is not None:
+            object.__setattr__(self, "matrices", _array(self.matrices, (count, 3, 3), "rotation matrices", self.source))
         if self.status is not None and len(self.status) != count:
             raise InputError(f"{count} status words, one per pose", f"{len(self.status)} ({self.source})", "give one per pose")
 
@@ -103,6 +107,11 @@ class Trajectory:
         if self.time_ns is None:
             raise InputError("a trajectory with time stamps", f"{self.source} without", "use TUM, EuRoC or CSV, which carry time")
         return self.time_ns
+
+    @property
+    def R(self) -> NDArray[np.float64]:
+        """(N, 3, 3) rotation matrices `R_world_body`; those of a KITTI file are orthonormal up to the digits it has."""
+        return quaternion.to_matrix(self.q_wxyz) if self.matrices is None else self.matrices
 
     @property
     def duration_s(self) -> float:
@@ -123,6 +132,7 @@ class Trajectory:
             q_wxyz=self.q_wxyz[index],
             covariance=None if self.covariance is None else self.covariance[index],
             status=None if self.status is None else tuple(self.status[i] for i in index),
+            matrices=None if self.matrices is None else self.matrices[index],
             lines=None,
         )
 
@@ -225,6 +235,7 @@ def _assemble(rows: list[Row], numbers: list[int], layout: Format, source: str, 
         rows = [row for i, row in enumerate(rows) if i not in repeated]
         numbers = [number for i, number in enumerate(numbers) if i not in repeated]
     rotation = np.array([row.rotation for row in rows], dtype=np.float64)
+    matrices: NDArray[np.float64] | None
     if layout == "kitti":
         matrices = rotation.reshape(-1, 3, 3)
         with np.errstate(all="ignore"):
@@ -237,6 +248,8 @@ def _assemble(rows: list[Row], numbers: list[int], layout: Format, source: str, 
                 "check that the file holds 3×4 pose matrices row by row",
             )
         rotation = quaternion.from_matrix(matrices)
+    else:
+        matrices = None
     covariance = None
     if layout == "csv":
         covariance = np.empty((len(rows), 6, 6))
@@ -247,6 +260,7 @@ def _assemble(rows: list[Row], numbers: list[int], layout: Format, source: str, 
         q_wxyz=rotation,
         covariance=None if covariance is None or np.isnan(covariance).all() else covariance,
         status=tuple(row.status or "" for row in rows) if layout == "csv" else None,
+        matrices=matrices,
         source=source,
         warnings=warnings,
         lines=numbers,
@@ -271,9 +285,8 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    R = quaternion.to_matrix(trajectory.q_wxyz)
     with atomic_file(path) as file:
-        file.writelines(kitti_row(*row).encode() for row in zip(R, trajectory.p, strict=True))
+        file.writelines(kitti_row(*row).encode() for row in zip(trajectory.R, trajectory.p, strict=True))
 
 
 def write_csv(path: str | Path, trajectory: Trajectory) -> None:

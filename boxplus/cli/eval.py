@@ -1,0 +1,78 @@
+"""`boxplus eval`: how good is an estimated trajectory."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class _Alignment(StrEnum):
+    se3 = "se3"
+    sim3 = "sim3"
+    none = "none"
+
+
+class _Format(StrEnum):
+    auto = "auto"
+    tum = "tum"
+    kitti = "kitti"
+    euroc = "euroc"
+    csv = "csv"
+
+
+class _Pairs(StrEnum):
+    consecutive = "consecutive"
+    all = "all"
+
+
+def evaluate_command(
+    estimate: Annotated[Path, typer.Argument(help="Estimated trajectory: TUM, KITTI, EuRoC or boxplus CSV.", metavar="ESTIMATE")],
+    ground_truth: Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.", metavar="GROUND_TRUTH")],
+    align: Annotated[_Alignment, typer.Option(help="Transform of the estimate onto the ground truth.")] = _Alignment.se3,
+    max_diff: Annotated[float, typer.Option(help="Largest stamp difference of a match [s].")] = 0.02,
+    offset: Annotated[float, typer.Option(help="Added to the stamps of the estimate [s].")] = 0.0,
+    interpolate: Annotated[
+        bool, typer.Option("--interpolate", help="Interpolate the ground truth at the estimate's stamps.")
+    ] = False,
+    max_gap: Annotated[float, typer.Option(help="Longest gap of the ground truth to interpolate [s].")] = 0.25,
+    min_matches: Annotated[int, typer.Option(help="Refuse to compare fewer matches.")] = 10,
+    rpe_distance: Annotated[float, typer.Option(help="Distance of the relative error [m]; 0 leaves it out.")] = 10.0,
+    rpe_time: Annotated[float, typer.Option(help="Time of the relative error [s]; 0 leaves it out.")] = 1.0,
+    rpe_pairs: Annotated[_Pairs, typer.Option(help="Pairs one after the other, or one from every pose.")] = _Pairs.consecutive,
+    format: Annotated[_Format, typer.Option(help="Format of the estimate.")] = _Format.auto,
+    ground_truth_format: Annotated[_Format, typer.Option(help="Format of the ground truth.")] = _Format.auto,
+    plot: Annotated[Path | None, typer.Option(help="Folder to draw pictures into.", metavar="DIR")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Compare an estimated trajectory with the ground truth: association, ATE and RPE.
+
+    The association report comes first. Comparisons that mean nothing (too few matches, no overlap in time, another unit,
+    positions that do not determine the alignment) are refused with the reason.
+    """
+    from boxplus.evaluation.evaluation import evaluate
+    from boxplus.formats.trajectory import read_trajectory
+
+    estimated, truth = read_trajectory(estimate, format.value), read_trajectory(ground_truth, ground_truth_format.value)
+    evaluation = evaluate(
+        estimated,
+        truth,
+        alignment=align.value,
+        method="interpolate" if interpolate else "nearest",
+        max_difference_s=max_diff,
+        offset_s=offset,
+        max_gap_s=max_gap,
+        min_matches=min_matches,
+        rpe_distance_m=rpe_distance or None,
+        rpe_time_s=rpe_time or None,
+        rpe_pairs=rpe_pairs.value,
+    )
+    typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else evaluation.summary())
+    if plot is not None:
+        from boxplus.evaluation.plots import write_plots
+
+        for path in write_plots(evaluation, plot, estimated, truth):
+            typer.echo(f"drew {path}", err=True)

@@ -1,0 +1,98 @@
+"""The transform that brings an estimate into the frame of the ground truth, from matched positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion
+
+AlignmentKind = Literal["none", "se3", "sim3"]
+
+_COINCIDENT_M = 1e-6
+_COLLINEAR = 1e-3  # second against first principal standard deviation
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """x_world = scale · R_world_estimate · x_estimate + p_world_estimate.
+
+    Attributes:
+        kind: `none`, `se3` or `sim3`.
+        R_world_estimate: (3, 3) rotation.
+        p_world_estimate: (3,) [m].
+        scale: 1 unless `sim3`.
+        spread_m: (3,) principal standard deviations of the matched ground-truth positions, largest first [m].
+        mirrored: the best fit without the demand for a rotation would have been a mirror image.
+    """
+
+    kind: AlignmentKind
+    R_world_estimate: NDArray[np.float64]
+    p_world_estimate: NDArray[np.float64]
+    scale: float
+    spread_m: NDArray[np.float64]
+    mirrored: bool
+
+    def apply(self, trajectory: Trajectory) -> Trajectory:
+        """The trajectory in the frame of the ground truth. Covariances are dropped: they belong to the frame before."""
+        R = self.R_world_estimate @ trajectory.R
+        p = self.scale * trajectory.p @ self.R_world_estimate.T + self.p_world_estimate
+        return replace(trajectory, p=p, q_wxyz=quaternion.from_matrix(R), matrices=R, covariance=None, lines=None)
+
+
+def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: AlignmentKind = "se3") -> Alignment:
+    """Least-squares transform of the estimate's positions onto the ground truth's (Umeyama 1991, eqs. 34-42).
+
+    Args:
+        p_estimate, p_ground_truth: (M, 3) matched positions [m].
+        kind: `se3` (rotation and translation), `sim3` (and scale) or `none` (identity).
+
+    Raises:
+        InputError: fewer than three positions, or positions that do not determine the rotation: all in one place or on
+            one line.
+    """
+    x, y = np.asarray(p_estimate, dtype=np.float64), np.asarray(p_ground_truth, dtype=np.float64)
+    if x.ndim != 2 or x.shape[1:] != (3,) or x.shape != y.shape:
+        raise InputError(
+            "matched positions of shape (M, 3)", f"shapes {x.shape} and {y.shape}", "associate the trajectories first"
+        )
+    spread = principal_spread(y)
+    if kind == "none":
+        return Alignment(kind, np.eye(3), np.zeros(3), 1.0, spread, False)
+    if len(x) < 3:
+        raise InputError(
+            "at least three matched positions to align", f"{len(x)}", "compare with --align none, or match more poses"
+        )
+    for name, values in (("ground truth", spread), ("estimate", principal_spread(x))):
+        if values[0] < _COINCIDENT_M:
+            raise InputError(
+                f"{name} positions that differ, to align by them",
+                f"{len(x)} positions within {values[0]:.1e} m: rotation undetermined",
+                "compare with --align none",
+            )
+        if values[1] < _COLLINEAR * values[0]:
+            raise InputError(
+                f"{name} positions off one line, to align by them",
+                f"{len(x)} positions that stray {values[1]:.2g} m from a line of {values[0]:.3g} m (standard deviations): the "
+                "rotation about that line is undetermined",
+                "compare with --align none",
+            )
+    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
+    U, d, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
+    sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
+    R = (U * sign) @ Vt
+    scale = float((d * sign).sum() / ((x - mean_x) ** 2).sum(axis=1).mean()) if kind == "sim3" else 1.0
+    mirrored = bool(sign[2] < 0 and d[2] > 0.1 * d[1])
+    return Alignment(kind, R, mean_y - scale * R @ mean_x, scale, spread, mirrored)
+
+
+def principal_spread(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) standard deviations of (M, 3) positions along their principal axes, largest first [m]."""
+    centred = p - p.mean(axis=0)
+    values = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(p))
+    return np.concatenate([values, np.zeros(3 - len(values))])

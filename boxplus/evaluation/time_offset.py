@@ -1,0 +1,119 @@
+"""The offset between two clocks, from the motion that both trajectories saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import so3
+
+_LEAST_OVERLAP_S = 5.0
+_LARGEST_OFFSET_S = 2.0
+_LEAST_CORRELATION = 0.8
+_MOST_SAMPLES = 60_000
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOffset:
+    """The offset that makes two motions fit best.
+
+    Attributes:
+        offset_s: to be added to the stamps of the estimate [s].
+        correlation: normalised correlation of the two motions at that offset, at most 1.
+        signal: `rotation` or `translation`: which speed was compared.
+    """
+
+    offset_s: float
+    correlation: float
+    signal: str
+
+
+def estimate_time_offset(
+    t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
+) -> TimeOffset | None:
+    """Correlate the speeds of both trajectories within ±2 s.
+
+    Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation
+    not on their scale. The better of the two signals counts.
+
+    Args:
+        t_estimate, t_ground_truth: (N,) int64 stamps to use [ns], in the place of the trajectories' own.
+        estimate, ground_truth: the trajectories.
+
+    Returns:
+        None where the trajectories overlap for less than 5 s, or no offset gives a correlation of 0.8 inside the range.
+    """
+    begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
+    if float(end - begin) * 1e-9 < _LEAST_OVERLAP_S or min(len(estimate), len(ground_truth)) < 20:
+        return None
+    step = max(
+        float(np.median(np.diff(t_ground_truth))), 0.2 * float(np.median(np.diff(t_estimate))), float(end - begin) / _MOST_SAMPLES
+    )
+    grid = np.arange(0.0, float(end - begin), step)
+    lags = min(int(_LARGEST_OFFSET_S * 1e9 / step), len(grid) // 4)
+    if lags < 2:
+        return None
+    # Both speeds over the same window: that of the estimate's own rate, or 0.1 s.
+    window = max(float(np.median(np.diff(t_estimate))), 1e8, 2.0 * step)
+    found = []
+    for signal, difference in (("rotation", _rotation_speed), ("translation", _translation_speed)):
+        a = difference(t_estimate - begin, estimate, grid, window)
+        b = difference(t_ground_truth - begin, ground_truth, grid, window)
+        lag, correlation = _best_lag(a, b, lags)
+        if correlation >= _LEAST_CORRELATION and abs(lag) < lags:
+            found.append(TimeOffset(lag * step * 1e-9, correlation, signal))
+    return max(found, key=lambda offset: offset.correlation, default=None)
+
+
+def _translation_speed(
+    t: NDArray[np.int64], trajectory: Trajectory, grid: NDArray[np.float64], window: float
+) -> NDArray[np.float64]:
+    early, late = (
+        np.stack([np.interp(grid + side * window / 2, t, trajectory.p[:, axis]) for axis in range(3)], axis=1) for side in (-1, 1)
+    )
+    return np.asarray(np.linalg.norm(late - early, axis=1))
+
+
+def _rotation_speed(
+    t: NDArray[np.int64], trajectory: Trajectory, grid: NDArray[np.float64], window: float
+) -> NDArray[np.float64]:
+    """Angle turned within the window, from the nearest measured poses, per time between them."""
+    rows = [_nearest_row(t, grid + side * window / 2) for side in (-1, 1)]
+    R = trajectory.R
+    angle = np.linalg.norm(so3.log(R[rows[0]].transpose(0, 2, 1) @ R[rows[1]]), axis=1)
+    return np.asarray(angle / np.maximum(t[rows[1]] - t[rows[0]], 1.0))
+
+
+def _nearest_row(t: NDArray[np.int64], at: NDArray[np.float64]) -> NDArray[np.intp]:
+    after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    return after - (at - t[after - 1] < t[after] - at)
+
+
+def _best_lag(a: NDArray[np.float64], b: NDArray[np.float64], lags: int) -> tuple[float, float]:
+    """The lag (in samples, refined by a parabola) by which `a` must be moved later to fit `b` best, and the correlation there."""
+    from scipy.signal import correlate
+
+    n = len(a)
+    core = a[lags : n - lags] - a[lags : n - lags].mean()
+    m = len(core)
+    # Correlation of the middle of `a` with every window of `b`, each window centred and normalised by itself.
+    sums = np.concatenate([[0.0], np.cumsum(b)])
+    squares = np.concatenate([[0.0], np.cumsum(b * b)])
+    mean = (sums[m:] - sums[:-m]) / m
+    spread = np.sqrt(np.maximum((squares[m:] - squares[:-m]) / m - mean**2, 0.0))
+    scale = float(np.sqrt(np.mean(core**2)))
+    if scale < 1e-12 or spread.max() < 1e-12:
+        return 0.0, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = correlate(b, core, mode="valid") / (m * scale * spread)
+    values = np.where(np.isfinite(values), values, 0.0)
+    best = int(np.argmax(values))
+    lag = float(best - lags)
+    if 0 < best < len(values) - 1:
+        left, middle, right = values[best - 1 : best + 2]
+        bend = left - 2 * middle + right
+        lag += 0.5 * (left - right) / bend if bend < 0 else 0.0
+    return lag, float(values[best])

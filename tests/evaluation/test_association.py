@@ -1,0 +1,147 @@
+"""Matching of stamps, interpolation, clock offsets, and the comparisons that are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from smooth_paths import SmoothPath
+
+from boxplus.errors import InputError
+from boxplus.evaluation.association import associate
+from boxplus.formats.trajectory import Trajectory
+
+stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=40, unique=True).map(sorted)
+
+
+def still(times: list[int]) -> Trajectory:
+    count = len(times)
+    return Trajectory(np.array(times, dtype=np.int64), np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)))
+
+
+@settings(max_examples=200, deadline=None)
+@given(estimate=stamps, truth=stamps, limit=st.integers(1, 500))
+def test_nearest_pairs_against_brute_force(estimate: list[int], truth: list[int], limit: int) -> None:
+    best: dict[int, tuple[int, int]] = {}  # ground truth → (difference, estimate)
+    for i, t in enumerate(estimate):
+        difference, j = min((abs(t - other), j) for j, other in enumerate(truth))
+        if difference <= limit:
+            best[j] = min(best.get(j, (difference, i)), (difference, i))
+    expected = sorted((i, j) for j, (_, i) in best.items())
+    try:
+        found = associate(still(estimate), still(truth), max_difference_s=limit * 1e-9, min_matches=1)
+    except InputError:
+        assert not expected or max(estimate[0], truth[0]) > min(estimate[-1], truth[-1])
+        return
+    assert list(zip(found.estimate_index.tolist(), found.ground_truth_index.tolist(), strict=True)) == expected
+    assert found.unmatched_estimate == len(estimate) - len(expected)
+    assert found.outside == sum(t < truth[0] or t > truth[-1] for t in estimate)
+    np.testing.assert_array_equal(found.difference_s * 1e9 <= limit + 1e-6, True)
+
+
+def test_interpolation_follows_the_path() -> None:
+    path = SmoothPath(1)
+    truth, estimate = path.sample(np.arange(0.0, 30.0, 0.01)), path.sample(np.arange(0.003, 29.9, 0.1))
+    found = associate(estimate, truth, "interpolate")
+    assert len(found) == len(estimate)
+    np.testing.assert_allclose(found.ground_truth.p, estimate.p, atol=2e-4)
+    angle = 2 * np.arccos(np.minimum(1.0, np.abs(np.sum(found.ground_truth.q_wxyz * estimate.q_wxyz, axis=1))))
+    assert angle.max() < 1e-3
+    np.testing.assert_array_equal(found.ground_truth.times, estimate.times)
+
+
+def test_interpolation_on_a_measured_pose_is_that_pose() -> None:
+    truth = SmoothPath(2).sample(np.arange(0.0, 10.0, 0.1))
+    found = associate(truth, truth, "interpolate", max_gap_s=0.01)
+    assert len(found) == len(truth)
+    np.testing.assert_allclose(found.ground_truth.p, truth.p, atol=1e-12)
+
+
+def test_ground_truth_gaps_are_not_interpolated_and_reported() -> None:
+    path = SmoothPath(3)
+    t = np.arange(0.0, 20.0, 0.01)
+    truth, estimate = path.sample(t[(t < 8.0) | (t > 11.0)]), path.sample(np.arange(0.005, 19.9, 0.05))
+    for method in ("nearest", "interpolate"):
+        found = associate(estimate, truth, method)
+        assert len(found) == pytest.approx(len(estimate) - 60, abs=2)
+        ((begin, end),) = found.gaps
+        assert (begin, end) == (pytest.approx(8.0, abs=0.06), pytest.approx(11.0, abs=0.06))
+        assert any("1 gaps without matches" in line for line in found.lines())
+
+
+@pytest.mark.parametrize("offset", [-0.7, -0.05, 0.0, 0.013, 0.3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_clock_offset_is_found_from_the_motion(offset: float, seed: int) -> None:
+    path = SmoothPath(seed)
+    truth = path.sample(np.arange(0.0, 30.0, 0.01))
+    estimate = path.sample(np.arange(1.0, 29.0, 0.1))
+    late = Trajectory(estimate.times - round(offset * 1e9), estimate.p, estimate.q_wxyz)
+    found = associate(late, truth).time_offset
+    assert found is not None
+    assert found.offset_s == pytest.approx(offset, abs=0.01)
+    assert found.correlation > 0.95
+    again = associate(late, truth, offset_s=offset).time_offset
+    assert again is not None
+    assert abs(again.offset_s) < 0.01
+
+
+def test_motions_that_do_not_tell_give_no_offset() -> None:
+    t = np.arange(0.0, 20.0, 0.05)
+    straight = Trajectory(
+        np.round(t * 1e9).astype(np.int64), t[:, None] * np.array([1.0, 0.0, 0.0]), np.tile([1.0, 0, 0, 0], (len(t), 1))
+    )
+    assert associate(straight, straight).time_offset is None
+    other = SmoothPath(5).sample(t, 0)
+    assert associate(SmoothPath(6).sample(t, 0), other).time_offset is None
+
+
+def shifted(trajectory: Trajectory, start_ns: int, factor: float = 1.0) -> Trajectory:
+    time = start_ns + np.round((trajectory.times - trajectory.times[0]) * factor).astype(np.int64)
+    return Trajectory(time, trajectory.p, trajectory.q_wxyz, source="estimate.tum")
+
+
+def test_no_overlap_says_which_offset_would_make_them_start_together() -> None:
+    truth = SmoothPath(0).sample(np.arange(0.0, 20.0, 0.01))
+    with pytest.raises(
+        InputError,
+        match=r"expected two trajectories that overlap in time – got 0\.000 … 19\.990 s \(estimate\.tum\) and 1500000000\.000 … "
+        r"1500000019\.990 s \(path\) – give the clocks' difference with --offset \(equal starts: --offset 1500000000\.000000\)",
+    ):
+        associate(shifted(truth, 0), truth)
+
+
+@pytest.mark.parametrize(("factor", "word"), [(1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")])
+def test_another_unit_of_time_is_suspected(factor: float, word: str) -> None:
+    truth = SmoothPath(0).sample(np.arange(0.0, 20.0, 0.5))
+    small = shifted(truth, round(truth.times[0] * factor), max(factor, 1e-6))
+    with pytest.raises(InputError, match=rf"differ by a factor of about 1e\+0\d: {word} against seconds\? correct the unit"):
+        associate(small, truth)
+
+
+def test_too_few_matches_are_refused_with_a_hint() -> None:
+    path = SmoothPath(0)
+    truth = path.sample(np.arange(0.0, 20.0, 0.5))
+    with pytest.raises(InputError, match=r"at least 10 matched poses – got 0 of 39 .* – raise --max-diff, use --interpolate"):
+        associate(path.sample(np.arange(0.25, 19.6, 0.5)), truth)
+    with pytest.raises(InputError, match=r"got 1 of 1 "):
+        associate(path.sample(np.array([5.0])), truth)
+
+
+def test_trajectories_without_stamps_go_by_index() -> None:
+    path = SmoothPath(0).sample(np.arange(0.0, 20.0, 0.5))
+    bare = Trajectory(None, path.p, path.q_wxyz)
+    found = associate(bare, bare)
+    assert found.method == "index"
+    assert found.lines() == ["matched 40 poses by index (the files carry no time stamps)"]
+    with pytest.raises(InputError, match=r"of the same length, at least 10 poses – got 40 .* and 39"):
+        associate(bare, bare.select(np.arange(39)))
+    with pytest.raises(InputError, match="a trajectory with time stamps"):
+        associate(bare, path)
+
+
+def test_settings_are_checked() -> None:
+    path = SmoothPath(0).sample(np.arange(0.0, 20.0, 0.5))
+    for wrong in ({"max_difference_s": 0.0}, {"max_difference_s": np.nan}, {"offset_s": np.inf}, {"min_matches": 0}):
+        with pytest.raises(InputError, match="positive max_difference_s"):
+            associate(path, path, **wrong)
