@@ -1,0 +1,90 @@
+"""A model of an IMU: white noise, wandering biases, saturation."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus.simulation.spline import Motion
+
+GRAVITY = 9.81
+"""Free fall in simulated worlds [m/s²], along −z."""
+
+_BIAS_STEP_S = 0.1
+
+
+class ImuModel(BaseModel):
+    """Errors of an IMU; the default is the ADIS16448 as characterised for the EuRoC recordings.
+
+    A sample reads a_m = R_world_imuᵀ (a − g) + b_a + n_a and ω_m = ω + b_w + n_w (SPEC.md section 0), and is clipped at the
+    limits of the sensor. White noise of density σ has standard deviation σ √rate a sample.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_hz: float = Field(200.0, gt=0, description="samples per second")
+    gyro_noise_density: float = Field(1.7e-4, ge=0, description="[rad/s/√Hz]")
+    accel_noise_density: float = Field(2.0e-3, ge=0, description="[m/s²/√Hz]")
+    gyro_bias_walk: float = Field(1.9e-5, ge=0, description="[rad/s²/√Hz]")
+    accel_bias_walk: float = Field(3.0e-3, ge=0, description="[m/s³/√Hz]")
+    gyro_bias: tuple[float, float, float] = Field((-0.003, 0.012, 0.008), description="at the first instant [rad/s]")
+    accel_bias: tuple[float, float, float] = Field((0.03, -0.04, 0.05), description="at the first instant [m/s²]")
+    gyro_max: float = Field(35.0, gt=0, description="largest rate about an axis [rad/s]")
+    accel_max: float = Field(176.0, gt=0, description="largest specific force along an axis [m/s²]")
+
+    def noise_free(self) -> Self:
+        """The same sensor without noise and biases."""
+        zero = (0.0, 0.0, 0.0)
+        return self.model_copy(
+            update={
+                "gyro_noise_density": 0.0,
+                "accel_noise_density": 0.0,
+                "gyro_bias_walk": 0.0,
+                "accel_bias_walk": 0.0,
+                "gyro_bias": zero,
+                "accel_bias": zero,
+            }
+        )
+
+
+class BiasWalk:
+    """Brownian motion of the six biases, drawn every 0.1 s and linear in between.
+
+    Args:
+        imu: initial biases and densities of the walk.
+        duration_s: length [s].
+        random: source of the steps.
+    """
+
+    def __init__(self, imu: ImuModel, duration_s: float, random: np.random.Generator) -> None:
+        count = int(np.ceil(duration_s / _BIAS_STEP_S)) + 1
+        density = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3)
+        steps = random.standard_normal((count, 6)) * density * np.sqrt(_BIAS_STEP_S)
+        steps[0] = [*imu.gyro_bias, *imu.accel_bias]
+        self._time = np.arange(count) * _BIAS_STEP_S
+        self._values = np.cumsum(steps, axis=0)
+
+    def at(self, offset_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gyro [rad/s] and accelerometer [m/s²] biases (N, 3) at `offset_s` (N,) after the first instant [s]."""
+        columns = [np.interp(np.asarray(offset_s, dtype=np.float64), self._time, column) for column in self._values.T]
+        values = np.stack(columns, axis=-1)
+        return values[..., :3], values[..., 3:]
+
+
+def measure(
+    imu: ImuModel,
+    motion: Motion,
+    gyro_bias: NDArray[np.float64],
+    accel_bias: NDArray[np.float64],
+    random: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gyro [rad/s] and accelerometer [m/s²] readings (N, 3) of a motion at N instants, given the biases (N, 3) there."""
+    specific_force_world = motion.a_world_imu + np.array([0.0, 0.0, GRAVITY])
+    accel = np.einsum("nji,nj->ni", motion.R_world_imu, specific_force_world)
+    noise = random.standard_normal((2, *accel.shape)) * np.sqrt(imu.rate_hz)
+    gyro = motion.omega_imu + gyro_bias + imu.gyro_noise_density * noise[0]
+    accel = accel + accel_bias + imu.accel_noise_density * noise[1]
+    return np.clip(gyro, -imu.gyro_max, imu.gyro_max), np.clip(accel, -imu.accel_max, imu.accel_max)
