@@ -83,8 +83,8 @@ def read_gyro_unit(
             "say the unit with --gyro-unit rad/s or deg/s",
         )
     text = (
-        f"by the message's definition: in the first seconds gravity turned too little ({np.degrees(turned):.1f} deg) to check "
-        f"(fastest tenth {fast:.3f}); 'boxplus inspect' compares with the LiDAR"
+        f"by the message's definition: the turn of gravity in the first seconds ({np.degrees(turned):.1f} deg, noise included) "
+        f"does not show it; the fastest tenth turns at {fast:.3f}; 'boxplus inspect' compares with the LiDAR"
     )
     return "rad/s", Evidence("gyro_unit", "rad/s", "ok", text)
 

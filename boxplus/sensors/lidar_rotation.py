@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
+from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.scan_registration import LidarRotations, lidar_rotations
@@ -38,6 +39,7 @@ class RotationAlignment:
         R_imu_lidar: (3, 3) float64, LiDAR coordinates to IMU coordinates. Where the motion does not determine it, the
             rotation closest to identity that fits.
         std_deg: (3,) float64, ascending: standard deviations of R_imu_lidar about its three principal axes [deg].
+        axes: (3, 3) float64, those axes in the IMU frame, one a column.
         observable_axes: about how many of these axes it is known to 3 degrees.
         residual_deg: median difference of the two rotations per interval after alignment [deg].
         excitation_deg_s: (3,) float64, descending: standard deviations of the rotation rate along its principal axes.
@@ -51,6 +53,7 @@ class RotationAlignment:
 
     R_imu_lidar: NDArray[np.float64]
     std_deg: NDArray[np.float64]
+    axes: NDArray[np.float64]
     observable_axes: int
     residual_deg: float
     excitation_deg_s: NDArray[np.float64]
@@ -83,8 +86,8 @@ def align_rotations(lidar: LidarRotations, imu: ImuSamples) -> RotationAlignment
     """
     finite = np.isfinite(imu.gyro).all(axis=1)
     order = np.argsort(imu.time_ns[finite], kind="stable")
-    attitude = _Attitude(imu.time_ns[finite][order], imu.gyro[finite][order])
-    covered = attitude.covers(lidar.begin_ns) & attitude.covers(lidar.end_ns)
+    attitude = GyroAttitude(imu.time_ns[finite][order], imu.gyro[finite][order])
+    covered = attitude.covers(lidar.begin_ns, _LARGEST_OFFSET_S) & attitude.covers(lidar.end_ns, _LARGEST_OFFSET_S)
     begin_ns, end_ns, phi_lidar = lidar.begin_ns[covered], lidar.end_ns[covered], lidar.rotation[covered]
     if len(begin_ns) < _FEWEST_INTERVALS:
         raise InputError(
@@ -111,6 +114,7 @@ def align_rotations(lidar: LidarRotations, imu: ImuSamples) -> RotationAlignment
     return RotationAlignment(
         R_imu_lidar=fit.R,
         std_deg=std_deg,
+        axes=fit.axes,
         observable_axes=observable,
         residual_deg=residual_deg,
         excitation_deg_s=excitation,
@@ -123,44 +127,8 @@ def align_rotations(lidar: LidarRotations, imu: ImuSamples) -> RotationAlignment
     )
 
 
-class _Attitude:
-    """The gyroscope's integral: attitude at any time relative to the first sample."""
-
-    def __init__(self, time_ns: NDArray[np.int64], gyro: NDArray[np.float64]) -> None:
-        self._time_ns = time_ns
-        self._gyro = gyro
-        self._rate = 0.5 * (gyro[1:] + gyro[:-1]) if len(gyro) > 1 else gyro
-        steps = self._rate * (np.diff(time_ns) * 1e-9)[:, None]
-        self._R = np.concatenate((np.eye(3)[None], _running_product(so3.exp(steps)))) if len(steps) else np.eye(3)[None]
-
-    def scaled(self, factor: float) -> _Attitude:
-        return self if factor == 1.0 else _Attitude(self._time_ns, self._gyro * factor)
-
-    def covers(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        if not len(self._time_ns):
-            return np.zeros(len(time_ns), dtype=bool)
-        margin = int(_LARGEST_OFFSET_S * 1e9)
-        covered: NDArray[np.bool_] = (time_ns >= self._time_ns[0] + margin) & (time_ns <= self._time_ns[-1] - margin)
-        return covered
-
-    def at(self, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        index = np.clip(np.searchsorted(self._time_ns, time_ns, side="right") - 1, 0, len(self._rate) - 1)
-        since = (time_ns - self._time_ns[index])[:, None] * 1e-9
-        return self._R[index] @ so3.exp(self._rate[index] * since)
-
-
-def _running_product(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R[0], R[0] R[1], … for (N, 3, 3), in log2(N) batches."""
-    product = R.copy()
-    reach = 1
-    while reach < len(product):
-        product[reach:] = product[:-reach] @ product[reach:]
-        reach *= 2
-    return product
-
-
 def _mean_rate(
-    attitude: _Attitude, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], offset_s: float
+    attitude: GyroAttitude, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], offset_s: float
 ) -> NDArray[np.float64]:
     """(K, 3) rotation of the IMU over the LiDAR's intervals, shifted by the offset, per second."""
     shift = round(offset_s * 1e9)
@@ -177,6 +145,7 @@ class _Fit:
     scale: float
     residual: NDArray[np.float64]
     std: NDArray[np.float64]
+    axes: NDArray[np.float64]
     cost: float
 
 
@@ -203,13 +172,14 @@ def _fit(rate_imu: NDArray[np.float64], rate_lidar: NDArray[np.float64]) -> _Fit
         weight[:, None, None] * (np.einsum("ni,ni->n", a, a)[:, None, None] * np.eye(3) - a[:, :, None] * a[:, None, :])
     ).sum(0)
     variance = float((weight[:, None] * residual**2).sum()) / max(3.0 * weight.sum() - 6.0, 1.0)
-    std = np.sqrt(variance / np.maximum(np.linalg.eigvalsh(information)[::-1], 1e-12))
+    strength, axes = np.linalg.eigh(information)
+    std = np.sqrt(variance / np.maximum(strength[::-1], 1e-12))
     cost = float((np.minimum(norm, 6.0 * sigma) ** 2).sum())
-    return _Fit(R, mean_imu - R @ mean_lidar, scale, residual, std, cost)
+    return _Fit(R, mean_imu - R @ mean_lidar, scale, residual, std, axes[:, ::-1], cost)
 
 
 def _time_offset(
-    attitude: _Attitude, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], rate_lidar: NDArray[np.float64]
+    attitude: GyroAttitude, begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], rate_lidar: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Offset with the least misfit, and its standard deviation from the curvature of the misfit."""
     steps = round(_LARGEST_OFFSET_S / _OFFSET_STEP_S) - 1

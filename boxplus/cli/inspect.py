@@ -1,0 +1,107 @@
+"""`boxplus inspect`: what is in a recording, and whether it is fit for odometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.options import (
+    DEFAULTS,
+    AccelUnitOption,
+    DurationS,
+    GyroUnitOption,
+    ImuTopic,
+    LidarTopic,
+    MaxRange,
+    MinRange,
+    PointTimeField,
+    PointTimeReference,
+    PointTimeUnit,
+    StartS,
+    recording_options,
+)
+
+if TYPE_CHECKING:
+    from boxplus.recordings.doctor import Diagnosis
+
+_STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
+
+
+def inspect(
+    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the findings as JSON to this file too.")] = None,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    point_time_field: PointTimeField = None,
+    point_time_unit: PointTimeUnit = None,
+    point_time_reference: PointTimeReference = None,
+    gyro_unit: GyroUnitOption = None,
+    accel_unit: AccelUnitOption = None,
+    min_range: MinRange = DEFAULTS.min_range,
+    max_range: MaxRange = DEFAULTS.max_range,
+    start: StartS = 0.0,
+    duration: DurationS = None,
+) -> None:
+    """Examine a recording: topics, rates, gaps, times, units, noise, extrinsic, points. Exit code 1 when there are errors."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from boxplus.recordings.doctor import diagnose
+
+    options = recording_options(
+        lidar_topic,
+        imu_topic,
+        point_time_field,
+        point_time_unit,
+        point_time_reference,
+        gyro_unit,
+        accel_unit,
+        min_range,
+        max_range,
+        start,
+        duration,
+    )
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(f"examining {recording.name}", total=1.0)
+        diagnosis = diagnose(recording, options, on_progress=lambda done: progress.update(task, completed=done))
+    if output is not None:
+        _write(output, diagnosis)
+    if json:
+        typer.echo(diagnosis.to_json())
+    else:
+        _print_table(diagnosis)
+    if diagnosis.verdict == "error":
+        raise typer.Exit(1)
+
+
+def _write(output: Path, diagnosis: Diagnosis) -> None:
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_text(diagnosis.to_json() + "\n", encoding="utf-8")
+    except OSError as error:
+        raise typer.BadParameter(
+            f"cannot write {output}: {error.strerror}; choose another file", param_hint="--output"
+        ) from error
+
+
+def _print_table(diagnosis: Diagnosis) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    table = Table(title=f"{diagnosis.path.name}: {diagnosis.format}", title_justify="left", show_lines=False, pad_edge=False)
+    table.add_column("")
+    table.add_column("what", no_wrap=True)
+    table.add_column("value", overflow="fold")
+    table.add_column("evidence", overflow="fold", ratio=1)
+    for finding in diagnosis.evidence:
+        style = _STYLE[finding.verdict]
+        table.add_row(Text(finding.verdict, style=style), finding.key, Text(finding.value), Text(finding.text))
+    console.print(table)
+    counts = {verdict: sum(finding.verdict == verdict for finding in diagnosis.evidence) for verdict in _STYLE}
+    summary = f"{counts['ok']} ok, {counts['warning']} warnings, {counts['error']} errors"
+    console.print(Text(summary, style=_STYLE[diagnosis.verdict]))
