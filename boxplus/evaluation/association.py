@@ -85,7 +85,8 @@ class Association:
             lines.append(f"clock offset: the motion does not tell{applied}")
         else:
             lines.append(
-                f"clock offset: the motions fit best with {self.time_offset.offset_s:+.3f} s added to the estimate's stamps, "
+                f"clock offset: the motions fit best with {round(self.time_offset.offset_s, 3) + 0.0:+.3f} s added to the "
+                f"estimate's stamps, "
                 f"correlation {self.time_offset.correlation:.3f}{applied}"
             )
         return lines

@@ -157,8 +157,8 @@ class TileWriter:
                 "the opposite",
                 "give intensities in every block or in none",
             )
-        usable = (np.abs(records[:, :3]) < LARGEST_COORDINATE).all(axis=1)  # false for NaN
-        if not usable.all():
+        if not np.abs(records[:, :3]).max(initial=0.0) < LARGEST_COORDINATE:  # also true for NaN
+            usable = (np.abs(records[:, :3]) < LARGEST_COORDINATE).all(axis=1)
             self.rejected += int(len(records) - usable.sum())
             records = records[usable]
         if self._recent is not None:
