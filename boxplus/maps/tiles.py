@@ -59,7 +59,7 @@ class TileWriter:
     Args:
         folder: created where it does not exist.
         tile_size: edge of the cubic tiles [m].
-        max_buffered_points: bound of the memory, about 60 bytes a point.
+        max_buffered_points: bound of the memory, about 120 bytes a point (60 MB at the default).
         voxel: keep one point per voxel of this edge [m]; None keeps every point.
 
     Raises:
