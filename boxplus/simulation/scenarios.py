@@ -79,13 +79,13 @@ def _drive30(seed: int) -> Scenario:
     count, pitch = 10, 78.0
     world = worlds.city(count, count, pitch=pitch, seed=seed)
     low, high = -1.8, count * pitch - 1.8
-    # Along every street from west to east and back, then along every street from north to south and back.
+    # Every street from west to east or back, going north; then every street from north to south or back, going west.
     route: list[tuple[float, float]] = []
     for row in range(count + 1):
         y = row * pitch - 1.8
         route += [(low, y), (high, y)] if row % 2 == 0 else [(high, y), (low, y)]
     for column in range(count + 1):
-        x = column * pitch - 1.8
+        x = high - column * pitch
         route += [(x, high), (x, low)] if column % 2 == 0 else [(x, low), (x, high)]
     route = [corner for corner, before in zip(route, [None, *route], strict=False) if corner != before]
     base = _drive(seed)

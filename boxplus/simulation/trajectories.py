@@ -154,8 +154,7 @@ def _times(duration_s: float, knot_s: float) -> Floats:
     """Times of the control poses of a motion of `duration_s`, relative to its start."""
     if not duration_s > 0:
         raise InputError("a positive duration [s]", f"{duration_s}", "give the length of the motion")
-    times: Floats = np.arange(-1, int(np.ceil(duration_s / knot_s - 1e-9)) + 2) * knot_s
-    return times
+    return np.arange(-1, int(np.ceil(duration_s / knot_s - 1e-9)) + 2, dtype=np.float64) * knot_s
 
 
 def _fade_in(time: Floats, start_s: float, ease_s: float = _EASE_S) -> Floats:
