@@ -150,6 +150,9 @@ class IndexedContainer:
                 last = position - 1
                 try:
                     for connection, received, data in reader.messages(connections=wanted, start=position, stop=stop_ns):
+                        if type(received) is not int or type(data) is not bytes:
+                            self.damage.append(f"a record of {connection.topic} holds no message; skipped")
+                            continue
                         last = received
                         channel = (
                             channel_of.get(id(connection)) or by_name[connection.topic, connection.msgtype.replace("/msg/", "/")]

@@ -32,8 +32,7 @@ def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tu
         RecordingError: no finite sample.
         AmbiguityError: the norm is neither one gravity in g nor in m/s².
     """
-    norms = np.linalg.norm(accel, axis=1)
-    norms = norms[np.isfinite(norms)]
+    norms = _norms(accel)
     if not len(norms):
         raise RecordingError("finite accelerations", "none in the first seconds", "check the IMU driver and --imu-topic")
     norm = float(np.median(norms))
@@ -61,8 +60,7 @@ def read_gyro_unit(
     Raises:
         AmbiguityError: the values are too fast for rad/s and the turn of gravity does not tell deg/s.
     """
-    norms = np.linalg.norm(gyro, axis=1)
-    norms = norms[np.isfinite(norms)]
+    norms = _norms(gyro)
     fast = float(np.quantile(norms, 0.9)) if len(norms) else 0.0
     ratio, turned = gravity_turn_ratio(time_ns, gyro, accel)
     measured: GyroUnit | None = None
@@ -89,6 +87,13 @@ def read_gyro_unit(
     return "rad/s", Evidence("gyro_unit", "rad/s", "ok", text)
 
 
+def _norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Norms of those vectors (N, 3) whose norm is finite."""
+    with np.errstate(over="ignore"):
+        norms: NDArray[np.float64] = np.linalg.norm(vectors, axis=1)
+    return norms[np.isfinite(norms)]
+
+
 def gravity_turn_ratio(
     time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]
 ) -> tuple[float | None, float]:
@@ -97,7 +102,7 @@ def gravity_turn_ratio(
     Window averages of the direction of gravity d change by -ω × d; the ratio is the least-squares factor between both
     sides, and None where the turn of gravity is too small or too unlike the gyroscope's to tell 1 from 57.3.
     """
-    finite = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    finite = (np.abs(gyro) < 1e6).all(axis=1) & (np.abs(accel) < 1e6).all(axis=1)
     time_ns, gyro, accel = time_ns[finite], gyro[finite], accel[finite]
     if len(time_ns) < 8 or time_ns[-1] - time_ns[0] < 4 * _WINDOW_S * 1e9:
         return None, 0.0

@@ -230,7 +230,10 @@ def _scan_sqlite(stream: BinaryIO) -> Iterator[_Record | None]:
         for key, topic, kind in database.execute("SELECT id, name, type FROM topics"):
             yield _Connection(key, topic, kind.replace("/msg/", "/"), "cdr")
         for key, time_ns, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
-            yield _Message(key, time_ns, bytes(data))
+            if type(time_ns) is int and type(data) is bytes:
+                yield _Message(key, time_ns, data)
+            else:
+                yield None
 
 
 def _skipping_damage(records: Iterator[_Record]) -> Iterator[_Record | None]:

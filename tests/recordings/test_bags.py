@@ -1,0 +1,167 @@
+"""Every layout in every container comes back as it was written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import CONTAINERS, LAYOUTS, PERIOD_NS, START_NS, Content, write_bag
+from scipy.spatial.transform import Rotation
+
+from boxplus.errors import AmbiguityError, RecordingError
+from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+
+def read(path: Path, options: RecordingOptions | None = None) -> tuple[list[Scan], list[ImuSamples]]:
+    with open_recording(path, options) as recording:
+        events = list(recording)
+    return [e for e in events if isinstance(e, Scan)], [e for e in events if isinstance(e, ImuSamples)]
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_points_and_times_come_back(tmp_path: Path, layout: str, container: str) -> None:
+    content = Content(layout=layout)
+    scans, imu = read(write_bag(tmp_path, container, content))
+    assert len(scans) == content.scans
+    for index, scan in enumerate(scans):
+        np.testing.assert_array_equal(scan.p_lidar, content.p_lidar(index))
+        # float32 seconds resolve 7 ns within a scan, float64 seconds since 1970 resolve 240 ns, after rounding twice.
+        np.testing.assert_allclose(scan.time_ns, content.times_ns(index), rtol=0, atol=500)
+    assert sum(len(block) for block in imu) == content.scans * PERIOD_NS // 10_000_000 + 1
+    np.testing.assert_array_equal(imu[0].accel[0], content.accel)
+    assert imu[0].time_ns[0] == START_NS
+
+
+def test_events_keep_the_order_of_the_file(tmp_path: Path) -> None:
+    content = Content()
+    with open_recording(write_bag(tmp_path, "mcap", content)) as recording:
+        received = [e.start_ns + content.lidar_delay_ns if isinstance(e, Scan) else int(e.time_ns[-1]) for e in recording]
+    assert received == sorted(received)
+
+
+def test_counts_progress_and_second_pass(tmp_path: Path) -> None:
+    with open_recording(write_bag(tmp_path, "ros1"), RecordingOptions(min_range=5.0)) as recording:
+        progress = []
+        for _ in recording:
+            progress.append(recording.progress)
+        first = recording.rejected
+        kept = sum(len(e) for e in recording if isinstance(e, Scan))
+    assert progress == sorted(progress) and 0.0 < progress[0] < 1.0 and recording.progress == 1.0
+    assert first == recording.rejected
+    content = Content()
+    near = sum(int((np.linalg.norm(content.p_lidar(k), axis=1) < 5.0).sum()) for k in range(content.scans))
+    assert first == {"points: nearer than min_range": near}
+    assert kept == content.scans * content.points - near
+
+
+def test_start_and_duration_cut_the_stream(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", Content(scans=20))
+    scans, imu = read(path, RecordingOptions(start_s=0.5, duration_s=1.0))
+    assert 9 <= len(scans) <= 11
+    assert all(START_NS + 500_000_000 <= block.time_ns[0] <= START_NS + 1_500_000_000 for block in imu)
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3"])
+def test_ros2_files_without_metadata(tmp_path: Path, container: str) -> None:
+    folder = write_bag(tmp_path, container)
+    expected, _ = read(folder)
+    (folder / "metadata.yaml").unlink()
+    for path in (folder, next(folder.iterdir())):
+        scans, _ = read(path)
+        assert [len(s) for s in scans] == [len(s) for s in expected]
+
+
+def test_extrinsic_from_static_transforms(tmp_path: Path) -> None:
+    q_xyzw = Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_quat()
+    base_from_imu = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+    base_from_lidar = np.concatenate(([1.0, 0.0, 0.5], q_xyzw))
+    content = Content(transforms=[("base", "imu", base_from_imu), ("base", "lidar", base_from_lidar)])
+    for container in CONTAINERS:
+        folder = tmp_path / container
+        folder.mkdir()
+        with open_recording(write_bag(folder, container, content)) as recording:
+            T_imu_lidar = recording.info.T_imu_lidar
+            assert T_imu_lidar is not None and "static transforms" in recording.info.T_imu_lidar_source
+            np.testing.assert_allclose(T_imu_lidar[:3, :3], Rotation.from_quat(q_xyzw).as_matrix(), atol=1e-12)
+            np.testing.assert_allclose(T_imu_lidar[:3, 3], [0.9, -0.2, 0.2], atol=1e-12)
+
+
+def test_without_transforms_the_extrinsic_is_unknown(tmp_path: Path) -> None:
+    with open_recording(write_bag(tmp_path, "ros1")) as recording:
+        assert recording.info.T_imu_lidar is None
+        found = {e.key: e for e in recording.info.evidence}["T_imu_lidar"]
+    assert found.verdict == "warning" and "--T-imu-lidar" in found.text
+
+
+def test_units_are_converted(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", Content(accel=(0.0, 0.6, 0.8), gyro=(10.0, 0.0, 0.0)))
+    _, imu = read(path, RecordingOptions(gyro_unit="deg/s"))
+    np.testing.assert_allclose(imu[0].accel[0], [0.0, 0.6 * 9.80665, 0.8 * 9.80665])
+    np.testing.assert_allclose(imu[0].gyro[0], [np.radians(10.0), 0.0, 0.0])
+
+
+def test_several_topics_are_refused_and_decided(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", Content(extra_topics={"/other": "ouster"}))
+    with pytest.raises(AmbiguityError, match=r"one LiDAR topic.*/other.*/points.*--lidar-topic"):
+        open_recording(path)
+    scans, _ = read(path, RecordingOptions(lidar_topic="/other"))
+    assert len(scans) == 6
+    with pytest.raises(RecordingError, match=r"on /none – got topics .*/points.* – choose another --lidar-topic"):
+        open_recording(path, RecordingOptions(lidar_topic="/none"))
+
+
+def test_the_only_topic_with_point_times_is_chosen(tmp_path: Path) -> None:
+    content = Content(extra_topics={"/registered": "velodyne"}, layout="ouster")
+    path = write_bag(tmp_path, "ros1", content)
+    with open_recording(path, RecordingOptions(point_time_field="t")) as recording:
+        assert recording.info.lidar_topic == "/points"
+
+
+def test_no_point_times(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", Content(drop_fields=("time",)))
+    with pytest.raises(
+        RecordingError, match=r"a time for every point .* – got a cloud with the fields x, y, z, intensity, ring – "
+    ):
+        open_recording(path)
+    scans, _ = read(path, RecordingOptions(point_time_field="none"))
+    assert all((scan.time_ns == Content().stamp_ns(index)).all() for index, scan in enumerate(scans))
+
+
+def test_constant_point_times(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", Content(static_time=True))
+    with pytest.raises(RecordingError, match="times in the field 'time' that differ from point to point – got the same value 0"):
+        open_recording(path)
+
+
+def test_no_imu(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"an IMU topic \(sensor_msgs/Imu\) – got topics /points"):
+        open_recording(write_bag(tmp_path, "ros1", Content(with_imu=False)))
+
+
+def test_early_reception_is_ambiguous(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", Content(lidar_delay_ns=5_000_000))
+    with pytest.raises(AmbiguityError, match=r"0.005 s after their stamps.*--point-time-reference scan_start"):
+        open_recording(path)
+    scans, _ = read(path, RecordingOptions(point_time_reference="scan_end"))
+    assert abs(scans[3].end_ns - Content().stamp_ns(3)) < 100
+    scans, _ = read(path, RecordingOptions(point_time_reference="scan_start"))
+    assert scans[3].start_ns == Content().stamp_ns(3)
+
+
+def test_gravity_missing_from_the_accelerometer(tmp_path: Path) -> None:
+    with pytest.raises(AmbiguityError, match=r"median \|acceleration\|.*got 0.01 .*--accel-unit"):
+        open_recording(write_bag(tmp_path, "ros1", Content(accel=(0.01, 0.0, 0.0))))
+
+
+def test_gyro_too_fast_for_radians(tmp_path: Path) -> None:
+    with pytest.raises(AmbiguityError, match=r"below 35 rad/s.*got 100.0.*--gyro-unit"):
+        open_recording(write_bag(tmp_path, "ros1", Content(gyro=(0.0, 0.0, 100.0))))
+
+
+@pytest.mark.parametrize("name", ["missing.bag", "notes.txt"])
+def test_wrong_paths(tmp_path: Path, name: str) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(RecordingError, match=r"expected a .* – got .*" + name.replace(".", r"\.")):
+        open_recording(tmp_path / name)
