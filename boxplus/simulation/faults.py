@@ -1,0 +1,261 @@
+"""What goes wrong in real recordings, as changes to a stream of events.
+
+A fault takes events and gives events; it leaves alone whatever it does not name. Times count from the first event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+Event = Scan | ImuSamples
+Times = NDArray[np.int64]
+_STANDARD_GRAVITY = 9.80665
+
+
+def _unchanged(T_imu_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+    return T_imu_lidar
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that goes wrong.
+
+    Attributes:
+        name: short name.
+        description: one line.
+        events: turns the stream of events into the faulty one.
+        declared_extrinsic: turns the true T_imu_lidar (4, 4) into the one the recording declares.
+    """
+
+    name: str
+    description: str
+    events: Callable[[Iterable[Event]], Iterator[Event]]
+    declared_extrinsic: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _unchanged
+
+    def then(self, other: Fault) -> Fault:
+        """This fault, and `other` on top of it."""
+        return Fault(
+            f"{self.name}+{other.name}",
+            f"{self.description}; {other.description}",
+            lambda events: other.events(self.events(events)),
+            lambda T_imu_lidar: other.declared_extrinsic(self.declared_extrinsic(T_imu_lidar)),
+        )
+
+
+class _Change:
+    """Applies one function to the scans and one to the IMU samples of a stream.
+
+    The functions get what arrived and `inside`, which says of times (N,) whether they lie in the interval of the fault. They
+    return None for an event that is lost.
+    """
+
+    def __init__(
+        self,
+        scan: Callable[[Scan, Callable[[Times], NDArray[np.bool_]]], Scan | None] | None = None,
+        imu: Callable[[ImuSamples, Callable[[Times], NDArray[np.bool_]]], ImuSamples] | None = None,
+        start_s: float = 0.0,
+        duration_s: float = np.inf,
+    ) -> None:
+        self._scan, self._imu = scan, imu
+        self._start_s, self._duration_s = start_s, duration_s
+
+    def __call__(self, events: Iterable[Event]) -> Iterator[Event]:
+        origin_ns: int | None = None
+
+        def inside(time_ns: Times) -> NDArray[np.bool_]:
+            since = (time_ns - (origin_ns or 0)) * 1e-9
+            return (since >= self._start_s) & (since < self._start_s + self._duration_s)
+
+        for event in events:
+            if origin_ns is None:
+                origin_ns = event.start_ns if isinstance(event, Scan) else int(event.time_ns[0])
+            changed: Event | None = event
+            if isinstance(event, Scan) and self._scan is not None:
+                changed = self._scan(event, inside)
+            elif isinstance(event, ImuSamples) and self._imu is not None:
+                changed = self._imu(event, inside)
+            if changed is not None and (isinstance(changed, Scan) or len(changed)):
+                yield changed
+
+
+_Inside = Callable[[Times], NDArray[np.bool_]]
+
+
+def _begins(scan: Scan, inside: _Inside) -> bool:
+    return bool(inside(np.array([scan.start_ns]))[0])
+
+
+def _shifted(scan: Scan, shift_ns: int) -> Scan:
+    return replace(scan, time_ns=scan.time_ns + shift_ns, start_ns=scan.start_ns + shift_ns, end_ns=scan.end_ns + shift_ns)
+
+
+def _emptied(scan: Scan) -> Scan:
+    intensity = None if scan.intensity is None else scan.intensity[:0]
+    return Scan(scan.p_lidar[:0], scan.time_ns[:0], intensity, scan.start_ns, scan.end_ns)
+
+
+def drop_imu(start_s: float = 10.0, duration_s: float = 1.0) -> Fault:
+    """No IMU samples for a while."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        keep = ~inside(samples.time_ns)
+        return ImuSamples(samples.time_ns[keep], samples.gyro[keep], samples.accel[keep])
+
+    return Fault("drop_imu", f"no IMU samples for {duration_s:g} s", _Change(imu=imu, start_s=start_s, duration_s=duration_s))
+
+
+def drop_scans(start_s: float = 10.0, duration_s: float = 0.5) -> Fault:
+    """No scans for a while."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan | None:
+        return None if _begins(scan, inside) else scan
+
+    return Fault("drop_scans", f"no scans for {duration_s:g} s", _Change(scan, start_s=start_s, duration_s=duration_s))
+
+
+def empty_scans(start_s: float = 10.0, duration_s: float = 0.5) -> Fault:
+    """Scans without a single point for a while (a covered sensor)."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        return _emptied(scan) if _begins(scan, inside) else scan
+
+    return Fault("empty_scans", f"empty scans for {duration_s:g} s", _Change(scan, start_s=start_s, duration_s=duration_s))
+
+
+def repeat_stamps(start_s: float = 10.0, duration_s: float = 0.3) -> Fault:
+    """All IMU samples, and all scans, that begin within the interval carry the stamp of the first of them."""
+
+    def events(incoming: Iterable[Event]) -> Iterator[Event]:
+        frozen: dict[str, int] = {}
+
+        def scan(scan: Scan, inside: _Inside) -> Scan:
+            if not _begins(scan, inside):
+                return scan
+            return _shifted(scan, frozen.setdefault("scan", scan.start_ns) - scan.start_ns)
+
+        def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+            chosen = inside(samples.time_ns)
+            if not chosen.any():
+                return samples
+            stamp = frozen.setdefault("imu", int(samples.time_ns[chosen][0]))
+            return replace(samples, time_ns=np.where(chosen, stamp, samples.time_ns))
+
+        return _Change(scan, imu, start_s, duration_s)(incoming)
+
+    return Fault("repeat_stamps", f"the same time stamp again and again for {duration_s:g} s", events)
+
+
+def backward_stamps(start_s: float = 10.0, duration_s: float = 0.3, jump_s: float = 1.0) -> Fault:
+    """The stamps of the interval lie `jump_s` too early (a clock that is set back, then corrected)."""
+    jump_ns = round(jump_s * 1e9)
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        return _shifted(scan, -jump_ns) if _begins(scan, inside) else scan
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, time_ns=samples.time_ns - jump_ns * inside(samples.time_ns))
+
+    text = f"time stamps {jump_s:g} s too early for {duration_s:g} s"
+    return Fault("backward_stamps", text, _Change(scan, imu, start_s, duration_s))
+
+
+def nan_burst(start_s: float = 10.0, duration_s: float = 0.2, every: int = 2) -> Fault:
+    """NaN in every second point and in every second IMU sample (or every `every`-th) for a while."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        if not _begins(scan, inside):
+            return scan
+        p_lidar = scan.p_lidar.copy()
+        p_lidar[::every] = np.nan
+        return Scan.from_arrays(p_lidar, scan.time_ns, scan.intensity)
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        bad = np.flatnonzero(inside(samples.time_ns))[::every]
+        gyro, accel = samples.gyro.copy(), samples.accel.copy()
+        gyro[bad] = np.nan
+        accel[bad] = np.nan
+        return ImuSamples(samples.time_ns, gyro, accel)
+
+    return Fault("nan_burst", f"NaN in points and IMU samples for {duration_s:g} s", _Change(scan, imu, start_s, duration_s))
+
+
+def imu_in_g() -> Fault:
+    """The accelerometer reports in g and nobody says so."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, accel=samples.accel / _STANDARD_GRAVITY)
+
+    return Fault("imu_in_g", "accelerometer in g, declared as m/s²", _Change(imu=imu))
+
+
+def gyro_in_deg() -> Fault:
+    """The gyroscope reports in deg/s and nobody says so."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, gyro=np.rad2deg(samples.gyro))
+
+    return Fault("gyro_in_deg", "gyroscope in deg/s, declared as rad/s", _Change(imu=imu))
+
+
+def inverted_extrinsic() -> Fault:
+    """The mounting is declared the wrong way round: T_lidar_imu in place of T_imu_lidar."""
+
+    def inverse(T_imu_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.inv(T_imu_lidar), dtype=np.float64)
+
+    return Fault("inverted_extrinsic", "T_lidar_imu declared as T_imu_lidar", _Change(), inverse)
+
+
+def saturate_accel(limit: float = 11.0) -> Fault:
+    """Every axis of the accelerometer is clipped at ±`limit` [m/s²]."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, accel=np.clip(samples.accel, -limit, limit))
+
+    return Fault("saturate_accel", f"accelerometer clipped at {limit:g} m/s²", _Change(imu=imu))
+
+
+def wrong_time_unit(factor: float = 1e-3) -> Fault:
+    """The times of the points, counted from the first one of their scan, are multiplied by `factor` (µs read as ns: 0.001)."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        time_ns = scan.start_ns + np.rint((scan.time_ns - scan.start_ns) * factor).astype(np.int64)
+        end_ns = scan.start_ns + round((scan.end_ns - scan.start_ns) * factor)
+        return replace(scan, time_ns=time_ns, end_ns=end_ns)
+
+    return Fault("wrong_time_unit", f"point times multiplied by {factor:g}", _Change(scan))
+
+
+FAULTS: dict[str, Callable[[], Fault]] = {
+    "drop_imu": drop_imu,
+    "drop_scans": drop_scans,
+    "empty_scans": empty_scans,
+    "repeat_stamps": repeat_stamps,
+    "backward_stamps": backward_stamps,
+    "nan_burst": nan_burst,
+    "imu_in_g": imu_in_g,
+    "gyro_in_deg": gyro_in_deg,
+    "inverted_extrinsic": inverted_extrinsic,
+    "saturate_accel": saturate_accel,
+    "wrong_time_unit": wrong_time_unit,
+}
+"""Name → maker; without arguments the interval begins 10 s after the start."""
+
+
+def make_fault(name: str) -> Fault:
+    """A fault with its default parameters.
+
+    Raises:
+        InputError: no fault of that name.
+    """
+    if name not in FAULTS:
+        raise InputError(f"a fault: {', '.join(FAULTS)}", repr(name), "see 'boxplus simulate --list'")
+    return FAULTS[name]()
