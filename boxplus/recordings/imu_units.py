@@ -23,6 +23,7 @@ _FASTEST_RAD_S = 35.0
 """2000 °/s, the range of the fastest common gyroscopes."""
 _WINDOW_S = 0.25
 _LEAST_TURN_RAD = 0.03
+_SIGNIFICANT = 6.0
 
 
 def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tuple[AccelUnit, Evidence]:
@@ -100,7 +101,7 @@ def gravity_turn_ratio(
     """How much faster the gyroscope turns than gravity does in the accelerometer, and by how much gravity turned [rad].
 
     Window averages of the direction of gravity d change by -ω × d; the ratio is the least-squares factor between both
-    sides, and None where the turn of gravity is too small or too unlike the gyroscope's to tell 1 from 57.3.
+    sides, with the gyroscope's bias estimated beside it, and None where it is not significant.
     """
     finite = (np.abs(gyro) < 1e6).all(axis=1) & (np.abs(accel) < 1e6).all(axis=1)
     time_ns, gyro, accel = time_ns[finite], gyro[finite], accel[finite]
@@ -114,14 +115,21 @@ def gravity_turn_ratio(
     direction = np.add.reduceat(accel, begin) / count
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
     middle = np.add.reduceat(seconds, begin) / count[:, 0]
-    seen = np.diff(direction, axis=0)
-    bias = np.median(rate, axis=0)  # at rest for most of the time this is the bias; in steady turns it hides part of both
     step = np.diff(middle)[:, None]
     halfway = 0.5 * (direction[1:] + direction[:-1])
-    predicted = -np.cross(0.5 * (rate[1:] + rate[:-1]) - bias, halfway) * step
+    seen = np.diff(direction, axis=0)
     turned = float(np.sqrt((seen**2).sum()))
-    agreement = float((seen * predicted).sum())
-    strength = turned * float(np.sqrt((predicted**2).sum()))
-    if turned < _LEAST_TURN_RAD or strength == 0.0 or agreement < 0.5 * strength:
+    # seen = -k (rate × d) Δt + (bias × d) Δt, linear in k = 1/ratio and the bias.
+    A = np.empty((len(seen), 3, 4))
+    A[:, :, 0] = np.cross(halfway, 0.5 * (rate[1:] + rate[:-1])) * step
+    for axis, unit in enumerate(np.eye(3)):
+        A[:, :, 1 + axis] = np.cross(unit, halfway) * step
+    A = A.reshape(-1, 4)
+    b = seen.reshape(-1)
+    solution, _, rank, _ = np.linalg.lstsq(A, b, rcond=None)
+    information = float(np.linalg.norm(A[:, 0] - A[:, 1:] @ np.linalg.lstsq(A[:, 1:], A[:, 0], rcond=None)[0]))
+    sigma = float(np.linalg.norm(b - A @ solution)) / np.sqrt(max(len(b) - rank, 1))
+    k = float(solution[0])
+    if turned < _LEAST_TURN_RAD or k * information < _SIGNIFICANT * max(sigma, 1e-9):
         return None, turned
-    return float((predicted**2).sum()) / agreement, turned
+    return 1.0 / k, turned

@@ -1,0 +1,112 @@
+"""KITTI raw folders, small ones made here."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boxplus.errors import RecordingError
+from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.recordings.kitti import read_times
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+START = np.datetime64("2011-09-26T13:02:25.100000000", "ns")
+R_VELO_IMU = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+T_VELO_IMU = np.array([-0.8, 0.3, -0.8])
+
+
+def stamps(first_s: float, step_s: float, count: int) -> str:
+    times = START + (np.rint((first_s + step_s * np.arange(count)) * 1e9)).astype("timedelta64[ns]")
+    return "\n".join(str(t).replace("T", " ") for t in times) + "\n"
+
+
+def directions(count: int = 72) -> np.ndarray:
+    """Azimuths of one turn in the order they are measured: clockwise from the rear."""
+    return np.pi - 2 * np.pi * (np.arange(count) + 0.5) / count
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    folder = tmp_path / "2011_09_26" / "2011_09_26_drive_0005_sync"
+    velodyne, oxts = folder / "velodyne_points", folder / "oxts"
+    (velodyne / "data").mkdir(parents=True)
+    (oxts / "data").mkdir(parents=True)
+    (velodyne / "timestamps.txt").write_text(stamps(0.05, 0.1, 5))
+    (velodyne / "timestamps_start.txt").write_text(stamps(0.0, 0.1, 5))
+    (velodyne / "timestamps_end.txt").write_text(stamps(0.1, 0.1, 5))
+    azimuth = directions()
+    for k in range(5):
+        points = np.stack((10 * np.cos(azimuth), 10 * np.sin(azimuth), 0 * azimuth + 1, 0.5 + 0 * azimuth), axis=1)
+        points.astype("<f4").tofile(velodyne / "data" / f"{k:010d}.bin")
+    (oxts / "timestamps.txt").write_text(stamps(0.0, 0.01, 50))
+    for k in range(50):
+        row = np.zeros(30)
+        row[11:14], row[17:20] = (0.1, 0.2, 9.81), (0.01, 0.02, 0.03)
+        (oxts / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, row)))
+    rows = f"calib_time: x\nR: {' '.join(map(str, R_VELO_IMU.ravel()))}\nT: {' '.join(map(str, T_VELO_IMU))}\n"
+    (folder.parent / "calib_imu_to_velo.txt").write_text(rows)
+    return folder
+
+
+def test_points_get_their_time_from_their_azimuth(drive: Path) -> None:
+    with open_recording(drive) as recording:
+        events = list(recording)
+        assert recording.progress == 1.0 and recording.rejected == {}
+    scans = [e for e in events if isinstance(e, Scan)]
+    assert len(scans) == 5
+    start_ns = START.astype(np.int64)
+    expected = np.rint((np.arange(72) + 0.5) / 72 * 1e8)
+    np.testing.assert_allclose(scans[2].time_ns - start_ns - 200_000_000, expected, atol=20)
+    np.testing.assert_allclose(scans[0].intensity, 0.5)
+    imu = [e for e in events if isinstance(e, ImuSamples)]
+    assert len(imu) == 50
+    np.testing.assert_allclose(imu[7].accel, [[0.1, 0.2, 9.81]])
+    np.testing.assert_allclose(imu[7].gyro, [[0.01, 0.02, 0.03]])
+    order = [e.end_ns if isinstance(e, Scan) else int(e.time_ns[0]) for e in events]
+    assert all(b - a > -2_000_000 for a, b in pairwise(order))
+
+
+def test_the_calibration_above_the_drive_is_inverted(drive: Path) -> None:
+    T_imu_lidar = open_recording(drive).info.T_imu_lidar
+    assert T_imu_lidar is not None
+    p_imu = np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(T_imu_lidar[:3, :3] @ (R_VELO_IMU @ p_imu + T_VELO_IMU) + T_imu_lidar[:3, 3], p_imu, atol=1e-12)
+
+
+def test_broken_and_missing_files_are_counted(drive: Path) -> None:
+    (drive / "velodyne_points" / "data" / "0000000001.bin").write_bytes(b"123")
+    (drive / "oxts" / "data" / "0000000003.txt").write_text("1 2 3")
+    (drive / "oxts" / "data" / "0000000004.txt").write_text("no numbers")
+    (drive / "oxts" / "data" / "0000000005.txt").unlink()
+    with open_recording(drive) as recording:
+        events = list(recording)
+        assert recording.rejected == {
+            "messages: scan file is not a multiple of 16 bytes": 1,
+            "messages: oxts file without its 30 columns": 1,
+            "messages: unreadable oxts file": 1,
+        }
+        assert any("1 of the 50 times in oxts have no data file" in e.text for e in recording.info.evidence)
+    assert sum(isinstance(e, Scan) for e in events) == 4
+
+
+def test_without_start_and_end_times(drive: Path) -> None:
+    (drive / "velodyne_points" / "timestamps_end.txt").unlink()
+    with pytest.raises(RecordingError, match=r"timestamps_start.txt and timestamps_end.txt.*--point-time-field none"):
+        open_recording(drive)
+    with open_recording(drive, RecordingOptions(point_time_field="none")) as recording:
+        scans = [e for e in recording if isinstance(e, Scan)]
+    assert all(scan.start_ns == scan.end_ns for scan in scans)
+
+
+def test_wrong_calibration_and_times(drive: Path) -> None:
+    (drive.parent / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 2 0 0 0 1\nT: 0 0 0\n")
+    with pytest.raises(RecordingError, match=r"R \(9 numbers, a rotation\)"):
+        open_recording(drive)
+    (drive / "oxts" / "timestamps.txt").write_text("yesterday\n")
+    with pytest.raises(RecordingError, match="lines like 2011-09-26"):
+        read_times(drive / "oxts" / "timestamps.txt")
+    (drive / "oxts" / "timestamps.txt").unlink()
+    with pytest.raises(RecordingError, match=r"the times timestamps.txt – got none"):
+        open_recording(drive)
