@@ -34,9 +34,9 @@ def accumulate_planes(
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
-        planes: (n, 5): unit normal u, offset uᵀq in the world frame, variance of the plane at the point [m²].
+        planes: (n, 5): unit normal u, offset uᵀq in the world, variance of the plane at the point per variance of a map point.
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
-        range_variance, map_variance: of a point and of the map [m²].
+        range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
         A, b: (12, 12), (12,), added to; the upper triangle of A is filled only.
         sums: (3,) += [used points, Σ z², Σ z²/r].
@@ -62,7 +62,9 @@ def accumulate_planes(
         cx = x[R] * ux + x[R + 3] * uy + x[R + 6] * uz
         cy = x[R + 1] * ux + x[R + 4] * uy + x[R + 7] * uz
         cz = x[R + 2] * ux + x[R + 5] * uy + x[R + 8] * uz
-        weight = 1.0 / (range_variance + map_variance + planes[n, 4])
+        # The misfit of the plane's own points says how far to trust it; the Cauchy weight, how far to trust the point.
+        variance = range_variance + (map_variance + planes[n, 5]) * planes[n, 4] + planes[n, 5]
+        weight = 1.0 / (variance + z * z)
         h[0], h[1], h[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
         h[3], h[4], h[5] = ux, uy, uz
         if with_extrinsic:

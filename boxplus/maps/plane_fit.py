@@ -11,13 +11,14 @@ from boxplus._jit import kernel
 
 COINCIDENT_M = 1e-6
 COLLINEAR_RATIO = 0.05
+PLANARITY = 1.0
 
 
 @kernel(inline=True)
 def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float, plane: NDArray[np.float64]) -> bool:
     """Fit a plane to `points[:count]` (n, 3); False if they are coincident, collinear or off the plane by `max_distance`.
 
-    `plane` (≥ 7,) receives the unit normal u, the offset uᵀq, and the centroid q.
+    `plane` (8,) receives the unit normal u, the offset uᵀq, the centroid q, and the variance of the points about the plane.
     """
     qx, qy, qz = 0.0, 0.0, 0.0
     for i in range(count):
@@ -48,7 +49,7 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
     largest = mean + 2.0 * scale * math.cos(angle)
     smallest = mean + 2.0 * scale * math.cos(angle + 2.0943951023931953)
     middle = 3.0 * mean - largest - smallest
-    if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest:
+    if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest or smallest > PLANARITY * middle:
         return False
     # The normal is orthogonal to the rows of M − λI: the longest of their three cross products.
     ax, ay, az = xx - smallest, yy - smallest, zz - smallest
@@ -73,4 +74,5 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
     plane[0], plane[1], plane[2] = ux, uy, uz
     plane[3] = ux * qx + uy * qy + uz * qz
     plane[4], plane[5], plane[6] = qx, qy, qz
+    plane[7] = max(smallest, 0.0) / max(count - 3, 1)
     return True

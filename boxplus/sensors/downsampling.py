@@ -1,4 +1,8 @@
-"""Voxel filter of a scan: the centroid of the points in every occupied voxel (SPEC.md 9.11, step 5)."""
+"""Voxel filter of a scan: a centroid and a representative point for every occupied voxel (SPEC.md 9.11, step 5).
+
+The centroid carries the least noise and is what the scan is measured with. At an edge or a corner it lies off every
+surface, so what the map takes is a point that was really seen: the one nearest to the centroid.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,9 @@ def voxel_centroids(
     keys: NDArray[np.int64],
     sums: NDArray[np.float32],
     counts: NDArray[np.int32],
+    voxel_of: NDArray[np.int32],
+    nearest: NDArray[np.int32],
+    distances: NDArray[np.float32],
 ) -> int:
     """Centroids of the occupied voxels, in the order in which the voxels are first seen; returns their number.
 
@@ -30,6 +37,8 @@ def voxel_centroids(
         points: (n, 3); inverse_size: one over the voxel's side [1/m].
         table: (power of two ≥ 2 n,) filled with −1; keys: (n,), sums: (n, 3), counts: (n,) scratch.
         sums: receives the centroids.
+        voxel_of: (n,) receives the voxel of each point; nearest: (n,) the point nearest to each centroid;
+            distances: (n,) scratch.
     """
     mask = np.uint64(table.shape[0] - 1)
     used = 0
@@ -59,11 +68,20 @@ def voxel_centroids(
                 counts[voxel] += 1
                 break
             slot = (slot + np.uint64(1)) & mask
+        voxel_of[n] = voxel
     for voxel in range(used):
         share = np.float32(1.0) / np.float32(counts[voxel])
         sums[voxel, 0] *= share
         sums[voxel, 1] *= share
         sums[voxel, 2] *= share
+        distances[voxel] = np.float32(np.inf)
+    for n in range(points.shape[0]):
+        voxel = voxel_of[n]
+        dx, dy, dz = points[n, 0] - sums[voxel, 0], points[n, 1] - sums[voxel, 1], points[n, 2] - sums[voxel, 2]
+        distance = dx * dx + dy * dy + dz * dz
+        if distance < distances[voxel]:
+            distances[voxel] = distance
+            nearest[voxel] = n
     return used
 
 
@@ -88,11 +106,27 @@ class VoxelFilter:
         self._keys = np.zeros(points, dtype=np.int64)
         self._sums = np.zeros((points, 3), dtype=np.float32)
         self._counts = np.zeros(points, dtype=np.int32)
+        self._voxel_of = np.zeros(points, dtype=np.int32)
+        self._nearest = np.zeros(points, dtype=np.int32)
+        self._distances = np.zeros(points, dtype=np.float32)
 
-    def __call__(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Centroids (m, 3) float32 of `points` (n, 3) float32, finite, within ±2^20 voxels of the origin."""
+    def __call__(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Centroids and representatives, (m, 3) float32 each, of `points` (n, 3) float32.
+
+        The points must be finite and within ±2^20 voxels of the origin.
+        """
         if len(points) > len(self._counts):
             self._reserve(2 * len(points))
         self._table.fill(_EMPTY)
-        used = voxel_centroids(points, 1.0 / self.voxel_size, self._table, self._keys, self._sums, self._counts)
-        return self._sums[:used].copy()
+        used = voxel_centroids(
+            points,
+            1.0 / self.voxel_size,
+            self._table,
+            self._keys,
+            self._sums,
+            self._counts,
+            self._voxel_of,
+            self._nearest,
+            self._distances,
+        )
+        return self._sums[:used].copy(), points[self._nearest[:used]]

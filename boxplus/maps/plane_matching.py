@@ -1,0 +1,108 @@
+"""Find the plane of the map that each point of a scan lies on (SPEC.md 9.6, steps 1 and 2)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.filtering.nav_state import PL, RL, P, R
+from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, USED
+from boxplus.maps.ikd_search import IkdView, knn5
+from boxplus.maps.plane_fit import fit_plane_into
+
+NEIGHBOURS = 5
+# A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
+_SLACK = 1.0 + 1e-5
+
+
+@kernel
+def match_planes(
+    view: IkdView,
+    origin: NDArray[np.float64],
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    begin: int,
+    end: int,
+    max_distance_sq: float,
+    plane_threshold: float,
+    warm: bool,
+    neighbours: NDArray[np.float32],
+    planes: NDArray[np.float64],
+    fate: NDArray[np.uint8],
+    found_sq: NDArray[np.float32],
+    stack: NDArray[np.void],
+) -> None:
+    """Match the points [begin, end): five nearest map points, then the plane through them.
+
+    Args:
+        view, origin: the map; its coordinates are relative to `origin` (3,).
+        x: (36,) state that places the points in the world.
+        p_lidar: (n, 3) deskewed points, LiDAR frame.
+        max_distance_sq: squared distance the fifth neighbour may have [m²].
+        plane_threshold: largest distance of a neighbour from the plane [m].
+        warm: `neighbours` holds the result of an earlier call on the same map: their distances bound the search.
+        neighbours: (n, 5, 3), relative to `origin`.
+        planes: (n, 5) receives the unit normal, the offset uᵀq in the world and the variance of the plane at the point, in
+            units of the variance of one map point.
+        fate: (n,) receives USED, FEW_NEIGHBOURS or NOT_A_PLANE.
+        found_sq, stack: scratch of the calling thread.
+    """
+    fit = np.empty(8)
+    for n in range(begin, end):
+        lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
+        sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
+        sy = x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz + x[PL + 1]
+        sz = x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz + x[PL + 2]
+        yx = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P] - origin[0]
+        yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1]
+        yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2]
+        near = neighbours[n]
+        bound = max_distance_sq
+        if warm and fate[n] != FEW_NEIGHBOURS:
+            farthest = 0.0
+            for i in range(NEIGHBOURS):
+                dx, dy, dz = near[i, 0] - yx, near[i, 1] - yy, near[i, 2] - yz
+                farthest = max(farthest, dx * dx + dy * dy + dz * dz)
+            bound = min(bound, farthest * _SLACK)
+        count = knn5(view, np.float32(yx), np.float32(yy), np.float32(yz), np.float32(bound), near, found_sq, stack)
+        if count < NEIGHBOURS:
+            fate[n] = FEW_NEIGHBOURS
+            continue
+        if not fit_plane_into(near, NEIGHBOURS, plane_threshold, fit):
+            fate[n] = NOT_A_PLANE
+            continue
+        fate[n] = USED
+        ux, uy, uz = fit[0], fit[1], fit[2]
+        planes[n, 0], planes[n, 1], planes[n, 2] = ux, uy, uz
+        planes[n, 3] = fit[3] + ux * origin[0] + uy * origin[1] + uz * origin[2]
+        planes[n, 4] = _leverage(near, fit, yx, yy, yz)
+        planes[n, 5] = fit[7]
+
+
+@kernel(inline=True)
+def _leverage(near: NDArray[np.float32], fit: NDArray[np.float64], yx: float, yy: float, yz: float) -> float:
+    """Variance of a fitted plane at (yx, yy, yz) per unit variance of its points: 1/n + the pull of the in-plane offset."""
+    ux, uy, uz = fit[0], fit[1], fit[2]
+    # Two unit vectors in the plane.
+    if abs(ux) < 0.6:
+        norm = 1.0 / math.sqrt(uy * uy + uz * uz)
+        ex, ey, ez = 0.0, uz * norm, -uy * norm
+    else:
+        norm = 1.0 / math.sqrt(ux * ux + uz * uz)
+        ex, ey, ez = -uz * norm, 0.0, ux * norm
+    fx, fy, fz = uy * ez - uz * ey, uz * ex - ux * ez, ux * ey - uy * ex
+    ee, ef, ff = 0.0, 0.0, 0.0
+    for i in range(NEIGHBOURS):
+        dx, dy, dz = near[i, 0] - fit[4], near[i, 1] - fit[5], near[i, 2] - fit[6]
+        e = ex * dx + ey * dy + ez * dz
+        f = fx * dx + fy * dy + fz * dz
+        ee += e * e
+        ef += e * f
+        ff += f * f
+    dx, dy, dz = yx - fit[4], yy - fit[5], yz - fit[6]
+    e = ex * dx + ey * dy + ez * dz
+    f = fx * dx + fy * dy + fz * dz
+    return 1.0 / NEIGHBOURS + (ff * e * e - 2.0 * ef * e * f + ee * f * f) / (ee * ff - ef * ef)

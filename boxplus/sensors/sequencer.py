@@ -1,0 +1,154 @@
+"""Bring IMU samples and scans together: each scan with the samples that cover it, in order of time.
+
+Everything that cannot be used is counted by reason; nothing is dropped silently and nothing is half accepted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A scan and the IMU samples around it.
+
+    Attributes:
+        scan: the scan.
+        imu: samples from the last one at or before `begin_ns` to the first one at or after the scan's end, where they exist.
+        begin_ns: end of the previous frame (for the first one: start of the scan).
+        covered: whether a sample at or after the scan's end exists.
+        largest_gap_s: longest time between neighbouring samples within (begin_ns, scan.end_ns], ends included.
+    """
+
+    scan: Scan
+    imu: ImuSamples
+    begin_ns: int
+    covered: bool
+    largest_gap_s: float
+
+
+class Sequencer:
+    """Pairs scans with IMU samples.
+
+    Args:
+        max_wait_s: a scan not covered by IMU samples is released once data this much later has arrived [s].
+        max_jump_s: times further ahead than this of everything before are rejected until they prove to be the new time
+            (ten in a row) [s].
+    """
+
+    _MAX_JUMP_PROOF = 10
+
+    def __init__(self, max_wait_s: float = 0.5, max_jump_s: float = 10.0) -> None:
+        self.rejected: Counter[str] = Counter()
+        self._max_wait_ns = int(max_wait_s * 1e9)
+        self._max_jump_ns = int(max_jump_s * 1e9)
+        self._imu: deque[ImuSamples] = deque()
+        self._last_imu_ns: int | None = None
+        self._scans: deque[Scan] = deque()
+        self._last_end_ns: int | None = None
+        self._newest_scan_end_ns: int | None = None
+        self._imu_jumps = 0
+        self._scan_jumps = 0
+
+    def add_imu(self, samples: ImuSamples) -> None:
+        """Take samples in; non-finite ones and those that do not move forward in time are counted and left out."""
+        if not len(samples):
+            return
+        finite = np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
+        self.rejected["IMU sample not finite"] += int((~finite).sum())
+        time = samples.time_ns
+        keep = np.zeros(len(samples), dtype=bool)
+        for i in np.flatnonzero(finite):
+            now, last = int(time[i]), self._last_imu_ns
+            if last is not None and now == last:
+                self.rejected["IMU sample with a repeated time"] += 1
+                continue
+            if last is not None and now < last:
+                self.rejected["IMU sample going back in time"] += 1
+                continue
+            if last is not None and now - last > self._max_jump_ns and self._imu_jumps < self._MAX_JUMP_PROOF:
+                self._imu_jumps += 1
+                self.rejected["IMU sample jumping ahead in time"] += 1
+                continue
+            self._imu_jumps = 0
+            self._last_imu_ns = now
+            keep[i] = True
+        if keep.any():
+            self._imu.append(ImuSamples(time[keep], samples.gyro[keep], samples.accel[keep]))
+
+    def add_scan(self, scan: Scan) -> None:
+        """Take a scan in; one that is empty, or does not end after the one before, is counted and left out."""
+        if not len(scan):
+            self.rejected["scan without a valid point"] += 1
+            return
+        newest = self._newest_scan_end_ns
+        if newest is not None:
+            if scan.end_ns == newest:
+                self.rejected["scan with a repeated time"] += 1
+                return
+            if scan.end_ns < newest:
+                self.rejected["scan going back in time"] += 1
+                return
+            if scan.end_ns - newest > self._max_jump_ns and self._scan_jumps < self._MAX_JUMP_PROOF:
+                self._scan_jumps += 1
+                self.rejected["scan jumping ahead in time"] += 1
+                return
+        self._scan_jumps = 0
+        self._newest_scan_end_ns = scan.end_ns
+        self._scans.append(scan)
+
+    def frames(self, *, flush: bool = False) -> list[Frame]:
+        """The frames that are complete by now; with `flush`, also those that never will be."""
+        ready = []
+        while self._scans:
+            scan = self._scans[0]
+            covered = self._last_imu_ns is not None and self._last_imu_ns >= scan.end_ns
+            waited = (self._newest_scan_end_ns or 0) - scan.end_ns >= self._max_wait_ns
+            if not (covered or waited or flush):
+                break
+            self._scans.popleft()
+            frame = self._frame(scan, covered)
+            if frame is not None:
+                ready.append(frame)
+        return ready
+
+    def _frame(self, scan: Scan, covered: bool) -> Frame | None:
+        begin = scan.start_ns if self._last_end_ns is None else self._last_end_ns
+        imu = self._take_until(begin, scan.end_ns)
+        if not len(imu):
+            self.rejected["scan without any IMU sample"] += 1
+            return None
+        self._last_end_ns = scan.end_ns
+        inside = imu.time_ns[(imu.time_ns > begin) & (imu.time_ns < scan.end_ns)]
+        edges = np.concatenate([[max(begin, int(imu.time_ns[0]))], inside, [min(scan.end_ns, max(int(imu.time_ns[-1]), begin))]])
+        spans = np.append(np.diff(edges), [scan.end_ns - edges[-1], edges[0] - begin])
+        if len(imu) > 1:  # a gap that began before the frame is a gap in all of it
+            between = np.diff(imu.time_ns)[(imu.time_ns[1:] > begin) & (imu.time_ns[:-1] < scan.end_ns)]
+            spans = np.append(spans, between)
+        return Frame(scan, imu, begin, covered, float(spans.max(initial=0)) * 1e-9)
+
+    def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:
+        """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""
+        if len(self._imu) > 1:
+            blocks = list(self._imu)
+            joined = ImuSamples(
+                np.concatenate([b.time_ns for b in blocks]),
+                np.concatenate([b.gyro for b in blocks]),
+                np.concatenate([b.accel for b in blocks]),
+            )
+            self._imu = deque([joined])
+        if not self._imu:
+            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        block = self._imu[0]
+        first = max(int(np.searchsorted(block.time_ns, begin_ns, side="right")) - 1, 0)
+        stop = min(int(np.searchsorted(block.time_ns, end_ns, side="left")) + 1, len(block))
+        # Two samples at or before the end stay: the next frame needs the last one before its begin.
+        keep = max(stop - 2, 0)
+        self._imu = deque([ImuSamples(block.time_ns[keep:], block.gyro[keep:], block.accel[keep:])])
+        return ImuSamples(block.time_ns[first:stop], block.gyro[first:stop], block.accel[first:stop])

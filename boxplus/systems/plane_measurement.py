@@ -1,0 +1,118 @@
+"""The LiDAR measurement: a scan against the map, point to plane, as information about the state (SPEC.md 9.6 to 9.8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import run_chunks
+from boxplus.filtering.plane_information import FEW_NEIGHBOURS, GATED, MEASURED_DOF, NOT_A_PLANE, USED, accumulate_planes
+from boxplus.maps.ikd_search import STACK, STACK_DEPTH
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_matching import NEIGHBOURS, match_planes
+from boxplus.systems.lio_config import LioConfig
+
+_CHUNK = 512
+REASONS = {
+    FEW_NEIGHBOURS: "fewer than five map points near",
+    NOT_A_PLANE: "neighbours not on a plane",
+    GATED: "too far from the plane",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """What a scan says about the components [θ, p, θ_L, p_L] at one state: A = Hᵀ R⁻¹ H (12, 12), b = Hᵀ R⁻¹ z (12,)."""
+
+    A: NDArray[np.float64]
+    b: NDArray[np.float64]
+    used: int
+    residual_rms: float
+
+
+class PlaneMeasurement:
+    """One scan against one map; keeps neighbours and planes from iteration to iteration.
+
+    Args:
+        p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame.
+        tree: the map, which must not change while the measurement lives.
+        config: noise, gates and threads.
+        with_extrinsic: whether the extrinsic is measured.
+    """
+
+    def __init__(self, p_lidar: NDArray[np.float32], tree: IkdTree, config: LioConfig, *, with_extrinsic: bool) -> None:
+        n = len(p_lidar)
+        self._p_lidar = p_lidar
+        self._tree = tree
+        self._config = config
+        self._with_extrinsic = with_extrinsic
+        self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
+        self._planes = np.zeros((n, 6))
+        self._fate = np.zeros(n, dtype=np.uint8)
+        self._matched = False
+        squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
+        self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
+
+    def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
+        """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
+        if rematch or not self._matched:
+            self._match(x)
+        A = np.zeros((MEASURED_DOF, MEASURED_DOF))
+        b = np.zeros(MEASURED_DOF)
+        sums = np.zeros(3)
+        config = self._config
+        accumulate_planes(
+            x,
+            self._p_lidar,
+            self._planes,
+            self._fate,
+            0,
+            len(self._p_lidar),
+            config.range_sigma**2,
+            config.map_sigma**2,
+            self._with_extrinsic,
+            A,
+            b,
+            sums,
+        )
+        A += np.triu(A, 1).T
+        used = int(sums[0])
+        return Information(A, b, used, float(np.sqrt(sums[1] / used)) if used else 0.0)
+
+    def rejected(self) -> Mapping[str, int]:
+        """Points that were not used, by reason."""
+        counts = np.bincount(self._fate, minlength=4)
+        return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
+
+    def used_mask(self) -> NDArray[np.bool_]:
+        """(n,) which points were used in the last iteration."""
+        mask: NDArray[np.bool_] = self._fate == USED
+        return mask
+
+    def _match(self, x: NDArray[np.float64]) -> None:
+        view, origin, config = self._tree.view(), self._tree.origin, self._config
+        warm = self._matched
+
+        def work(_: int, begin: int, end: int) -> None:
+            match_planes(
+                view,
+                origin,
+                x,
+                self._p_lidar,
+                begin,
+                end,
+                config.max_neighbour_distance**2,
+                config.plane_threshold,
+                warm,
+                self._neighbours,
+                self._planes,
+                self._fate,
+                np.zeros(NEIGHBOURS, dtype=np.float32),
+                np.zeros(STACK_DEPTH, dtype=STACK),
+            )
+
+        run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
+        self._matched = True
