@@ -100,6 +100,9 @@ class _Bag(AbstractContextManager["_Bag"]):
 
         self._ros1 = format == "ros1"
         self.typestore: Typestore = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
+        if _TRANSFORMS not in self.typestore.types:
+            definition = "geometry_msgs/TransformStamped[] transforms"
+            self.typestore.register(get_types_from_msg(definition, _TRANSFORMS))
         self._writer: Any = Ros1Writer(path) if self._ros1 else Ros2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Any] = {}
         self._arrived_ns = 0
