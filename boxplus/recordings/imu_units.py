@@ -124,11 +124,11 @@ def gravity_turn_ratio(
     A[:, :, 0] = np.cross(halfway, 0.5 * (rate[1:] + rate[:-1])) * step
     for axis, unit in enumerate(np.eye(3)):
         A[:, :, 1 + axis] = np.cross(unit, halfway) * step
-    A = A.reshape(-1, 4)
-    b = seen.reshape(-1)
-    solution, _, rank, _ = np.linalg.lstsq(A, b, rcond=None)
-    information = float(np.linalg.norm(A[:, 0] - A[:, 1:] @ np.linalg.lstsq(A[:, 1:], A[:, 0], rcond=None)[0]))
-    sigma = float(np.linalg.norm(b - A @ solution)) / np.sqrt(max(len(b) - rank, 1))
+    rows, b = A.reshape(-1, 4), seen.reshape(-1)
+    solution = np.linalg.lstsq(rows, b, rcond=None)[0]
+    biases = rows[:, 1:]
+    information = float(np.linalg.norm(rows[:, 0] - biases @ np.linalg.lstsq(biases, rows[:, 0], rcond=None)[0]))
+    sigma = float(np.linalg.norm(b - rows @ solution)) / float(np.sqrt(max(len(b) - 4, 1)))
     k = float(solution[0])
     if turned < _LEAST_TURN_RAD or k * information < _SIGNIFICANT * max(sigma, 1e-9):
         return None, turned

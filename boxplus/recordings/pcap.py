@@ -61,7 +61,11 @@ def _interval(first_ns: int, options: RecordingOptions) -> tuple[int, int]:
 
 
 def _recording(
-    info: RecordingInfo, events: Callable[[Tally], Iterator[tuple[int, Event]]], first_ns: int, options: RecordingOptions
+    info: RecordingInfo,
+    events: Callable[[Tally], Iterator[tuple[int, Event]]],
+    first_ns: int,
+    options: RecordingOptions,
+    errors: tuple[type[Exception], ...] = READ_ERRORS,
 ) -> Recording:
     """A recording over (reception time, event) pairs, cut to the wanted interval; a capture that breaks off ends there."""
     start_ns, stop_ns = _interval(first_ns, options)
@@ -73,7 +77,7 @@ def _recording(
                     return
                 if received_ns >= start_ns:
                     yield event
-        except READ_ERRORS as error:
+        except errors as error:
             tally.damage.append(f"decoding stopped: {str(error) or type(error).__name__}")
 
     return Recording(info, read, lambda: None)
@@ -225,7 +229,7 @@ def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
         if result is not None:
             yield _velodyne_scan(result, options)
 
-    return _recording(info, events, round(stamps[0] * 1e9), options)
+    return _recording(info, events, round(stamps[0] * 1e9), options, errors)
 
 
 def _velodyne_model(decoder: ModuleType, path: Path) -> Any:

@@ -17,6 +17,7 @@ class GyroAttitude:
         self._gyro = gyro
         self._rate = 0.5 * (gyro[1:] + gyro[:-1]) if len(gyro) > 1 else gyro
         steps = self._rate * (np.diff(time_ns) * 1e-9)[:, None]
+        self._sum = np.concatenate((np.zeros((1, 3)), np.cumsum(steps, axis=0)))
         self._R = np.concatenate((np.eye(3)[None], _running_product(so3.exp(steps)))) if len(steps) else np.eye(3)[None]
 
     def scaled(self, factor: float) -> GyroAttitude:
@@ -36,6 +37,11 @@ class GyroAttitude:
         index = np.clip(np.searchsorted(self._time_ns, time_ns, side="right") - 1, 0, len(self._rate) - 1)
         since = (time_ns - self._time_ns[index])[:, None] * 1e-9
         return self._R[index] @ so3.exp(self._rate[index] * since)
+
+    def integral(self, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(K, 3) plain integrals of the rate up to the times (K,): no rotation, but right in whatever unit the rate has."""
+        index = np.clip(np.searchsorted(self._time_ns, time_ns, side="right") - 1, 0, len(self._rate) - 1)
+        return self._sum[index] + self._rate[index] * (time_ns - self._time_ns[index])[:, None] * 1e-9
 
 
 def _running_product(R: NDArray[np.float64]) -> NDArray[np.float64]:

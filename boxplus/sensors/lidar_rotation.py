@@ -98,9 +98,9 @@ def align_rotations(lidar: LidarRotations, imu: ImuSamples) -> RotationAlignment
     step_s = (end_ns - begin_ns)[:, None] * 1e-9
     rate_lidar = phi_lidar / step_s
 
-    # In a first pass without an offset the scale is found: a gyroscope in deg/s is integrated as rad/s otherwise.
-    scale = _fit(_mean_rate(attitude, begin_ns, end_ns, 0.0), rate_lidar).scale
-    scale = 180.0 / np.pi if 7.6 < scale < 430.0 else 1.0
+    # First the unit: a gyroscope in deg/s taken for rad/s turns several times around between two scans.
+    plain_rate = (attitude.integral(end_ns) - attitude.integral(begin_ns)) / step_s
+    scale = 180.0 / np.pi if 7.6 < _fit(plain_rate, rate_lidar).scale < 430.0 else 1.0
     attitude = attitude.scaled(1.0 / scale)
 
     offset_s, offset_std_s = _time_offset(attitude, begin_ns, end_ns, rate_lidar)
