@@ -1,14 +1,19 @@
 """Recordings that are computed: worlds, smooth motions, LiDAR and IMU, with exact ground truth."""
 
+from boxplus.simulation.faults import FAULTS, Fault, make_fault
 from boxplus.simulation.imu import ImuModel
 from boxplus.simulation.lidar import RosetteLidar, SpinningLidar
+from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import SCENARIOS, Scenario, make_scenario, mounting
 from boxplus.simulation.simulation import Simulation, SimulationConfig, simulate
 from boxplus.simulation.spline import Motion, SplineTrajectory
 from boxplus.simulation.world import World, box, cylinder, rectangle, sphere
 
 __all__ = [
+    "FAULTS",
     "SCENARIOS",
+    "Fault",
     "ImuModel",
     "Motion",
     "RosetteLidar",
@@ -18,11 +23,14 @@ __all__ = [
     "SpinningLidar",
     "SplineTrajectory",
     "World",
+    "as_recording",
     "box",
     "cylinder",
+    "make_fault",
     "make_scenario",
     "mounting",
     "rectangle",
     "simulate",
     "sphere",
+    "write_recording",
 ]
