@@ -1,0 +1,94 @@
+"""The command line: `boxplus COMMAND`. Commands are imported when they are called, so that the first word appears at once."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from boxplus.errors import BoxplusError, InputError
+
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+_COMMANDS = {
+    "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
+    "inspect": ("boxplus.cli.inspect:inspect", "Examine a recording: topics, rates, gaps, times, units, extrinsic."),
+    "eval": ("boxplus.cli.eval:evaluate_command", "Compare a trajectory with the ground truth: ATE, RPE."),
+    "map": ("boxplus.cli.map:map_app", "Look into a map folder, or merge its tiles into one file."),
+    "report": ("boxplus.cli.report:report", "Draw the report of a run again, also of an interrupted one."),
+    "simulate": ("boxplus.cli.simulate:simulate_command", "Compute a recording with exact ground truth."),
+    "demo": ("boxplus.cli.demo:demo", "Simulate a walk, run the odometry on it and compare with the truth."),
+    "warmup": ("boxplus.cli.warmup:warmup", "Compile everything now, so that the first run does not have to."),
+}
+
+
+class _Commands(TyperGroup):
+    """Imports a command when it is called, and turns boxplus' errors into one paragraph and an exit code."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A stand-in with the help text, which is all a listing needs."""
+        if cmd_name not in _COMMANDS:
+            return None
+        stand_in = typer.Typer(add_completion=False)
+        stand_in.command(cmd_name, help=_COMMANDS[cmd_name][1])(lambda: None)
+        return typer.main.get_command(stand_in)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, rest = super().resolve_command(ctx, args)
+        if name is None or command is None:
+            return name, command, rest
+        module, _, attribute = _COMMANDS[name][0].partition(":")
+        found = getattr(importlib.import_module(module), attribute)
+        if not isinstance(found, typer.Typer):
+            single = typer.Typer(add_completion=False)
+            single.command(name)(found)
+            found = single
+        return name, typer.main.get_command(found), rest
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except BoxplusError as error:
+            typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
+            typer.echo(str(error), err=True)
+            raise typer.Exit(EXIT_BAD_INPUT if isinstance(error, InputError) else EXIT_FAILED) from None
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="boxplus: LiDAR-inertial odometry and its tools.",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        import boxplus
+
+        typer.echo(f"boxplus {boxplus.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the log as well.")] = False,
+) -> None:
+    logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(levelname)s %(name)s: %(message)s")
+
+
+def main() -> None:
+    """Entry point of the command `boxplus`."""
+    app(prog_name="boxplus")

@@ -1,0 +1,142 @@
+"""`boxplus lio`: a recording in, a trajectory, a map and a report out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.options import (
+    DEFAULTS,
+    AccelUnitOption,
+    DurationS,
+    GyroUnitOption,
+    ImuTopic,
+    LidarTopic,
+    MaxRange,
+    MinRange,
+    PointTimeField,
+    PointTimeReference,
+    PointTimeUnit,
+    StartS,
+    recording_options,
+)
+
+if TYPE_CHECKING:
+    from boxplus.systems.odometry_run import View
+    from boxplus.systems.run_config import RunConfig
+    from boxplus.systems.run_summary import RunSummary
+
+
+def lio(
+    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting, e.g. scan_voxel=0.5; may be repeated.", metavar="KEY=VALUE")
+    ] = None,
+    T_imu_lidar: Annotated[
+        str | None,
+        typer.Option(
+            "--T-imu-lidar",
+            help="Pose of the LiDAR in the IMU frame (p_imu = T p_lidar): 16 numbers row by row, 'xyz_qwxyz: x y z qw qx qy qz', "
+            "'xyz_qxyzw: …', 'xyz_rpy_deg: x y z roll pitch yaw', or a file with one of these.",
+        ),
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
+    no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    lidar_topic: LidarTopic = None,
+    imu_topic: ImuTopic = None,
+    point_time_field: PointTimeField = None,
+    point_time_unit: PointTimeUnit = None,
+    point_time_reference: PointTimeReference = None,
+    gyro_unit: GyroUnitOption = None,
+    accel_unit: AccelUnitOption = None,
+    min_range: MinRange = DEFAULTS.min_range,
+    max_range: MaxRange = DEFAULTS.max_range,
+    start: StartS = 0.0,
+    duration: DurationS = None,
+) -> None:
+    """Turn a recording into a trajectory, a map and a report.
+
+    No configuration is needed: topics, times and units are found from the data, with the evidence printed. Exit codes: 0 done,
+    1 the results could not be written, 2 bad input, 130 interrupted (results up to there are complete).
+    """
+    from boxplus.systems.run_config import load_run_config
+    from boxplus.systems.run_transform import parse_transform
+
+    options = recording_options(
+        lidar_topic,
+        imu_topic,
+        point_time_field,
+        point_time_unit,
+        point_time_reference,
+        gyro_unit,
+        accel_unit,
+        min_range,
+        max_range,
+        start,
+        duration,
+    )
+    given = {key: value for key, value in options if value != getattr(DEFAULTS, key)}
+    odometry: dict[str, object] = {}
+    if T_imu_lidar is not None:
+        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
+    if threads is not None:
+        odometry["threads"] = threads
+    overrides: dict[str, dict[str, object]] = {"recording": given, "odometry": odometry, "map": {"save": False} if no_map else {}}
+    run_config = load_run_config(config, settings or (), overrides)
+    if "threads" not in run_config.odometry.model_fields_set:
+        both = {"threads": min(2, os.cpu_count() or 1)}
+        run_config = run_config.model_copy(update={"odometry": run_config.odometry.model_copy(update=both)})
+    folder = output or Path(f"{recording.resolve().stem}_boxplus")
+    summary = run(recording, folder, run_config, overwrite=overwrite, view=view, report=not no_report)
+    if summary.state == "interrupted":
+        raise typer.Exit(130)
+
+
+def run(
+    recording: Path, folder: Path, config: RunConfig, *, overwrite: bool = False, view: bool = False, report: bool = True
+) -> RunSummary:
+    """Run the odometry with everything a terminal shows: evidence, progress, results.
+
+    Raises:
+        BoxplusError: bad input, or results that cannot be written.
+    """
+    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.recordings import open_recording
+    from boxplus.systems.odometry_run import run_odometry
+    from boxplus.systems.run_extrinsic import choose_extrinsic
+    from boxplus.systems.run_folder import prepare_run_folder
+
+    terminal = RunTerminal()
+    shown: View | None = None
+    if view:
+        from boxplus.report.live_view import LiveView
+
+        shown = LiveView(recording.name)
+    with open_recording(recording, config.recording) as opened:
+        prepare_run_folder(folder, overwrite=overwrite)
+        with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
+            extrinsic = choose_extrinsic(opened, config.odometry)
+        terminal.print_evidence(opened.info, extrinsic)
+        with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.progress() as progress:
+            summary = run_odometry(
+                opened, folder, config, extrinsic=extrinsic, progress=progress, view=shown, should_stop=should_stop
+            )
+    if report and summary.scans:
+        from boxplus.report import write_report
+
+        with terminal.status("drawing the report"):
+            write_report(folder)
+    terminal.print_results(summary, folder)
+    return summary

@@ -1,0 +1,150 @@
+"""What a run shows on a terminal: evidence before, progress while it goes on, results at the end; and Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from boxplus.recordings.info import RecordingInfo
+from boxplus.systems.odometry_run import Progress
+from boxplus.systems.run_extrinsic import Extrinsic
+from boxplus.systems.run_summary import RunSummary
+
+_STYLE = {"ok": "green", "warning": "yellow", "error": "bold red", "weak": "yellow", "lost": "bold red"}
+_SHOWN_WARNINGS = 8
+
+
+class RunTerminal:
+    """Prints on the standard output; without a terminal the progress bar is left out."""
+
+    def __init__(self) -> None:
+        self._console = Console(highlight=False)
+
+    def status(self, text: str) -> AbstractContextManager[object]:
+        """A line that stands while something takes its time."""
+        return self._console.status(text)
+
+    def announce_stop(self) -> None:
+        """Say that Ctrl-C was heard."""
+        self._console.print("interrupted: finishing the files; Ctrl-C again stops at once")
+
+    def print_evidence(self, info: RecordingInfo, extrinsic: Extrinsic) -> None:
+        """How the recording is read, and why."""
+        self._console.print(f"[bold]{info.path.name}[/bold]: {info.format}, {info.duration_s:.1f} s, {info.message_count} messages")
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for heading in ("reading", "found", "", "evidence"):
+            table.add_column(heading, overflow="fold")
+        for entry in info.evidence:
+            if entry.key != "T_imu_lidar":
+                table.add_row(entry.key, Text(entry.value), Text(entry.verdict, _STYLE[entry.verdict]), Text(entry.text))
+        verdict = "warning" if extrinsic.warning else "ok"
+        table.add_row("T_imu_lidar", extrinsic.source, Text(verdict, _STYLE[verdict]), Text(extrinsic.warning or extrinsic.text))
+        self._console.print(table)
+
+    @contextmanager
+    def progress(self) -> Iterator[Callable[[Progress], None]]:
+        """A bar with the scan rate; yields what `run_odometry` calls."""
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        with ProgressBar(*columns, console=self._console, disable=not self._console.is_terminal) as bar:
+            task = bar.add_task("odometry", total=1.0, text="")
+            rate = _Rate()
+            compiling = False
+
+            def show(progress: Progress) -> None:
+                nonlocal compiling
+                if progress.compiling is not None:
+                    if not compiling:
+                        compiling = True
+                        self._console.print("compiling kernels (first use only) …")
+                    bar.update(task, text=f"compiling {progress.compiling}")
+                elif rate.due():
+                    text = f"{progress.scans} scans, {rate(progress.scans):.0f}/s, {progress.status}"
+                    bar.update(task, completed=progress.share, description=progress.stage, text=text)
+
+            yield show
+            bar.update(task, completed=bar.tasks[0].total if bar.tasks[0].completed > 0.999 else bar.tasks[0].completed)
+
+    def print_results(self, summary: RunSummary, folder: Path) -> None:
+        """The facts of the run, its warnings and its files."""
+        console, timing = self._console, summary.timing
+        style = "green" if summary.state == "finished" else "yellow"
+        console.print(Text(summary.describe_state(), style))
+        table = Table(box=None, show_header=False, pad_edge=False)
+        table.add_column(style="bold")
+        table.add_column()
+        counts = Text(", ").join(Text(f"{count} {name}", _STYLE[name]) for name, count in sorted(summary.status.items()))
+        table.add_row("scans", Text.assemble(f"{summary.scans} (", counts, ")"))
+        if summary.start is not None:
+            table.add_row("start", Text(f"{summary.start.kind}: {summary.start.text}"))
+        table.add_row("path length", f"{summary.path_length_m:.2f} m in {summary.duration_s:.1f} s")
+        if timing.scan_ms is not None:
+            table.add_row("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms")
+        table.add_row("speed", f"{timing.real_time_factor:.1f} × real time, reading included; {timing.total_s:.1f} s in all")
+        table.add_row("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept")
+        console.print(table)
+        for warning in summary.warnings[:_SHOWN_WARNINGS]:
+            times = f" ({warning.count} times)" if warning.count > 1 else ""
+            console.print(Text.assemble(("warning: ", "yellow"), warning.text + times))
+        if len(summary.warnings) > _SHOWN_WARNINGS:
+            console.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
+        for name in ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"):
+            if (folder / name).exists():
+                console.print(f"  {folder / name}", soft_wrap=True, markup=False)
+
+
+class _Rate:
+    """Scans per second over the last few seconds, asked at most ten times a second."""
+
+    def __init__(self) -> None:
+        self._last = 0.0
+        self._seen: deque[tuple[float, int]] = deque(maxlen=30)
+
+    def due(self) -> bool:
+        return time.monotonic() - self._last > 0.1
+
+    def __call__(self, scans: int) -> float:
+        self._last = now = time.monotonic()
+        self._seen.append((now, scans))
+        begin, first = self._seen[0]
+        return (scans - first) / (now - begin) if now > begin else 0.0
+
+
+@contextmanager
+def stop_on_interrupt(announce: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Yields a question: was it asked to stop? The first Ctrl-C (or SIGTERM) only asks, the second stops at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield stop.is_set
+        return
+
+    def ask(number: int, frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+        announce()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

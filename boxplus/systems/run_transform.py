@@ -1,0 +1,131 @@
+"""A rigid transform as people write it: numbers on the command line, or a file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.filtering.nav_state import check_transform
+from boxplus.manifolds import quaternion
+
+_FORMS = (
+    "16 numbers row by row, or with a tag 'xyz_qwxyz: x y z qw qx qy qz', 'xyz_qxyzw: x y z qx qy qz qw' or "
+    "'xyz_rpy_deg: x y z roll pitch yaw'"
+)
+_TAGS = {"matrix": 16, "xyz_qwxyz": 7, "xyz_qxyzw": 7, "xyz_rpy_deg": 6}
+
+
+def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]:
+    """Read a rigid transform; for `T_imu_lidar` it maps LiDAR coordinates to IMU coordinates (p_imu = T p_lidar).
+
+    Args:
+        text: 16 numbers (row-major), tagged numbers (`xyz_qwxyz: …`, `xyz_qxyzw: …`, `xyz_rpy_deg: …` with
+            R = Rz(yaw) Ry(pitch) Rx(roll)), or a file with one of these, or a YAML or JSON file with the key `T_imu_lidar`, or with
+            `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`).
+        name: of the transform, for the messages.
+
+    Returns:
+        (4, 4) float64.
+
+    Raises:
+        InputError: not one of these forms, or not a rotation.
+    """
+    stripped = text.strip()
+    tag, body = _split_tag(stripped)
+    if tag is None and not _is_numbers(body):
+        stripped = _read_file(stripped, name)
+        mapping = _mapping(stripped)
+        if mapping is not None:
+            return _from_mapping(mapping, name)
+        tag, body = _split_tag(stripped)
+    try:
+        numbers = np.array([float(word) for word in re.split(r"[\s,;\[\]()]+", body) if word])
+    except ValueError:
+        raise InputError(f"{name} as {_FORMS}, or a file with these", f"{text[:80]!r}", "correct the numbers") from None
+    return _from_numbers(tag, numbers, name)
+
+
+def _split_tag(text: str) -> tuple[str | None, str]:
+    tag, colon, body = text.partition(":")
+    return (tag.strip(), body) if colon and tag.strip() in _TAGS else (None, text)
+
+
+def _is_numbers(text: str) -> bool:
+    return bool(re.fullmatch(r"[\s,;\[\]()0-9eE+.-]+", text)) and not Path(text).is_file()
+
+
+def _read_file(path: str, name: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise InputError(
+            f"{name} as {_FORMS}, or a file with these", f"{path[:80]!r} ({reason})", "check the numbers or the path"
+        ) from error
+
+
+def _mapping(text: str) -> dict[str, object] | None:
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return None
+    return content if isinstance(content, dict) and not set(content) <= set(_TAGS) else None
+
+
+def _from_mapping(content: dict[str, object], name: str) -> NDArray[np.float64]:
+    try:
+        if name in content:
+            return _from_numbers(None, np.array(content[name], dtype=np.float64).ravel(), name)
+        suffix = name.removeprefix("T_")
+        position = content.get(f"p_{suffix}", content.get(f"t_{suffix}"))
+        if f"R_{suffix}" in content and position is not None:
+            T = np.eye(4)
+            T[:3, :3] = np.array(content[f"R_{suffix}"], dtype=np.float64).reshape(3, 3)
+            T[:3, 3] = np.array(position, dtype=np.float64).reshape(3)
+            return check_transform(name, T)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"numbers for {name}", str(error), "correct the file") from error
+    raise InputError(
+        f"the key {name}, or R_{suffix} and p_{suffix}",
+        f"the keys {', '.join(map(str, content))}",
+        "rename the keys; the name says the direction",
+    )
+
+
+def _from_numbers(tag: str | None, numbers: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    if tag is None:
+        if numbers.size == 7:
+            raise InputError(
+                f"{name} as {_FORMS}", "7 numbers without a tag", "say in which order the quaternion is: xyz_qwxyz: or xyz_qxyzw:"
+            )
+        tag = "matrix"
+    if numbers.size != _TAGS[tag]:
+        raise InputError(f"{name} as {_FORMS}", f"{numbers.size} numbers", "check that all were copied")
+    if tag == "matrix":
+        return check_transform(name, numbers.reshape(4, 4))
+    T = np.eye(4)
+    T[:3, 3] = numbers[:3]
+    if tag == "xyz_rpy_deg":
+        roll, pitch, yaw = np.radians(numbers[3:])
+        cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+        T[:3, :3] = [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+        return check_transform(name, T)
+    q_wxyz = numbers[3:] if tag == "xyz_qwxyz" else numbers[[6, 3, 4, 5]]
+    norm = float(np.linalg.norm(q_wxyz))
+    if not abs(norm - 1.0) < 1e-2:
+        raise InputError(
+            f"a unit quaternion in {name}", f"one of norm {norm:.4g}", "check the order of the numbers and that all were copied"
+        )
+    T[:3, :3] = quaternion.to_matrix((q_wxyz / norm)[None])[0]
+    return check_transform(name, T)
