@@ -1,0 +1,49 @@
+"""Half-open boxes `lo ≤ x < hi` in float32, as six numbers: low x, y, z, high x, y, z."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.maps.ikd_pool import BUCKET, ZERO, all_bits
+
+
+@kernel
+def in_box(leaf: NDArray[np.void], index: np.uint32, box: NDArray[np.float32]) -> np.uint32:
+    """Which stored points of a leaf lie in a half-open box (as bits)."""
+    record = leaf[index]
+    x, y, z = record["x"], record["y"], record["z"]
+    x0, y0, z0, x1, y1, z1 = box[0], box[1], box[2], box[3], box[4], box[5]
+    count = np.uint32(record["count"])
+    bits = ZERO
+    for i in range((count + np.uint32(7)) & np.uint32(2 * BUCKET - 8)):
+        hit = np.uint32(x[i] >= x0) & np.uint32(x[i] < x1) & np.uint32(y[i] >= y0) & np.uint32(y[i] < y1)
+        bits |= (hit & np.uint32(z[i] >= z0) & np.uint32(z[i] < z1)) << np.uint32(i)
+    return np.uint32(bits & all_bits(count))
+
+
+@kernel(inline=True)
+def disjoint(slots: NDArray[np.float32], side: np.uint32, box: NDArray[np.float32]) -> bool:
+    """Whether the box of a slot and a half-open box have no point in common."""
+    return bool(
+        (slots[side, 0] >= box[3])
+        | (slots[side, 1] >= box[4])
+        | (slots[side, 2] >= box[5])
+        | (slots[side, 3] < box[0])
+        | (slots[side, 4] < box[1])
+        | (slots[side, 5] < box[2])
+    )
+
+
+@kernel(inline=True)
+def contained(slots: NDArray[np.float32], side: np.uint32, box: NDArray[np.float32]) -> bool:
+    """Whether the box of a slot lies in a half-open box."""
+    return bool(
+        (slots[side, 0] >= box[0])
+        & (slots[side, 1] >= box[1])
+        & (slots[side, 2] >= box[2])
+        & (slots[side, 3] < box[3])
+        & (slots[side, 4] < box[4])
+        & (slots[side, 5] < box[5])
+    )
