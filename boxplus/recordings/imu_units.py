@@ -1,8 +1,8 @@
 """Finding out the units of an IMU from what it measured.
 
 The accelerometer at rest, or in the median of any motion a robot survives, shows one gravity: about 1 in g, about 9.8 in m/s².
-The gyroscope is compared with it: gravity, seen from the IMU, turns with -ω × g, so the ratio of the two is 1 in rad/s and
-57.3 in deg/s. Where too little turns to tell, the message's definition holds (sensor_msgs/Imu and REP 103: rad/s).
+The gyroscope is compared with it: gravity, seen from the IMU, turns with -ω × g, and only one unit of ω fits. Where the two fit
+alike, nothing turned, and the message's definition holds (sensor_msgs/Imu and REP 103: rad/s).
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ _PLAUSIBLE_NORMS: dict[AccelUnit, tuple[float, float]] = {"g": (0.6, 1.6), "m/s2
 _FASTEST_RAD_S = 35.0
 """2000 °/s, the range of the fastest common gyroscopes."""
 _WINDOW_S = 0.25
-_LEAST_TURN_RAD = 0.03
-_SIGNIFICANT = 6.0
+_RAD_FITS = 0.8
+_DEG_FITS = 0.3
+"""The misfit of one unit as a share of the other's, below which it is taken: stricter for the unusual one."""
 
 
 def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tuple[AccelUnit, Evidence]:
@@ -63,15 +64,16 @@ def read_gyro_unit(
     """
     norms = _norms(gyro)
     fast = float(np.quantile(norms, 0.9)) if len(norms) else 0.0
-    ratio, turned = gravity_turn_ratio(time_ns, gyro, accel)
-    measured: GyroUnit | None = None
-    if ratio is not None:
-        measured = "rad/s" if ratio < 7.6 else "deg/s"
-    seen = f"gyro and accelerometer turn by a ratio of {ratio:.1f} (1 in rad/s, 57.3 in deg/s)" if ratio is not None else ""
+    rad, deg = gravity_misfits(time_ns, gyro, accel)
+    measured: GyroUnit | None = "rad/s" if rad < _RAD_FITS * deg else "deg/s" if deg < _DEG_FITS * rad else None
+    seen = (
+        f"every {_WINDOW_S} s the turn of gravity in the accelerometer differs from the gyroscope's by {np.degrees(rad):.2f} deg "
+        f"(rms) if it is in rad/s, by {np.degrees(deg):.2f} deg if in deg/s"
+    )
     given = options.gyro_unit
     if given is not None:
         if measured is None or measured == given:
-            return given, Evidence("gyro_unit", given, "ok", f"given; {seen or 'too little rotation to check it'}")
+            return given, Evidence("gyro_unit", given, "ok", f"given; {seen}")
         return given, Evidence("gyro_unit", given, "warning", f"given, but {seen}: check --gyro-unit")
     if measured is not None:
         return measured, Evidence("gyro_unit", measured, "ok", seen)
@@ -81,10 +83,7 @@ def read_gyro_unit(
             f"{fast:.1f} in the fastest tenth of the first samples: deg/s, or a broken sensor",
             "say the unit with --gyro-unit rad/s or deg/s",
         )
-    text = (
-        f"by the message's definition: the turn of gravity in the first seconds ({np.degrees(turned):.1f} deg, noise included) "
-        f"does not show it; the fastest tenth turns at {fast:.3f}; 'boxplus inspect' compares with the LiDAR"
-    )
+    text = f"by the message's definition; {seen}, which does not decide; 'boxplus inspect' compares with the LiDAR"
     return "rad/s", Evidence("gyro_unit", "rad/s", "ok", text)
 
 
@@ -95,18 +94,16 @@ def _norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return norms[np.isfinite(norms)]
 
 
-def gravity_turn_ratio(
-    time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]
-) -> tuple[float | None, float]:
-    """How much faster the gyroscope turns than gravity does in the accelerometer, and by how much gravity turned [rad].
+def gravity_misfits(time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> tuple[float, float]:
+    """How badly the turn of gravity fits a gyroscope in rad/s, and one in deg/s: rms per window [rad].
 
-    Window averages of the direction of gravity d change by -ω × d; the ratio is the least-squares factor between both
-    sides, with the gyroscope's bias estimated beside it, and None where it is not significant.
+    Window means of the direction of gravity d change by -ω × d Δt; a constant bias of ω is fitted. Equal misfits (0, 0 without
+    data) mean that nothing turned.
     """
     finite = (np.abs(gyro) < 1e6).all(axis=1) & (np.abs(accel) < 1e6).all(axis=1)
     time_ns, gyro, accel = time_ns[finite], gyro[finite], accel[finite]
     if len(time_ns) < 8 or time_ns[-1] - time_ns[0] < 4 * _WINDOW_S * 1e9:
-        return None, 0.0
+        return 0.0, 0.0
     seconds = (time_ns - time_ns[0]) * 1e-9
     window = np.maximum.accumulate((seconds / _WINDOW_S).astype(np.int64))
     _, begin = np.unique(window, return_index=True)
@@ -114,22 +111,15 @@ def gravity_turn_ratio(
     rate = np.add.reduceat(gyro, begin) / count
     direction = np.add.reduceat(accel, begin) / count
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
-    middle = np.add.reduceat(seconds, begin) / count[:, 0]
-    step = np.diff(middle)[:, None]
+    step = np.diff(np.add.reduceat(seconds, begin) / count[:, 0])[:, None]
     halfway = 0.5 * (direction[1:] + direction[:-1])
+    turned = np.cross(halfway, 0.5 * (rate[1:] + rate[:-1])) * step
     seen = np.diff(direction, axis=0)
-    turned = float(np.sqrt((seen**2).sum()))
-    # seen = -k (rate × d) Δt + (bias × d) Δt, linear in k = 1/ratio and the bias.
-    A = np.empty((len(seen), 3, 4))
-    A[:, :, 0] = np.cross(halfway, 0.5 * (rate[1:] + rate[:-1])) * step
-    for axis, unit in enumerate(np.eye(3)):
-        A[:, :, 1 + axis] = np.cross(unit, halfway) * step
-    rows, b = A.reshape(-1, 4), seen.reshape(-1)
-    solution = np.linalg.lstsq(rows, b, rcond=None)[0]
-    biases = rows[:, 1:]
-    information = float(np.linalg.norm(rows[:, 0] - biases @ np.linalg.lstsq(biases, rows[:, 0], rcond=None)[0]))
-    sigma = float(np.linalg.norm(b - rows @ solution)) / float(np.sqrt(max(len(b) - 4, 1)))
-    k = float(solution[0])
-    if turned < _LEAST_TURN_RAD or k * information < _SIGNIFICANT * max(sigma, 1e-9):
-        return None, turned
-    return 1.0 / k, turned
+    biases = np.stack([np.cross(halfway, unit) * step for unit in np.eye(3)], axis=2).reshape(-1, 3)
+
+    def misfit(scale: float) -> float:
+        rest = (seen - scale * turned).reshape(-1)
+        rest = rest - biases @ np.linalg.lstsq(biases, rest, rcond=None)[0]
+        return float(np.linalg.norm(rest)) / float(np.sqrt(len(seen)))
+
+    return misfit(GYRO_SCALE["rad/s"]), misfit(GYRO_SCALE["deg/s"])

@@ -19,11 +19,11 @@ from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
 
 _SCANS_IN_MAP = 4
-_POINTS = 1500
+_POINTS = 1000
 _MOST_POINTS = 20_000
 _CELL = 0.03
 """Size of the grid on which points are averaged, as a share of the median range; coarser where that makes too many cells."""
-_MOST_CELLS = 2500
+_MOST_CELLS = 1500
 _NEIGHBOURS = 12
 _THICKEST_PLANE = 0.15
 """Largest variance across a neighbourhood, as a share of its second one, that still makes a plane."""
@@ -34,7 +34,7 @@ _ITERATIONS = 5
 _FEWEST_MATCHES = 100
 _SAME_PLANE = 0.9
 """Cosine between the normals of two matched points."""
-_CONVERGED = 2e-4
+_CONVERGED = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +110,14 @@ class _Tracker:
         turn, move = self._turn, self._move
         planar, normals = _normals(_undistort(raw, share, turn, move))
         raw, share = raw[planar], share[planar]
+        target = _Patch(*(np.concatenate([getattr(patch, name) for patch in self._patches]) for name in ("points", "normals")))
+        tree = cKDTree(target.points, balanced_tree=False, compact_nodes=False)
         # Twice: the motion found first undistorts the scan better than the previous scan's motion.
         for reach in (_REACH_M, _REACH_M[1:]):
             # `turn` is the mean between the middles of two scans; in the middle of this one it has changed by half a step more.
             now = turn + 0.5 * (turn - self._turn) if self._turned else turn
             still = _undistort(raw, share, now, move)
-            found = self._register(still, normals, turn, move, reach)
+            found = self._register(target, tree, still, normals, turn, move, reach)
             if found is None:
                 self.failed += 1
                 self._restart()
@@ -136,6 +138,8 @@ class _Tracker:
 
     def _register(
         self,
+        target: _Patch,
+        tree: cKDTree,
         points: NDArray[np.float64],
         normals: NDArray[np.float64],
         turn: NDArray[np.float64],
@@ -145,11 +149,8 @@ class _Tracker:
         """Rotation vector and translation from the previous scan, from a first guess of both."""
         stride = -(-len(points) // _POINTS) or 1
         points, normals = points[::stride], normals[::stride]
-        target = np.concatenate([patch.points for patch in self._patches])
-        target_normals = np.concatenate([patch.normals for patch in self._patches])
-        if len(target) < _FEWEST_MATCHES or len(points) < _FEWEST_MATCHES:
+        if len(target.points) < _FEWEST_MATCHES or len(points) < _FEWEST_MATCHES:
             return None
-        tree = cKDTree(target)
         R, t = self._R @ so3.exp(turn), self._t + self._R @ move
         for distance in reach:
             for _ in range(_ITERATIONS):
@@ -157,11 +158,11 @@ class _Tracker:
                 gap, index = tree.query(world, distance_upper_bound=distance)
                 hit = np.isfinite(gap)
                 index[~hit] = 0
-                plane = target_normals[index]
+                plane = target.normals[index]
                 hit &= np.abs(np.einsum("ij,ij->i", plane, normals @ R.T)) > _SAME_PLANE
                 if hit.sum() < _FEWEST_MATCHES:
                     return None
-                change = _gauss_newton_step(world[hit], target[index[hit]], plane[hit])
+                change = _gauss_newton_step(world[hit], target.points[index[hit]], plane[hit])
                 if change is None:
                     return None
                 dR = so3.exp(change[:3])

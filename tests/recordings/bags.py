@@ -94,6 +94,14 @@ class Content:
     def stamp_ns(self, index: int) -> int:
         return START_NS + index * PERIOD_NS
 
+    def imu(self, stamp_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Angular velocity and acceleration as recorded at this time."""
+        return self.gyro, self.accel
+
+    def keeps(self, topic: str, index: int) -> bool:
+        """Whether the message of this index is recorded."""
+        return True
+
 
 class _Bag:
     """The few things both writers do, and the types they need."""
@@ -130,7 +138,7 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
     path = folder / ("recording.bag" if container == "ros1" else "recording")
     bag = _Bag(path, container)
     events: list[tuple[int, str, Any]] = []
-    for index in range(content.scans):
+    for index in (k for k in range(content.scans) if content.keeps("/points", k)):
         stamp_ns = content.stamp_ns(index)
         events.append((stamp_ns + content.lidar_delay_ns, "/points", cloud_message(bag, content, index)))
         for name, kind in content.extra_topics.items():
@@ -138,7 +146,7 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
             events.append((stamp_ns + content.lidar_delay_ns, name, cloud_message(bag, other, index)))
     if content.with_imu:
         count = (content.scans * PERIOD_NS * content.imu_rate) // 10**9 + 1
-        for index in range(count):
+        for index in (k for k in range(count) if content.keeps("/imu", k)):
             stamp_ns = START_NS + index * 10**9 // content.imu_rate
             events.append((stamp_ns, "/imu", _imu_message(bag, content, stamp_ns)))
     if content.transforms:
@@ -206,13 +214,14 @@ def cloud_message(bag: _Bag, content: Content, index: int) -> Any:
 def _imu_message(bag: _Bag, content: Content, stamp_ns: int) -> Any:
     types = bag.store.types
     vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    gyro, accel = content.imu(stamp_ns)
     return types["sensor_msgs/msg/Imu"](
         header=bag.header(stamp_ns, "imu"),
         orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=np.zeros(9),
-        angular_velocity=vector(*content.gyro),
+        angular_velocity=vector(*gyro),
         angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(*content.accel),
+        linear_acceleration=vector(*accel),
         linear_acceleration_covariance=np.zeros(9),
     )
 
