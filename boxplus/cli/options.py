@@ -33,8 +33,12 @@ GyroUnitOption = Annotated[
 AccelUnitOption = Annotated[
     AccelUnit | None, typer.Option("--accel-unit", help="Unit of the acceleration.", rich_help_panel=_PANEL)
 ]
-MinRange = Annotated[float, typer.Option("--min-range", help="Drop points nearer than this [m].", min=0.0, rich_help_panel=_PANEL)]
-MaxRange = Annotated[float, typer.Option("--max-range", help="Drop points farther than this [m].", min=0.0, rich_help_panel=_PANEL)]
+MinRange = Annotated[
+    float, typer.Option("--min-range", help="Drop points nearer than this [m].", min=0.0, rich_help_panel=_PANEL)
+]
+MaxRange = Annotated[
+    float, typer.Option("--max-range", help="Drop points farther than this [m].", min=0.0, rich_help_panel=_PANEL)
+]
 StartS = Annotated[float, typer.Option("--start", help="Skip this much at the beginning [s].", min=0.0, rich_help_panel=_PANEL)]
 DurationS = Annotated[float | None, typer.Option("--duration", help="Read at most this much [s].", rich_help_panel=_PANEL)]
 
