@@ -18,13 +18,16 @@ from boxplus.manifolds import so3
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.scan_registration import LidarRotations, lidar_rotations
+from boxplus.sensors.scan_registration import LidarRotations, ScanRegistration
 
 _LARGEST_OFFSET_S = 0.25
 _OFFSET_STEP_S = 0.01
 _FEWEST_INTERVALS = 10
 _ROUNDS = 4
-_DETERMINED_DEG = 3.0
+_DETERMINED_DEG = 8.0
+_WELL_KNOWN_DEG = 0.7
+_SCANS_BETWEEN_LOOKS = 15
+_FEWEST_SCANS_TO_STOP = 45
 _OFFSET_KNOWN_S = 0.01
 _REGISTRATION_LAG_S = 0.003
 """What registration against a map of the last scans lags by, measured on recordings with known offset."""
@@ -40,7 +43,7 @@ class RotationAlignment:
             rotation closest to identity that fits.
         std_deg: (3,) float64, ascending: standard deviations of R_imu_lidar about its three principal axes [deg].
         axes: (3, 3) float64, those axes in the IMU frame, one a column.
-        observable_axes: about how many of these axes it is known to 3 degrees.
+        observable_axes: about how many of these axes it is known to 8 degrees (a start for online refinement).
         residual_deg: median difference of the two rotations per interval after alignment [deg].
         excitation_deg_s: (3,) float64, descending: standard deviations of the rotation rate along its principal axes.
         time_offset_s: add this to the LiDAR's times to bring them to the IMU's clock [s].
@@ -68,6 +71,8 @@ class RotationAlignment:
 def estimate_rotation_extrinsic(scans: Sequence[Scan], imu: ImuSamples) -> RotationAlignment:
     """Estimate R_imu_lidar, the time offset and the gyroscope's scale from a stretch with motion.
 
+    Scans are registered until the rotation is known to 0.7 degrees; the rest is not looked at.
+
     Args:
         scans: consecutive scans, about 10 s with rotation about at least two axes.
         imu: the samples of the same stretch.
@@ -75,7 +80,14 @@ def estimate_rotation_extrinsic(scans: Sequence[Scan], imu: ImuSamples) -> Rotat
     Raises:
         InputError: fewer than ten scan pairs could be registered within the IMU's samples.
     """
-    return align_rotations(lidar_rotations(scans), imu)
+    registration = ScanRegistration()
+    for number, scan in enumerate(scans, start=1):
+        registration.add(scan)
+        if number % _SCANS_BETWEEN_LOOKS == 0 and number >= _FEWEST_SCANS_TO_STOP:
+            found = align_rotations(registration.rotations(), imu)
+            if found.std_deg[-1] < _WELL_KNOWN_DEG:
+                return found
+    return align_rotations(registration.rotations(), imu)
 
 
 def align_rotations(lidar: LidarRotations, imu: ImuSamples) -> RotationAlignment:

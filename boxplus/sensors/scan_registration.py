@@ -61,13 +61,10 @@ def lidar_rotations(scans: Iterable[Scan]) -> LidarRotations:
     Args:
         scans: in order of time; streamed, only a few are held at once.
     """
-    tracker = _Tracker()
-    steps = [step for scan in scans if (step := tracker.add(scan)) is not None]
-    begin = np.array([step[0] for step in steps], np.int64)
-    end = np.array([step[1] for step in steps], np.int64)
-    rotation = np.array([step[2] for step in steps]).reshape(-1, 3)
-    translation = np.array([step[3] for step in steps]).reshape(-1, 3)
-    return LidarRotations(begin, end, rotation, translation, tracker.failed)
+    registration = ScanRegistration()
+    for scan in scans:
+        registration.add(scan)
+    return registration.rotations()
 
 
 @dataclass(slots=True)
@@ -82,21 +79,30 @@ _Step = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 """Middle of the earlier and of the later scan, rotation vector and translation between them."""
 
 
-class _Tracker:
-    """The poses of the scans so far, as far as the next one needs them."""
+class ScanRegistration:
+    """Registers scans one after the other, each to the few before it."""
 
     def __init__(self) -> None:
-        self.failed = 0
+        self._failed = 0
+        self._steps: list[_Step] = []
         self._patches: deque[_Patch] = deque(maxlen=_SCANS_IN_MAP)
         self._R, self._t = np.eye(3), np.zeros(3)
         self._turn, self._move, self._turned = np.zeros(3), np.zeros(3), False
         self._previous_ns: int | None = None
 
-    def add(self, scan: Scan) -> _Step | None:
-        """The motion from the previous scan to this one, or None when there is none to tell."""
+    def rotations(self) -> LidarRotations:
+        """The motions found so far."""
+        begin = np.array([step[0] for step in self._steps], np.int64)
+        end = np.array([step[1] for step in self._steps], np.int64)
+        rotation = np.array([step[2] for step in self._steps]).reshape(-1, 3)
+        translation = np.array([step[3] for step in self._steps]).reshape(-1, 3)
+        return LidarRotations(begin, end, rotation, translation, self._failed)
+
+    def add(self, scan: Scan) -> None:
+        """Register the next scan; one that does not fit the map, or follows a gap, begins a new one."""
         if len(scan) < _FEWEST_MATCHES:
             self._restart()
-            return None
+            return
         raw, share = _cell_means(scan)
         middle_ns = (scan.start_ns + scan.end_ns) // 2
         step_s = 0.0 if self._previous_ns is None else (middle_ns - self._previous_ns) * 1e-9
@@ -105,7 +111,7 @@ class _Tracker:
             self._previous_ns = middle_ns
             planar, normals = _normals(raw)
             self._patches.append(_Patch(raw[planar], normals))
-            return None
+            return
         share *= (scan.end_ns - scan.start_ns) * 1e-9 / step_s
         turn, move = self._turn, self._move
         planar, normals = _normals(_undistort(raw, share, turn, move))
@@ -119,16 +125,16 @@ class _Tracker:
             still = _undistort(raw, share, now, move)
             found = self._register(target, tree, still, normals, turn, move, reach)
             if found is None:
-                self.failed += 1
+                self._failed += 1
                 self._restart()
-                return None
+                return
             turn, move = found
         self._t = self._t + self._R @ move
         self._R = self._R @ so3.exp(turn)
         self._patches.append(_Patch(still @ self._R.T + self._t, normals @ self._R.T))
         begin_ns, self._previous_ns = self._previous_ns, middle_ns
         self._turn, self._move, self._turned = turn, move, True
-        return begin_ns, middle_ns, turn, move
+        self._steps.append((begin_ns, middle_ns, turn, move))
 
     def _restart(self) -> None:
         self._patches.clear()
