@@ -94,6 +94,10 @@ class Content:
     def stamp_ns(self, index: int) -> int:
         return START_NS + index * PERIOD_NS
 
+    def written_stamp_ns(self, index: int) -> int:
+        """The stamp in the message of a scan."""
+        return self.stamp_ns(index)
+
     def imu(self, stamp_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Angular velocity and acceleration as recorded at this time."""
         return self.gyro, self.accel
@@ -159,7 +163,7 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
 
 def cloud_message(bag: _Bag, content: Content, index: int) -> Any:
     types = bag.store.types
-    header = bag.header(content.stamp_ns(index), "lidar")
+    header = bag.header(content.written_stamp_ns(index), "lidar")
     p_lidar, times_ns = content.p_lidar(index), content.times_ns(index)
     relative = times_ns - content.stamp_ns(index)
     if content.layout.startswith("livox"):

@@ -165,3 +165,26 @@ def test_wrong_paths(tmp_path: Path, name: str) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(RecordingError, match=r"expected a .* – got .*" + name.replace(".", r"\.")):
         open_recording(tmp_path / name)
+
+
+class UnstampedContent(Content):
+    def written_stamp_ns(self, index: int) -> int:
+        return 0
+
+
+class OtherClockContent(Content):
+    def written_stamp_ns(self, index: int) -> int:
+        return self.stamp_ns(index) - 1_000_000_000_000
+
+
+def test_stamps_that_stand_still(tmp_path: Path) -> None:
+    with pytest.raises(
+        RecordingError, match=r"stamps on /points that go on .* – got the same stamp 0.000 s on the first 6 messages"
+    ):
+        open_recording(write_bag(tmp_path, "ros1", UnstampedContent()))
+
+
+def test_different_clocks_are_an_error(tmp_path: Path) -> None:
+    with open_recording(write_bag(tmp_path, "ros1", OtherClockContent())) as recording:
+        found = {e.key: e for e in recording.info.evidence}["clocks"]
+    assert found.verdict == "error" and "stamped by different clocks" in found.text

@@ -1,0 +1,292 @@
+"""What the first seconds of a bag show: topics, point times, units, extrinsic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from boxplus.errors import AmbiguityError, RecordingError
+from boxplus.recordings import point_time
+from boxplus.recordings.clouds import cloud_layout, view_points
+from boxplus.recordings.containers import Channel, Container
+from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
+from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
+from boxplus.recordings.messages import (
+    CloudMessage,
+    MalformedMessageError,
+    parse_imu,
+    parse_livox,
+    parse_point_cloud,
+    parse_transforms,
+)
+from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.transforms import Transform, chain
+
+CLOUD_PARSERS = {
+    "sensor_msgs/PointCloud2": parse_point_cloud,
+    "livox_ros_driver/CustomMsg": parse_livox,
+    "livox_ros_driver2/CustomMsg": parse_livox,
+}
+IMU_TYPE = "sensor_msgs/Imu"
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+
+_PROBE_NS = 6_000_000_000
+_PROBE_SCANS = 30
+_SAME_CLOCK_S = 2.0
+_MOST_TRANSFORM_MESSAGES = 1000
+
+
+def interval(container: Container, options: RecordingOptions) -> tuple[int, int]:
+    """Reception times [start, stop) that the options ask for."""
+    start_ns = container.start_ns + round(options.start_s * 1e9)
+    if options.duration_s is None:
+        return start_ns, container.end_ns + 1
+    return start_ns, start_ns + round(options.duration_s * 1e9)
+
+
+@dataclass(slots=True)
+class _CloudProbe:
+    """What the first clouds of one topic show."""
+
+    fields: tuple[str, ...] = ()
+    time_fields: tuple[str, ...] = ()
+    times: list[point_time.CloudTimes] = field(default_factory=list)
+    stamp_ns: list[int] = field(default_factory=list)
+    received_ns: list[int] = field(default_factory=list)
+    frame: str = ""
+    seen: int = 0
+    complaint: str = ""
+
+
+@dataclass(slots=True)
+class _ImuProbe:
+    """What the first samples of the IMU show."""
+
+    time_ns: list[int] = field(default_factory=list)
+    received_ns: list[int] = field(default_factory=list)
+    gyro: list[tuple[float, ...]] = field(default_factory=list)
+    accel: list[tuple[float, ...]] = field(default_factory=list)
+    frame: str = ""
+
+
+def find_out(path: Path, container: Container, options: RecordingOptions) -> RecordingInfo:
+    channels = [channel for channel in container.channels if channel.count > 0]
+    evidence = [Evidence("file", "damaged", "warning", text) for text in container.damage]
+    imu = _choose_imu(channels, options)
+    clouds = _cloud_candidates(channels, options)
+    cloud_probes, imu_probe, transforms = _probe(container, clouds, imu, options)
+    lidar = _choose_lidar(clouds, cloud_probes, options)
+    probe = cloud_probes[lidar.topic]
+    evidence.append(_chosen("lidar_topic", lidar, [c for c in channels if c.type in CLOUD_PARSERS], options.lidar_topic))
+    evidence.append(_chosen("imu_topic", imu, [c for c in channels if c.type == IMU_TYPE], options.imu_topic))
+
+    if not probe.seen:
+        raise RecordingError(
+            f"point clouds on {lidar.topic}",
+            f"none that can be read in the first seconds{f' ({probe.complaint})' if probe.complaint else ''}",
+            "choose another --lidar-topic or convert the recording to sensor_msgs/PointCloud2",
+        )
+    if not imu_probe.time_ns:
+        raise RecordingError(
+            f"IMU messages on {imu.topic}", "none that can be read in the first seconds", "choose another --imu-topic"
+        )
+    delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns)
+    evidence.append(_clocks(_delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns) - delay))
+    reading = PointTimeReading(None, "ns", "scan_start", "stamp")
+    name = point_time.choose_time_field(probe.fields, probe.time_fields, options)
+    if name is not None:
+        reading, found = point_time.read_point_time(name, probe.times, delay, options)
+        evidence += found
+    else:
+        text = "every point is taken at the stamp of its scan, as asked for: motion within a scan is not corrected"
+        evidence.append(Evidence("point_time_field", "none", "warning", text))
+    gyro, accel = np.array(imu_probe.gyro), np.array(imu_probe.accel)
+    accel_unit, accel_evidence = read_accel_unit(accel, options)
+    gyro_unit, gyro_evidence = read_gyro_unit(np.array(imu_probe.time_ns, np.int64), gyro, accel, options)
+    evidence += [gyro_evidence, accel_evidence]
+    T_imu_lidar, source, found_extrinsic = _extrinsic(container, transforms, imu_probe.frame, probe.frame)
+    evidence.append(found_extrinsic)
+    return RecordingInfo(
+        path=path,
+        format=container.format,
+        topics=[Topic(channel.topic, channel.type, channel.count) for channel in container.channels],
+        duration_s=(container.end_ns - container.start_ns) * 1e-9,
+        message_count=lidar.count + imu.count,
+        lidar_topic=lidar.topic,
+        imu_topic=imu.topic,
+        lidar_frame=probe.frame,
+        imu_frame=imu_probe.frame,
+        point_time=reading,
+        gyro_unit=gyro_unit,
+        accel_unit=accel_unit,
+        T_imu_lidar=T_imu_lidar,
+        T_imu_lidar_source=source,
+        evidence=evidence,
+    )
+
+
+def _delay_ns(topic: str, stamp_ns: list[int], received_ns: list[int]) -> float:
+    """Median time from stamp to reception. Raises RecordingError when the stamps stand still."""
+    if len(stamp_ns) >= 3 and min(stamp_ns) == max(stamp_ns):
+        raise RecordingError(
+            f"stamps on {topic} that go on from message to message",
+            f"the same stamp {stamp_ns[0] * 1e-9:.3f} s on the first {len(stamp_ns)} messages",
+            "let the driver fill in header.stamp; the times of reception are too rough to replace it",
+        )
+    return float(np.median(np.array(received_ns, np.float64) - np.array(stamp_ns, np.float64)))
+
+
+def _clocks(difference_ns: float) -> Evidence:
+    """Compares how long after their stamps the messages of LiDAR and IMU arrived."""
+    seconds = difference_ns * 1e-9
+    text = f"clouds arrive {seconds:+.3f} s after their stamps, compared with IMU messages"
+    if abs(seconds) < _SAME_CLOCK_S:
+        return Evidence("clocks", "one", "ok", text)
+    advice = "LiDAR and IMU are stamped by different clocks: synchronise them (PTP, or the driver's host time)"
+    return Evidence("clocks", "differ", "error", f"{text}: {advice}")
+
+
+def _listed(channels: list[Channel]) -> str:
+    return ", ".join(f"{channel.topic} [{channel.type}, {channel.count}]" for channel in channels) or "none"
+
+
+def _choose_imu(channels: list[Channel], options: RecordingOptions) -> Channel:
+    found = [channel for channel in channels if channel.type == IMU_TYPE]
+    if options.imu_topic is not None:
+        found = [channel for channel in found if channel.topic == options.imu_topic]
+        if not found:
+            raise RecordingError(
+                f"IMU messages ({IMU_TYPE}) on {options.imu_topic}", f"topics {_listed(channels)}", "choose another --imu-topic"
+            )
+    if not found:
+        raise RecordingError(
+            f"an IMU topic ({IMU_TYPE})", f"topics {_listed(channels)}", "record the IMU too: LiDAR-inertial odometry needs both"
+        )
+    if len(found) > 1:
+        raise AmbiguityError("one IMU topic", f"several: {_listed(found)}", "choose one with --imu-topic")
+    return found[0]
+
+
+def _cloud_candidates(channels: list[Channel], options: RecordingOptions) -> list[Channel]:
+    found = [channel for channel in channels if channel.type in CLOUD_PARSERS]
+    if options.lidar_topic is not None:
+        found = [channel for channel in found if channel.topic == options.lidar_topic]
+        if not found:
+            raise RecordingError(
+                f"point clouds ({', '.join(CLOUD_PARSERS)}) on {options.lidar_topic}",
+                f"topics {_listed(channels)}",
+                "choose another --lidar-topic",
+            )
+    if not found:
+        raise RecordingError(
+            f"a LiDAR topic ({', '.join(CLOUD_PARSERS)})",
+            f"topics {_listed(channels)}",
+            "raw packet topics must be converted to clouds by the LiDAR's driver first",
+        )
+    return found
+
+
+def _choose_lidar(candidates: list[Channel], probes: dict[str, _CloudProbe], options: RecordingOptions) -> Channel:
+    """The only candidate, or the only one whose points have times."""
+    if len(candidates) == 1:
+        return candidates[0]
+    timed = [channel for channel in candidates if probes[channel.topic].time_fields]
+    if options.point_time_field is not None:
+        timed = [channel for channel in candidates if options.point_time_field in probes[channel.topic].fields]
+    if len(timed) == 1:
+        return timed[0]
+    raise AmbiguityError("one LiDAR topic", f"several: {_listed(timed or candidates)}", "choose one with --lidar-topic")
+
+
+def _chosen(key: str, chosen: Channel, candidates: list[Channel], given: str | None) -> Evidence:
+    how = (
+        "given" if given is not None else "the only one of its kind" if len(candidates) == 1 else "the only one with point times"
+    )
+    return Evidence(key, chosen.topic, "ok", f"{chosen.type}, {chosen.count} messages; {how}")
+
+
+def _probe(
+    container: Container, clouds: list[Channel], imu: Channel, options: RecordingOptions
+) -> tuple[dict[str, _CloudProbe], _ImuProbe, list[Transform]]:
+    """Read the first seconds: extents of the point times, IMU samples, static transforms."""
+    probes = {channel.topic: _CloudProbe() for channel in clouds}
+    samples = _ImuProbe()
+    transforms: list[Transform] = []
+    static = frozenset(c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static"))
+    start_ns, stop_ns = interval(container, options)
+    first_ns: int | None = None
+    for channel, received_ns, data in container.messages(frozenset(probes) | {imu.topic} | static, start_ns, stop_ns):
+        first_ns = received_ns if first_ns is None else first_ns
+        enough = samples.time_ns and all(probe.seen >= 3 or probe.complaint for probe in probes.values())
+        if received_ns - first_ns > (_PROBE_NS if enough else 10 * _PROBE_NS):
+            break
+        try:
+            if channel.type in TRANSFORM_TYPES:
+                transforms += parse_transforms(data, channel.encoding)
+            elif channel.topic == imu.topic:
+                stamp_ns, frame, gyro, accel = parse_imu(data, channel.encoding)
+                samples.time_ns.append(stamp_ns)
+                samples.received_ns.append(received_ns)
+                samples.gyro.append(gyro)
+                samples.accel.append(accel)
+                samples.frame = frame
+            elif probes[channel.topic].seen < _PROBE_SCANS:
+                _probe_cloud(probes[channel.topic], CLOUD_PARSERS[channel.type](data, channel.encoding), received_ns, options)
+        except MalformedMessageError as error:
+            if channel.topic in probes:
+                probes[channel.topic].complaint = str(error)
+    return probes, samples, transforms
+
+
+def _probe_cloud(probe: _CloudProbe, cloud: CloudMessage, received_ns: int, options: RecordingOptions) -> None:
+    layout = cloud_layout(cloud.fields, cloud.big_endian, cloud.point_step, None)
+    probe.fields = tuple(field.name for field in cloud.fields)
+    probe.time_fields = layout.time_fields
+    probe.frame = cloud.frame
+    probe.stamp_ns.append(cloud.stamp_ns)
+    probe.received_ns.append(received_ns)
+    probe.seen += 1
+    name = options.point_time_field or (layout.time_fields[0] if len(layout.time_fields) == 1 else None)
+    if name in probe.fields:
+        times = point_time.times_of_cloud(cloud.stamp_ns, received_ns, view_points(cloud, name)["time"])
+        if times is not None:
+            probe.times.append(times)
+
+
+def _extrinsic(
+    container: Container, transforms: list[Transform], imu_frame: str, lidar_frame: str
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None, str, Evidence]:
+    topics = frozenset(
+        c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static") and c.count
+    )
+    key = "T_imu_lidar"
+    if imu_frame == lidar_frame:
+        text = f"LiDAR and IMU both name the frame {imu_frame!r}, which says nothing about their mounting: give --T-imu-lidar"
+        return None, "", Evidence(key, "unknown", "warning", text)
+    found = chain(transforms, imu_frame, lidar_frame)
+    if found is None and topics:
+        later: list[Transform] = []
+        for number, (channel, _, data) in enumerate(container.messages(topics, container.start_ns, container.end_ns + 1)):
+            if number >= _MOST_TRANSFORM_MESSAGES:
+                break
+            try:
+                later += parse_transforms(data, channel.encoding)
+            except MalformedMessageError:
+                continue
+        found = chain(later, imu_frame, lidar_frame)
+    if found is None:
+        what = (
+            f"the static transforms do not connect {imu_frame!r} and {lidar_frame!r}"
+            if topics
+            else "the recording has no static transforms"
+        )
+        return (
+            None,
+            "",
+            Evidence(key, "unknown", "warning", f"{what}: give --T-imu-lidar, or the rotation is estimated from the data"),
+        )
+    T_imu_lidar, way = found
+    source = f"static transforms {' ← '.join(way)}"
+    return T_imu_lidar, source, Evidence(key, "static transforms", "ok", f"LiDAR pose in the IMU frame from the {source}")
