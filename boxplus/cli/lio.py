@@ -35,7 +35,9 @@ def lio(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
+    ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="One setting, e.g. scan_voxel=0.5; may be repeated.", metavar="KEY=VALUE")
     ] = None,

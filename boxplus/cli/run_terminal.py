@@ -42,7 +42,9 @@ class RunTerminal:
 
     def print_evidence(self, info: RecordingInfo, extrinsic: Extrinsic) -> None:
         """How the recording is read, and why."""
-        self._console.print(f"[bold]{info.path.name}[/bold]: {info.format}, {info.duration_s:.1f} s, {info.message_count} messages")
+        self._console.print(
+            f"[bold]{info.path.name}[/bold]: {info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
+        )
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in ("reading", "found", "", "evidence"):
             table.add_column(heading, overflow="fold")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -154,7 +153,7 @@ def _suggest(word: str, known: list[str], kind: str) -> str:
 
 def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
     """The text of `config.yaml`: everything as used, readings found from the data included, so that it repeats the run."""
-    used = config.model_dump(mode="json")
+    used = config.model_dump()
     found = used["recording"]
     is_bag = bool(info.lidar_topic) and any(topic.name == info.lidar_topic for topic in info.topics)
     if is_bag:
@@ -164,14 +163,8 @@ def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
             found["point_time_unit"], found["point_time_reference"] = info.point_time.unit, info.point_time.reference
         found["gyro_unit"], found["accel_unit"] = info.gyro_unit, info.accel_unit
     head = (
-        "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config' with this file repeats it.\n"
+        "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config FILE' repeats it.\n"
         "# For another recording delete the lines of section 'recording' that shall be found anew.\n"
     )
-    return head + yaml.safe_dump(_plain(used), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-
-
-def _plain(value: Any) -> Any:
-    """Without infinities, which JSON and thus `model_dump` turns into None for a field that refuses None."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items() if not (key == "max_range" and entry is None)}
-    return value
+    body: str = yaml.safe_dump(used, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return head + body

@@ -87,8 +87,8 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
     angle = np.degrees(np.arccos(np.clip((np.trace(alignment.R_imu_lidar) - 1.0) / 2.0, -1.0, 1.0)))
     text = f"rotation estimated from the data ({angle:.1f} deg from identity), translation begins at zero: {alignment.text}"
     warning = (
-        f"{unknown}: its rotation was estimated from the data ({angle:.1f} deg from identity, std {alignment.std_deg.max():.2f} deg), "
-        f"its translation begins at zero, both are refined while running; {remedy}"
+        f"{unknown}: its rotation was estimated from the data ({angle:.1f} deg from identity, "
+        f"std {alignment.std_deg.max():.2f} deg), its translation begins at zero, both are refined while running; {remedy}"
     )
     return Extrinsic(T, "estimated", text, True, warning)
 

@@ -146,7 +146,7 @@ class RunStatistics:
                 self._weak[-1] = last.model_copy(update={"end_s": since_s, "scans": last.scans + 1})
             elif len(self._weak) < _MOST_ENTRIES:
                 if estimate.status == "lost":
-                    text = f"no update was possible: {estimate.points_used} points could be used, the motion is predicted from the IMU alone"
+                    text = "no update was possible: too few points on known planes; the motion is predicted from the IMU alone"
                 else:
                     text = "; ".join(
                         f"{d} ({d.information_share:.2%} of the points' information)" for d in estimate.weak_directions

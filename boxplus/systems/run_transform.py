@@ -25,8 +25,8 @@ def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]
 
     Args:
         text: 16 numbers (row-major), tagged numbers (`xyz_qwxyz: …`, `xyz_qxyzw: …`, `xyz_rpy_deg: …` with
-            R = Rz(yaw) Ry(pitch) Rx(roll)), or a file with one of these, or a YAML or JSON file with the key `T_imu_lidar`, or with
-            `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`).
+            R = Rz(yaw) Ry(pitch) Rx(roll)), or a file with one of these, or a YAML or JSON file with the key
+            `T_imu_lidar`, or with `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`).
         name: of the transform, for the messages.
 
     Returns:

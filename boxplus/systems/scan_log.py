@@ -131,6 +131,11 @@ class ScanLog:
     def __len__(self) -> int:
         return int(self.time_ns.size)
 
+    def first(self, count: int) -> ScanLog:
+        """The first rows."""
+        texts = {name: entries[:count] for name, entries in self.texts.items()}
+        return ScanLog(self.time_ns[:count], self.status[:count], self._numbers[:count], texts)
+
     def column(self, name: str) -> NDArray[np.float64]:
         """(N,) one column, or (N, 3) for the name of a vector without its axis."""
         if name in _NUMBERS:

@@ -1,0 +1,18 @@
+"""`boxplus report`: draw the report of a run from its folder, finished or not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(folder: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio'.", metavar="FOLDER")]) -> None:
+    """Draw the report of a run again, also of an interrupted one, and say how far the run came."""
+    from boxplus.report import write_report
+    from boxplus.systems.run_folder import RunFolder
+    from boxplus.systems.run_summary import read_summary
+
+    typer.echo(read_summary(RunFolder(folder).summary).describe_state())
+    typer.echo(str(write_report(folder)))

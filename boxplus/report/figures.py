@@ -1,0 +1,303 @@
+"""The interactive figures of the report."""
+
+from __future__ import annotations
+
+from itertools import cycle
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.subplots import make_subplots
+
+from boxplus.report.palette import FAINT, GRID, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
+from boxplus.report.run_data import RunData
+from boxplus.systems.estimate import AXES
+
+_FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
+
+
+def map_and_trajectory(data: RunData) -> go.Figure:
+    """The map, coloured by height, and the trajectory, coloured by status."""
+    figure = go.Figure()
+    points = data.map_points
+    if len(points):
+        low, high = np.percentile(points[:, 2], [1, 99])
+        figure.add_scatter3d(
+            x=points[:, 0],
+            y=points[:, 1],
+            z=points[:, 2],
+            mode="markers",
+            name="map",
+            hoverinfo="skip",
+            marker={
+                "size": 1.5,
+                "color": points[:, 2],
+                "colorscale": "Viridis",
+                "cmin": float(low),
+                "cmax": float(high),
+                "opacity": 0.75,
+                "colorbar": {"title": {"text": "height [m]", "side": "right"}, "thickness": 12, "len": 0.6, "x": 1.0},
+            },
+        )
+    rows = shown_rows(data)
+    path, seconds, status = data.position[rows], data.seconds[rows], data.status[rows]
+    line = {"color": "#1b1b1b", "width": 3}
+    figure.add_scatter3d(x=path[:, 0], y=path[:, 1], z=path[:, 2], mode="lines", name="trajectory", hoverinfo="skip", line=line)
+    for name, color in STATUS.items():
+        here = status == name
+        if here.any():
+            figure.add_scatter3d(
+                x=path[here, 0],
+                y=path[here, 1],
+                z=path[here, 2],
+                mode="markers",
+                name=f"{name} ({int((data.status == name).sum())})",
+                marker={"size": 2.5 if name == "ok" else 4.5, "color": color},
+                customdata=seconds[here],
+                hovertemplate=f"{name}, %{{customdata:.1f}} s<br>(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m<extra></extra>",
+            )
+    for label, row in (("start", 0), ("end", -1)):
+        x, y, z = ([float(value)] for value in path[row])
+        symbol = "circle-open" if label == "start" else "x"
+        marker = {"size": 7, "color": INK, "symbol": symbol}
+        figure.add_scatter3d(x=x, y=y, z=z, mode="markers", name=label, marker=marker, hovertemplate=f"{label}<extra></extra>")
+    axis = {"backgroundcolor": "white", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
+    figure.update_layout(
+        height=640,
+        font=_FONT,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        paper_bgcolor="white",
+        legend={"x": 0.01, "y": 0.99, "bgcolor": "rgba(255,255,255,0.8)", "itemsizing": "constant"},
+        scene={
+            "aspectmode": "data",
+            "dragmode": "orbit",
+            "camera": {"eye": {"x": -1.05, "y": -1.05, "z": 1.05}},
+            **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
+        },
+    )
+    return figure
+
+
+def status_and_axes(data: RunData) -> go.Figure:
+    """The status, and how much of each axis came from the LiDAR."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, row_heights=[0.1, 0.9], vertical_spacing=0.03)
+    rows = shown_rows(data)
+    names = list(STATUS)
+    codes = [[names.index(status) for status in data.status[rows]]]
+    scale = [[(index + step) / 3, STATUS[name]] for index, name in enumerate(names) for step in (0, 1)]
+    figure.add_heatmap(
+        x=data.seconds[rows],
+        y=["status"],
+        z=codes,
+        zmin=-0.5,
+        zmax=2.5,
+        colorscale=scale,
+        showscale=False,
+        customdata=[list(data.status[rows])],
+        hovertemplate="%{x:.1f} s: %{customdata}<extra></extra>",
+        row=1,
+        col=1,
+    )
+    figure.add_heatmap(
+        x=data.seconds[rows],
+        y=AXES,
+        z=data.scans.lidar_share[rows].T,
+        zmin=0.0,
+        zmax=1.0,
+        colorscale="Cividis",
+        colorbar={"title": {"text": "share from LiDAR", "side": "right"}, "thickness": 12, "tickformat": ".0%"},
+        hovertemplate="%{y}, %{x:.1f} s: %{z:.0%} measured<extra></extra>",
+        row=2,
+        col=1,
+    )
+    figure.update_yaxes(autorange="reversed", row=2, col=1)
+    return _over_time(figure, data, 300, bottom_row=2)
+
+
+def timing(data: RunData) -> go.Figure:
+    """Milliseconds per scan, stacked by stage."""
+    figure, rows = go.Figure(), shown_rows(data)
+    for color, (stage, milliseconds) in zip(cycle(SERIES), data.scans.pairs("timing_ms").items(), strict=False):
+        _add_area(figure, data, rows, milliseconds, stage, color, "%{y:.2f} ms")
+    total = data.scans.column("total_ms")
+    top = 1.15 * float(np.percentile(total, 99.5)) if len(total) else 1.0
+    figure.update_yaxes(title_text="ms per scan", range=[0.0, max(top, 1e-3)])
+    return _over_time(figure, data, 280)
+
+
+def velocity(data: RunData) -> go.Figure:
+    """Velocity of the IMU in the world."""
+    figure, rows = go.Figure(), shown_rows(data)
+    values = data.scans.column("velocity")[rows]
+    _add_xyz(figure, data.seconds[rows], values)
+    _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "speed", INK)
+    figure.update_yaxes(title_text="m/s")
+    return _over_time(figure, data, 260)
+
+
+def biases(data: RunData) -> go.Figure:
+    """Biases of gyroscope and accelerometer with their standard deviations."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    rows = shown_rows(data)
+    for row, (name, factor) in enumerate((("bias_gyro", 180.0 / np.pi), ("bias_accel", 1.0)), 1):
+        values, sigma = factor * data.scans.column(name)[rows], factor * data.scans.column(f"sigma_{name}")[rows]
+        _add_xyz(figure, data.seconds[rows], values, sigma, row=row, legend=row == 1)
+        figure.update_yaxes(range=_range_of(values), row=row, col=1)
+    figure.update_yaxes(title_text="gyroscope [deg/s]", row=1, col=1)
+    figure.update_yaxes(title_text="accelerometer [m/s²]", row=2, col=1)
+    return _over_time(figure, data, 400, bottom_row=2)
+
+
+def gravity(data: RunData) -> go.Figure:
+    """Magnitude of gravity, and how far its direction moved from the first estimate."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    rows = shown_rows(data)
+    values = data.scans.column("gravity")[rows]
+    _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "magnitude", SERIES[0], row=1)
+    _add_line(figure, data.seconds[rows], gravity_tilt_deg(values), "direction, from the first", SERIES[3], row=2)
+    figure.update_yaxes(title_text="m/s²", row=1, col=1, tickformat=".3f")
+    figure.update_yaxes(title_text="deg", row=2, col=1, rangemode="tozero")
+    return _over_time(figure, data, 300, bottom_row=2)
+
+
+def sigmas(data: RunData) -> go.Figure:
+    """Standard deviations of the pose."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    rows = shown_rows(data)
+    _add_xyz(figure, data.seconds[rows], np.degrees(data.sigma[rows, :3]), row=1)
+    _add_xyz(figure, data.seconds[rows], 100.0 * data.sigma[rows, 3:], row=2, legend=False)
+    figure.update_yaxes(title_text="rotation [deg]", row=1, col=1, rangemode="tozero")
+    figure.update_yaxes(title_text="position [cm]", row=2, col=1, rangemode="tozero")
+    return _over_time(figure, data, 380, bottom_row=2)
+
+
+def points(data: RunData) -> go.Figure:
+    """Points after the voxel filter: used, and rejected by reason; and the residuals of the used ones."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
+    rows = shown_rows(data)
+    _add_area(figure, data, rows, data.scans.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
+    for color, (reason, count) in zip(cycle(REJECTED), data.scans.pairs("rejected").items(), strict=False):
+        _add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} points", row=1)
+    residual_cm = 100.0 * data.scans.column("residual_rms")[rows]
+    _add_line(figure, data.seconds[rows], residual_cm, "residual (rms)", FAINT, row=2)
+    figure.update_yaxes(title_text="points", row=1, col=1)
+    figure.update_yaxes(title_text="cm", row=2, col=1, rangemode="tozero")
+    return _over_time(figure, data, 380, bottom_row=2)
+
+
+def extrinsic(data: RunData) -> go.Figure:
+    """How the refined extrinsic moved from where it began."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
+    rows = shown_rows(data)
+    q = np.stack([data.scans.column(f"imu_lidar_q{part}") for part in "wxyz"], axis=1)[rows]
+    angle = 2.0 * np.degrees(np.arccos(np.clip(np.abs(q @ q[0]), 0.0, 1.0)))
+    _add_line(figure, data.seconds[rows], angle, "rotation, from the first", SERIES[3], row=1)
+    _add_xyz(figure, data.seconds[rows], 100.0 * data.scans.column("imu_lidar_p")[rows], row=2)
+    figure.update_yaxes(title_text="deg", row=1, col=1, rangemode="tozero")
+    figure.update_yaxes(title_text="position [cm]", row=2, col=1)
+    return _over_time(figure, data, 340, bottom_row=2)
+
+
+def gaps(data: RunData) -> go.Figure:
+    """Intervals without IMU samples or scans, at the time they began."""
+    figure = go.Figure()
+    for name, found, color in (
+        ("IMU", data.summary.imu_gaps, SERIES[0]),
+        ("scans", data.summary.scan_gaps, SERIES[4]),
+    ):
+        figure.add_bar(
+            x=[gap.begin_s + gap.duration_s / 2 for gap in found],
+            y=[gap.duration_s for gap in found],
+            width=[max(gap.duration_s, data.seconds[-1] / 300) for gap in found],
+            name=f"{name} ({len(found)})",
+            marker={"color": color, "line": {"width": 0}},
+            hovertemplate="%{x:.2f} s: %{y:.3f} s without data<extra></extra>",
+        )
+    figure.update_layout(barmode="overlay")
+    figure.update_yaxes(title_text="gap [s]", rangemode="tozero")
+    return _over_time(figure, data, 220)
+
+
+def _add_line(
+    figure: go.Figure,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    name: str,
+    color: str,
+    row: int | None = None,
+    legend: bool = True,
+) -> None:
+    place = {} if row is None else {"row": row, "col": 1}
+    line = {"color": color, "width": 1.4}
+    hover = f"{name}: %{{y:.4g}}<extra></extra>"
+    figure.add_scatter(
+        x=x, y=y, name=name, legendgroup=name, showlegend=legend, mode="lines", line=line, hovertemplate=hover, **place
+    )
+
+
+def _add_xyz(
+    figure: go.Figure,
+    x: NDArray[np.float64],
+    values: NDArray[np.float64],
+    sigma: NDArray[np.float64] | None = None,
+    row: int | None = None,
+    legend: bool = True,
+) -> None:
+    """Three lines, over bands of one standard deviation."""
+    place = {} if row is None else {"row": row, "col": 1}
+    for axis, (name, color) in enumerate(zip("xyz", XYZ, strict=True)):
+        if sigma is not None:
+            around = np.concatenate([values[:, axis] + sigma[:, axis], (values[:, axis] - sigma[:, axis])[::-1]])
+            band = {"fill": "toself", "fillcolor": color, "opacity": 0.12, "line": {"width": 0}, "mode": "lines"}
+            figure.add_scatter(
+                x=np.concatenate([x, x[::-1]]), y=around, legendgroup=name, showlegend=False, hoverinfo="skip", **band, **place
+            )
+        _add_line(figure, x, values[:, axis], name, color, row, legend)
+
+
+def _add_area(
+    figure: go.Figure,
+    data: RunData,
+    rows: NDArray[np.intp],
+    values: NDArray[np.float64],
+    name: str,
+    color: str,
+    unit: str,
+    row: int | None = None,
+) -> None:
+    place = {} if row is None else {"row": row, "col": 1}
+    figure.add_scatter(
+        x=data.seconds[rows],
+        y=values[rows],
+        name=name,
+        mode="lines",
+        stackgroup="all",
+        line={"width": 0.5, "color": color},
+        hovertemplate=f"{name}: {unit}<extra></extra>",
+        **place,
+    )
+
+
+def _range_of(values: NDArray[np.float64]) -> list[float]:
+    """An axis that shows the lines; the bands of the first moments may go beyond it."""
+    low, high = float(values.min()), float(values.max())
+    margin = 0.25 * (high - low) + 1e-6
+    return [low - margin, high + margin]
+
+
+def _over_time(figure: go.Figure, data: RunData, height: int, bottom_row: int | None = None) -> go.Figure:
+    """The look of all figures over time."""
+    figure.update_layout(
+        height=height,
+        font=_FONT,
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        margin={"l": 80, "r": 20, "t": 10, "b": 44},
+        hovermode="x unified",
+        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "itemsizing": "constant", "traceorder": "normal"},
+    )
+    figure.update_xaxes(showgrid=True, gridcolor=GRID, zeroline=False, range=[0.0, float(max(data.seconds[-1], 1e-3))])
+    figure.update_yaxes(showgrid=True, gridcolor=GRID, zerolinecolor=GRID)
+    place = {} if bottom_row is None else {"row": bottom_row, "col": 1}
+    figure.update_xaxes(title_text="time since the first scan [s]", **place)
+    return figure

@@ -1,0 +1,140 @@
+"""The main pictures as PNG files, for papers and tickets."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+from boxplus.formats.output import atomic_file, make_folder
+from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
+from boxplus.report.run_data import RunData
+from boxplus.systems.estimate import AXES
+from boxplus.systems.run_folder import PLOTS
+
+_DPI = 130
+_HEADROOM_M = 1.0
+"""Map points higher than this above the path are left out of the view from above: a ceiling would hide everything."""
+
+
+def write_plots(data: RunData) -> None:
+    """Write the pictures to `plots/` in the run's folder: trajectory, status, timing, biases.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    make_folder(data.folder.plots)
+    for name, draw in zip(PLOTS, (_trajectory, _status, _timing, _biases), strict=True):
+        with atomic_file(data.folder.plots / name) as file:
+            draw(data).savefig(file, format="png", dpi=_DPI)
+
+
+def _trajectory(data: RunData) -> Figure:
+    """From above, over the map."""
+    figure = Figure(figsize=(8.0, 8.0), layout="constrained")
+    axes = figure.subplots()
+    points = data.map_points
+    points = points[points[:, 2] < data.position[:, 2].max() + _HEADROOM_M]
+    if len(points):
+        low, high = np.percentile(points[:, 2], [1, 99])
+        points = points[np.argsort(points[:, 2])]
+        size = float(np.clip(6e4 / len(points), 0.4, 4.0))
+        color = {"c": points[:, 2], "cmap": "viridis", "vmin": low, "vmax": high}
+        shown = axes.scatter(points[:, 0], points[:, 1], s=size, linewidths=0, alpha=0.7, **color)
+        figure.colorbar(shown, ax=axes, label="height [m]", shrink=0.5, aspect=30)
+    rows = shown_rows(data)
+    path, status = data.position[rows], data.status[rows]
+    axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.0)
+    axes.plot(path[:, 0], path[:, 1], color=INK, linewidth=1.4, label="trajectory")
+    for name in ("weak", "lost"):
+        here = status == name
+        if here.any():
+            axes.scatter(path[here, 0], path[here, 1], s=14, color=STATUS[name], label=name, zorder=3)
+    axes.scatter(path[0, 0], path[0, 1], s=45, facecolors="white", edgecolors=INK, label="start", zorder=4)
+    axes.scatter(path[-1, 0], path[-1, 1], s=45, color=INK, marker="X", label="end", zorder=4)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.set_title(f"{data.summary.path_length_m:.1f} m in {data.summary.duration_s:.1f} s, from above", loc="left", fontsize=11)
+    axes.legend(loc="upper right", framealpha=0.9, fontsize=9)
+    _plain(axes)
+    return figure
+
+
+def _status(data: RunData) -> Figure:
+    """Status, and the LiDAR's share of each axis' information."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    strip, shares = figure.subplots(2, 1, sharex=True, height_ratios=[0.12, 1.0])
+    rows = shown_rows(data)
+    edges = _edges(data.seconds[rows])
+    codes = np.array([[list(STATUS).index(status) for status in data.status[rows]]])
+    strip.pcolormesh(edges, [0, 1], codes, cmap=ListedColormap(list(STATUS.values())), vmin=-0.5, vmax=2.5)
+    strip.set_yticks([0.5], ["status"])
+    for name, color in STATUS.items():
+        strip.plot([], [], "s", color=color, label=f"{name} ({int((data.status == name).sum())})")
+    strip.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, fontsize=9, borderaxespad=0.2)
+    mesh = shares.pcolormesh(edges, np.arange(7), data.scans.lidar_share[rows].T, cmap="cividis", vmin=0.0, vmax=1.0)
+    shares.set_yticks(np.arange(6) + 0.5, AXES)
+    shares.invert_yaxis()
+    shares.set_xlabel("time since the first scan [s]")
+    figure.colorbar(mesh, ax=shares, label="share from LiDAR", aspect=18)
+    return figure
+
+
+def _timing(data: RunData) -> Figure:
+    """Milliseconds per scan, stacked by stage."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    rows = shown_rows(data)
+    stages = data.scans.pairs("timing_ms")
+    if stages:
+        colors = [SERIES[index % len(SERIES)] for index in range(len(stages))]
+        axes.stackplot(
+            data.seconds[rows], [values[rows] for values in stages.values()], labels=list(stages), colors=colors, linewidth=0
+        )
+        axes.set_ylim(0.0, 1.15 * max(float(np.percentile(data.scans.column("total_ms"), 99.5)), 1e-3))
+        axes.legend(ncols=3, loc="upper left", fontsize=9, frameon=False)
+    scan = data.summary.timing.scan_ms
+    if scan is not None:
+        axes.axhline(scan.median, color=INK, linewidth=0.9, linestyle="--")
+        text = f"median {scan.median:.1f} ms, 99th percentile {scan.p99:.1f} ms, largest {scan.max:.1f} ms"
+        axes.set_title(text, loc="left", fontsize=11)
+    axes.set(xlabel="time since the first scan [s]", ylabel="ms per scan")
+    axes.margins(x=0.0)
+    _plain(axes)
+    return figure
+
+
+def _biases(data: RunData) -> Figure:
+    """Biases of gyroscope and accelerometer, with one standard deviation."""
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    rows = shown_rows(data)
+    kinds = (("bias_gyro", 180.0 / np.pi, "gyroscope [deg/s]"), ("bias_accel", 1.0, "accelerometer [m/s²]"))
+    for axes, (name, factor, label) in zip(figure.subplots(2, 1, sharex=True), kinds, strict=True):
+        values, sigma = factor * data.scans.column(name)[rows], factor * data.scans.column(f"sigma_{name}")[rows]
+        for axis, color in enumerate(XYZ):
+            low, high = values[:, axis] - sigma[:, axis], values[:, axis] + sigma[:, axis]
+            axes.fill_between(data.seconds[rows], low, high, color=color, alpha=0.13, linewidth=0)
+            axes.plot(data.seconds[rows], values[:, axis], color=color, linewidth=1.2, label="xyz"[axis])
+        margin = 0.25 * float(np.ptp(values)) + 1e-6
+        axes.set_ylim(values.min() - margin, values.max() + margin)
+        axes.set_ylabel(label)
+        axes.margins(x=0.0)
+        _plain(axes)
+    figure.axes[0].legend(ncols=3, loc="upper right", fontsize=9, frameon=False)
+    figure.axes[1].set_xlabel("time since the first scan [s]")
+    return figure
+
+
+def _edges(seconds: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    """The borders of the cells around (N,) times."""
+    if len(seconds) == 1:
+        return np.array([seconds[0] - 0.05, seconds[0] + 0.05])
+    middle = 0.5 * (seconds[1:] + seconds[:-1])
+    return np.concatenate([[2 * seconds[0] - middle[0]], middle, [2 * seconds[-1] - middle[-1]]])
+
+
+def _plain(axes: Axes) -> None:
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(colors=FAINT, labelsize=9)
