@@ -72,7 +72,7 @@ class SequentialContainer:
         self.format = kinds.get(files[0].suffix, "ROS 1 bag") if files else ""
 
     def messages(self, topics: frozenset[str], start_ns: int, stop_ns: int) -> Iterator[tuple[Channel, int, bytes]]:
-        for connection, time_ns, data in self._read([]):
+        for connection, time_ns, data in self._read(self.damage):
             if connection.topic in topics and start_ns <= time_ns < stop_ns:
                 yield self._channels[connection.topic, connection.type], time_ns, data
 

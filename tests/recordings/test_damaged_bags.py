@@ -85,6 +85,7 @@ def test_a_cut_bag_yields_what_is_there(shared_data: Path, tmp_path: Path) -> No
         assert 0.4 * total < len(scans) < 0.6 * total
         texts = [e.text for e in recording.info.evidence if e.key == "file"]
         assert any("is readable up to byte" in text for text in texts)
+        assert recording.rejected["unreadable stretches of the file"] == 1
 
 
 def test_a_damaged_chunk_is_skipped(shared_data: Path, tmp_path: Path) -> None:
