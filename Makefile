@@ -1,0 +1,48 @@
+# make demo    simulate a walk, run the odometry on it, compare with the truth, write demo/report.html
+# make test    run the test suite
+# make lint    ruff and mypy
+#
+# Each target sets up what it needs in .venv, once. PYTHON names another interpreter, 3.11 or later.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV ?= .venv
+OUTPUT ?= demo
+JOBS ?= 2
+PYTEST_ARGS ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet
+
+.PHONY: demo test lint clean
+
+demo: $(VENV)/.runtime
+	@$(BIN)/boxplus demo -o $(OUTPUT) --overwrite
+
+test: $(VENV)/.dev
+	@$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+lint: $(VENV)/.dev
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) $(OUTPUT)
+
+$(VENV)/.python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "boxplus needs Python 3.11 or later; '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Name another: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@echo "creating $(VENV) with $$($(PYTHON) --version)"
+	@$(PYTHON) -m venv --clear $(VENV) >/dev/null 2>&1 || \
+	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --quiet --python $(BIN)/python install pip; }
+	@touch $@
+
+$(VENV)/.runtime: pyproject.toml $(VENV)/.python
+	@echo "installing boxplus and what it needs into $(VENV) (once; about a minute)"
+	@$(PIP) install -e .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml $(VENV)/.python
+	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
+	@$(PIP) install -e '.[dev]'
+	@touch $(VENV)/.runtime $@
