@@ -46,6 +46,12 @@ def interval(container: Container, options: RecordingOptions) -> tuple[int, int]
     return start_ns, start_ns + round(options.duration_s * 1e9)
 
 
+def _share(container: Container, options: RecordingOptions) -> float:
+    """How much of the recording the options ask for, by time."""
+    start_ns, stop_ns = interval(container, options)
+    return max(min(stop_ns, container.end_ns) - start_ns, 0) / max(container.end_ns - container.start_ns, 1)
+
+
 @dataclass(slots=True)
 class _CloudProbe:
     """What the first clouds of one topic show."""
@@ -113,7 +119,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         format=container.format,
         topics=[Topic(channel.topic, channel.type, channel.count) for channel in container.channels],
         duration_s=(container.end_ns - container.start_ns) * 1e-9,
-        message_count=lidar.count + imu.count,
+        message_count=round((lidar.count + imu.count) * _share(container, options)),
         lidar_topic=lidar.topic,
         imu_topic=imu.topic,
         lidar_frame=probe.frame,

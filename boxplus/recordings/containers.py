@@ -65,6 +65,12 @@ def open_container(path: Path) -> Container:
     files = [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+        if not files:
+            raise RecordingError(
+                "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
+                f"{path.name} with {', '.join(sorted(file.name for file in path.iterdir())[:5]) or 'nothing in it'}",
+                "give the folder that holds them; of ROS 1 bags give one file",
+            )
     try:
         return IndexedContainer(path, files)
     except READ_ERRORS + _rosbags_errors() as error:
@@ -121,8 +127,6 @@ class IndexedContainer:
         try:
             for file in files:
                 self._readers.append(_open_reader(file))
-            if not self._readers:
-                raise ValueError("the folder holds no .mcap or .db3 file")
             self.channels = self._collect_channels()
             self.start_ns = min(int(reader.start_time) for reader in self._readers)
             self.end_ns = max(int(reader.end_time) for reader in self._readers)

@@ -79,20 +79,19 @@ class SequentialContainer:
     def _read(self, damage: list[str]) -> Iterator[tuple[_Connection, int, bytes]]:
         for file in self._files:
             connections: dict[int, _Connection] = {}
-            with file.open("rb") as stream:
-                size = file.stat().st_size
-                try:
+            position = 0
+            try:
+                with file.open("rb") as stream:
                     for record in _scanner(stream)(stream):
+                        position = stream.tell()
                         if record is None:
-                            damage.append(f"{file.name}: a damaged block before byte {stream.tell()} was skipped")
+                            damage.append(f"{file.name}: a damaged block before byte {position} was skipped")
                         elif isinstance(record, _Connection):
                             connections[record.channel] = record
                         elif record.channel in connections:
                             yield connections[record.channel], record.time_ns, record.data
-                except self._errors as error:
-                    damage.append(
-                        f"{file.name} is readable up to byte {stream.tell()} of {size} ({str(error) or type(error).__name__})"
-                    )
+            except self._errors as error:
+                damage.append(f"{file.name} is readable up to byte {position} only ({str(error) or type(error).__name__})")
 
     def close(self) -> None:
         """Nothing is held open between passes."""

@@ -134,11 +134,17 @@ def check_points(log: StreamLog) -> list[Evidence]:
         "nearer than min_range": ": the robot itself, or --min-range is too large for this place",
         "not finite": ": more points are missing than measured; look at the driver's settings",
     }
-    for reason in ("not finite", "zero (no return)", "nearer than min_range", "farther than max_range"):
+    keys = {
+        "not finite": "points_not_finite",
+        "zero (no return)": "points_zero",
+        "nearer than min_range": "points_near",
+        "farther than max_range": "points_far",
+    }
+    for reason, key in keys.items():
         share = log.dropped[reason] / max(total, 1)
         many = share > limits.get(reason, 1.0)
-        text = f"{log.dropped[reason]} of {total} points, dropped{advice[reason] if many else ''}"
-        found.append(Evidence(f"points {reason}", f"{100 * share:.2f} %", "warning" if many else "ok", text))
+        text = f"{log.dropped[reason]} of {total} points are {reason}, dropped{advice[reason] if many else ''}"
+        found.append(Evidence(key, f"{100 * share:.2f} %", "warning" if many else "ok", text))
     return found
 
 

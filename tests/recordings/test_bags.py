@@ -58,7 +58,10 @@ def test_counts_progress_and_second_pass(tmp_path: Path) -> None:
 
 def test_start_and_duration_cut_the_stream(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", Content(scans=20))
-    scans, imu = read(path, RecordingOptions(start_s=0.5, duration_s=1.0))
+    options = RecordingOptions(start_s=0.5, duration_s=1.0)
+    scans, imu = read(path, options)
+    with open_recording(path, options) as recording:
+        assert abs(recording.info.message_count - len(scans) - sum(map(len, imu))) < 20
     assert 9 <= len(scans) <= 11
     assert all(START_NS + 500_000_000 <= block.time_ns[0] <= START_NS + 1_500_000_000 for block in imu)
 
@@ -165,6 +168,12 @@ def test_wrong_paths(tmp_path: Path, name: str) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(RecordingError, match=r"expected a .* – got .*" + name.replace(".", r"\.")):
         open_recording(tmp_path / name)
+
+
+def test_a_folder_without_recordings(tmp_path: Path) -> None:
+    (tmp_path / "flight.bag").write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"a folder with .* – got .* with flight.bag – .* of ROS 1 bags give one file"):
+        open_recording(tmp_path)
 
 
 class UnstampedContent(Content):

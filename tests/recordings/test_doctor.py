@@ -140,7 +140,7 @@ def test_gaps_and_missing_returns(tmp_path: Path) -> None:
     assert found["imu_gaps"].verdict == found["lidar_gaps"].verdict == "warning"
     assert "longest 0.205 s" in found["imu_gaps"].text and "about 40 messages are missing" in found["imu_gaps"].text
     assert "longest 0.400 s" in found["lidar_gaps"].text and "about 3 messages" in found["lidar_gaps"].text
-    assert found["points not finite"].verdict == "warning" and found["points not finite"].value == "60.00 %"
+    assert found["points_not_finite"].verdict == "warning" and found["points_not_finite"].value == "60.00 %"
 
 
 def test_what_cannot_be_opened_becomes_a_finding(tmp_path: Path) -> None:
