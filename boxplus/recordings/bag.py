@@ -24,6 +24,8 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
 _LARGEST_IMU_BLOCK = 1000
+_LARGEST_IMU_VALUE = 1e5
+_MOST_REASONS = 50
 
 
 def open_bag(path: Path, options: RecordingOptions) -> Recording:
@@ -58,13 +60,15 @@ class _ImuBlock:
         self._time_ns.append(stamp_ns)
         self._rows.append(gyro + accel)
 
-    def take(self) -> ImuSamples:
-        rows = np.array(self._rows, np.float64)
-        samples = ImuSamples.from_arrays(
-            np.array(self._time_ns, np.int64), rows[:, :3] * self._gyro_scale, rows[:, 3:] * self._accel_scale
-        )
+    def take(self, tally: Tally) -> ImuSamples:
+        """The samples so far; NaN are delivered (the sequencer counts them), what no sensor can measure is dropped here."""
+        rows, time_ns = np.array(self._rows, np.float64).reshape(-1, 6), np.array(self._time_ns, np.int64)
         self._time_ns, self._rows = [], []
-        return samples
+        wild = (np.abs(rows) > _LARGEST_IMU_VALUE).any(axis=1)
+        if wild.any():
+            tally.rejected["messages: IMU values beyond any sensor"] += int(wild.sum())
+            rows, time_ns = rows[~wild], time_ns[~wild]
+        return ImuSamples.from_arrays(time_ns, rows[:, :3] * self._gyro_scale, rows[:, 3:] * self._accel_scale)
 
 
 def _events(
@@ -83,13 +87,14 @@ def _events(
                 scan = scan_from_cloud(CLOUD_PARSERS[channel.type](data, channel.encoding), info.point_time, options, tally)
         except MalformedMessageError as error:
             what = "IMU message" if channel.topic == info.imu_topic else "cloud"
-            tally.rejected[f"messages: malformed {what} ({error})"] += 1
-        if len(imu) and (scan is not None or len(imu) >= _LARGEST_IMU_BLOCK):
-            yield imu.take()
+            reason = str(error) if len(tally.rejected) < _MOST_REASONS else "other reasons"
+            tally.rejected[f"messages: malformed {what} ({reason})"] += 1
+        if (scan is not None or len(imu) >= _LARGEST_IMU_BLOCK) and len(block := imu.take(tally)):
+            yield block
         if scan is not None:
             yield scan
-    if len(imu):
-        yield imu.take()
+    if len(block := imu.take(tally)):
+        yield block
     tally.damage += container.damage
 
 

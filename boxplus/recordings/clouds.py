@@ -104,8 +104,9 @@ def view_points(cloud: CloudMessage, time_field: str | None) -> NDArray[np.void]
 
 
 def coordinates(points: NDArray[np.void]) -> NDArray[np.float32]:
-    """(N, 3) float32 of the columns x, y, z, in native byte order."""
+    """(N, 3) float32 of the columns x, y, z, in native byte order; beyond float32 they become infinite."""
     p_lidar = np.empty((len(points), 3), np.float32)
-    for axis, name in enumerate("xyz"):
-        p_lidar[:, axis] = points[name]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, name in enumerate("xyz"):
+            p_lidar[:, axis] = points[name]
     return p_lidar

@@ -34,6 +34,6 @@ class RecordingOptions(BaseModel):
     gyro_unit: GyroUnit | None = Field(default=None, description="unit of the angular velocity in the recording")
     accel_unit: AccelUnit | None = Field(default=None, description="unit of the acceleration in the recording")
     min_range: float = Field(default=0.5, ge=0.0, description="points nearer than this are dropped: the robot itself [m]")
-    max_range: float = Field(default=float("inf"), gt=0.0, description="points farther than this are dropped [m]")
+    max_range: float = Field(default=1000.0, gt=0.0, description="points farther than this are dropped [m]")
     start_s: float = Field(default=0.0, ge=0.0, description="skip this much at the beginning of the recording [s]")
     duration_s: float | None = Field(default=None, gt=0.0, description="read at most this much [s]")

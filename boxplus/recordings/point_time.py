@@ -229,7 +229,8 @@ def absolute_times(
     scale = UNIT_NS[reading.unit]
     whole, rest = divmod(stamp_ns, scale) if reading.anchor == "clock" else (0, 0)
     if values.dtype.kind == "f":
-        offset = (values.astype(np.float64) - whole) * scale - rest
+        with np.errstate(over="ignore", invalid="ignore"):
+            offset = (values.astype(np.float64) - whole) * scale - rest
     else:
         offset = (values.astype(np.int64) - whole).astype(np.float64) * scale - rest
     valid = np.isfinite(offset)

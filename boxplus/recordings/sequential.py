@@ -227,7 +227,8 @@ def _scan_sqlite(stream: BinaryIO) -> Iterator[_Record | None]:
     database = sqlite3.connect(f"{Path(stream.name).resolve().as_uri()}?immutable=1", uri=True)
     with closing(database):
         for key, topic, kind in database.execute("SELECT id, name, type FROM topics"):
-            yield _Connection(key, topic, kind.replace("/msg/", "/"), "cdr")
+            if type(key) is int and type(topic) is str and type(kind) is str:
+                yield _Connection(key, topic, kind.replace("/msg/", "/"), "cdr")
         for key, time_ns, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
             if type(time_ns) is int and type(data) is bytes:
                 yield _Message(key, time_ns, data)

@@ -197,3 +197,17 @@ def test_different_clocks_are_an_error(tmp_path: Path) -> None:
     with open_recording(write_bag(tmp_path, "ros1", OtherClockContent())) as recording:
         found = {e.key: e for e in recording.info.evidence}["clocks"]
     assert found.verdict == "error" and "stamped by different clocks" in found.text
+
+
+class WildImuContent(Content):
+    def imu(self, stamp_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        count = (stamp_ns - START_NS) // 10_000_000
+        gyro = {40: (1e300, 0.0, 0.0), 41: (float("nan"), 0.0, 0.0)}.get(count, (0.0, 0.0, 0.0))
+        return gyro, self.accel
+
+
+def test_values_beyond_any_sensor_are_dropped_and_nan_is_passed_on(tmp_path: Path) -> None:
+    with open_recording(write_bag(tmp_path, "ros1", WildImuContent())) as recording:
+        gyro = np.concatenate([e.gyro for e in recording if isinstance(e, ImuSamples)])
+        assert recording.rejected == {"messages: IMU values beyond any sensor": 1}
+    assert len(gyro) == 60 and np.isnan(gyro).any(axis=1).sum() == 1
