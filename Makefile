@@ -11,12 +11,12 @@ JOBS ?= 2
 PYTEST_ARGS ?=
 
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet --quiet
 
 .PHONY: demo test lint clean
 
 demo: $(VENV)/.runtime
-	@$(BIN)/boxplus demo -o $(OUTPUT) --overwrite
+	@$(BIN)/boxplus demo -o $(OUTPUT)
 
 test: $(VENV)/.dev
 	@$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
@@ -34,7 +34,7 @@ $(VENV)/.python:
 	  { echo "boxplus needs Python 3.11 or later; '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Name another: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@echo "creating $(VENV) with $$($(PYTHON) --version)"
 	@$(PYTHON) -m venv --clear $(VENV) >/dev/null 2>&1 || \
-	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --quiet --python $(BIN)/python install pip; }
+	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --quiet --quiet --python $(BIN)/python install pip; }
 	@touch $@
 
 $(VENV)/.runtime: pyproject.toml $(VENV)/.python
