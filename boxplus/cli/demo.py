@@ -43,9 +43,8 @@ def demo(
     scan, factor = summary.timing.scan_ms, summary.timing.real_time_factor
     error_cm = 100.0 * evaluation.ate.rmse
     typer.echo("")
-    typer.echo(
-        f"accuracy  {error_cm:.2f} cm position, {evaluation.ate_rotation.rmse:.3f} deg rotation (rms) over {summary.path_length_m:.0f} m"
-    )
+    error_deg = evaluation.ate_rotation.rmse
+    typer.echo(f"accuracy  {error_cm:.2f} cm position, {error_deg:.3f} deg rotation (rms) over {summary.path_length_m:.0f} m")
     if scan is not None:
         typer.echo(f"speed     {scan.median:.1f} ms per scan (median), {factor:.1f} × real time with reading and writing")
     typer.echo(f"report    {results.report}")
