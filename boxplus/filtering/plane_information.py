@@ -15,14 +15,38 @@ USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED = 0, 1, 2, 3
 MEASURED_DOF = 12
 
 
+@kernel(inline=True)
+def _row(
+    x: NDArray[np.float64],
+    lidar: tuple[float, float, float],
+    imu: tuple[float, float, float],
+    u: tuple[float, float, float],
+    with_extrinsic: bool,
+    h: NDArray[np.float64],
+) -> None:
+    """h = [s × C, u, ℓ × R_LᵀC, C] with C = Rᵀu: how uᵀ y moves with the state (SPEC.md 9.7)."""
+    lx, ly, lz = lidar
+    sx, sy, sz = imu
+    ux, uy, uz = u
+    cx = x[R] * ux + x[R + 3] * uy + x[R + 6] * uz
+    cy = x[R + 1] * ux + x[R + 4] * uy + x[R + 7] * uz
+    cz = x[R + 2] * ux + x[R + 5] * uy + x[R + 8] * uz
+    h[0], h[1], h[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
+    h[3], h[4], h[5] = ux, uy, uz
+    if with_extrinsic:
+        ex = x[RL] * cx + x[RL + 3] * cy + x[RL + 6] * cz
+        ey = x[RL + 1] * cx + x[RL + 4] * cy + x[RL + 7] * cz
+        ez = x[RL + 2] * cx + x[RL + 5] * cy + x[RL + 8] * cz
+        h[6], h[7], h[8] = ly * ez - lz * ey, lz * ex - lx * ez, lx * ey - ly * ex
+        h[9], h[10], h[11] = cx, cy, cz
+
+
 @kernel
 def accumulate_planes(
     x: NDArray[np.float64],
     p_lidar: NDArray[np.float32],
     planes: NDArray[np.float64],
     fate: NDArray[np.uint8],
-    begin: int,
-    end: int,
     range_variance: float,
     map_variance: float,
     with_extrinsic: bool,
@@ -30,49 +54,41 @@ def accumulate_planes(
     b: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Add the points [begin, end) to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L].
+    """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L].
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
-        planes: (n, 5): unit normal u, offset uᵀq in the world, variance of the plane at the point per variance of a map point.
+        planes: (n, PLANE) records of `maps.plane_matching`, columns named there.
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
         A, b: (12, 12), (12,), added to; the upper triangle of A is filled only.
-        sums: (3,) += [used points, Σ z², Σ z²/r].
+        sums: (2,) += [used points, Σ z²].
     """
     h = np.empty(MEASURED_DOF)
     size = MEASURED_DOF if with_extrinsic else 6
-    for n in range(begin, end):
+    for n in range(p_lidar.shape[0]):
         if fate[n] != USED and fate[n] != GATED:
             continue
+        plane = planes[n]
         lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
-        ux, uy, uz = planes[n, 0], planes[n, 1], planes[n, 2]
         sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
         sy = x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz + x[PL + 1]
         sz = x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz + x[PL + 2]
         yx = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P]
         yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1]
         yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2]
-        z = ux * yx + uy * yy + uz * yz - planes[n, 3]
+        z = plane[0] * yx + plane[1] * yy + plane[2] * yz - plane[3]
         if not 81.0 * z * z < math.sqrt(lx * lx + ly * ly + lz * lz):
             fate[n] = GATED
             continue
         fate[n] = USED
-        cx = x[R] * ux + x[R + 3] * uy + x[R + 6] * uz
-        cy = x[R + 1] * ux + x[R + 4] * uy + x[R + 7] * uz
-        cz = x[R + 2] * ux + x[R + 5] * uy + x[R + 8] * uz
+        t0 = plane[5] * yx + plane[6] * yy + plane[7] * yz - plane[8]
+        t1 = plane[9] * yx + plane[10] * yy + plane[11] * yz - plane[12]
         # The misfit of the plane's own points says how far to trust it; the Cauchy weight, how far to trust the point.
-        variance = range_variance + (map_variance + planes[n, 5]) * planes[n, 4] + planes[n, 5]
+        variance = range_variance + (map_variance + plane[4]) * (0.2 + t0 * t0 + t1 * t1) + plane[4]
         weight = 1.0 / (variance + z * z)
-        h[0], h[1], h[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
-        h[3], h[4], h[5] = ux, uy, uz
-        if with_extrinsic:
-            ex = x[RL] * cx + x[RL + 3] * cy + x[RL + 6] * cz
-            ey = x[RL + 1] * cx + x[RL + 4] * cy + x[RL + 7] * cz
-            ez = x[RL + 2] * cx + x[RL + 5] * cy + x[RL + 8] * cz
-            h[6], h[7], h[8] = ly * ez - lz * ey, lz * ex - lx * ez, lx * ey - ly * ex
-            h[9], h[10], h[11] = cx, cy, cz
+        _row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
         for i in range(size):
             wh = weight * h[i]
             b[i] += wh * z
@@ -80,4 +96,3 @@ def accumulate_planes(
                 A[i, j] += wh * h[j]
         sums[0] += 1.0
         sums[1] += z * z
-        sums[2] += z * z * weight

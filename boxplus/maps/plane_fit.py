@@ -11,7 +11,6 @@ from boxplus._jit import kernel
 
 COINCIDENT_M = 1e-6
 COLLINEAR_RATIO = 0.05
-PLANARITY = 1.0
 
 
 @kernel(inline=True)
@@ -49,7 +48,7 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
     largest = mean + 2.0 * scale * math.cos(angle)
     smallest = mean + 2.0 * scale * math.cos(angle + 2.0943951023931953)
     middle = 3.0 * mean - largest - smallest
-    if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest or smallest > PLANARITY * middle:
+    if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest:
         return False
     # The normal is orthogonal to the rows of M − λI: the longest of their three cross products.
     ax, ay, az = xx - smallest, yy - smallest, zz - smallest

@@ -14,6 +14,9 @@ from boxplus.maps.ikd_search import IkdView, knn5
 from boxplus.maps.plane_fit import fit_plane_into
 
 NEIGHBOURS = 5
+# A matched plane: unit normal u (0 to 2), offset uᵀq in the world (3), variance of its points about it (4), and twice a
+# vector g with its offset gᵀq (5 to 8, 9 to 12): the uncertainty of the normal, see `_normal_uncertainty`.
+PLANE = 13
 # A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
 _SLACK = 1.0 + 1e-5
 
@@ -45,8 +48,7 @@ def match_planes(
         plane_threshold: largest distance of a neighbour from the plane [m].
         warm: `neighbours` holds the result of an earlier call on the same map: their distances bound the search.
         neighbours: (n, 5, 3), relative to `origin`.
-        planes: (n, 5) receives the unit normal, the offset uᵀq in the world and the variance of the plane at the point, in
-            units of the variance of one map point.
+        planes: (n, PLANE) receives the planes.
         fate: (n,) receives USED, FEW_NEIGHBOURS or NOT_A_PLANE.
         found_sq, stack: scratch of the calling thread.
     """
@@ -76,17 +78,24 @@ def match_planes(
             continue
         fate[n] = USED
         ux, uy, uz = fit[0], fit[1], fit[2]
-        planes[n, 0], planes[n, 1], planes[n, 2] = ux, uy, uz
-        planes[n, 3] = fit[3] + ux * origin[0] + uy * origin[1] + uz * origin[2]
-        planes[n, 4] = _leverage(near, fit, yx, yy, yz)
-        planes[n, 5] = fit[7]
+        plane = planes[n]
+        plane[0], plane[1], plane[2] = ux, uy, uz
+        plane[3] = fit[3] + ux * origin[0] + uy * origin[1] + uz * origin[2]
+        plane[4] = fit[7]
+        _normal_uncertainty(near, fit, plane)
+        for g in (5, 9):
+            plane[g + 3] = (
+                plane[g] * (fit[4] + origin[0]) + plane[g + 1] * (fit[5] + origin[1]) + plane[g + 2] * (fit[6] + origin[2])
+            )
 
 
 @kernel(inline=True)
-def _leverage(near: NDArray[np.float32], fit: NDArray[np.float64], yx: float, yy: float, yz: float) -> float:
-    """Variance of a fitted plane at (yx, yy, yz) per unit variance of its points: 1/n + the pull of the in-plane offset."""
+def _normal_uncertainty(near: NDArray[np.float32], fit: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
+    """Two vectors g₁, g₂ in the plane with Cov(u) = σ² (g₁g₁ᵀ + g₂g₂ᵀ), σ² the variance of a map point.
+
+    Their sum of outer products is the inverse of the points' scatter within the plane.
+    """
     ux, uy, uz = fit[0], fit[1], fit[2]
-    # Two unit vectors in the plane.
     if abs(ux) < 0.6:
         norm = 1.0 / math.sqrt(uy * uy + uz * uz)
         ex, ey, ez = 0.0, uz * norm, -uy * norm
@@ -102,7 +111,9 @@ def _leverage(near: NDArray[np.float32], fit: NDArray[np.float64], yx: float, yy
         ee += e * e
         ef += e * f
         ff += f * f
-    dx, dy, dz = yx - fit[4], yy - fit[5], yz - fit[6]
-    e = ex * dx + ey * dy + ez * dz
-    f = fx * dx + fy * dy + fz * dz
-    return 1.0 / NEIGHBOURS + (ff * e * e - 2.0 * ef * e * f + ee * f * f) / (ee * ff - ef * ef)
+    # Cholesky factor of the inverse of [[ee, ef], [ef, ff]].
+    first = math.sqrt(ff / (ee * ff - ef * ef))
+    mixed = -first * ef / ff
+    second = 1.0 / math.sqrt(ff)
+    plane[5], plane[6], plane[7] = first * ex + mixed * fx, first * ey + mixed * fy, first * ez + mixed * fz
+    plane[9], plane[10], plane[11] = second * fx, second * fy, second * fz

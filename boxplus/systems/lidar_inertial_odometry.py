@@ -24,7 +24,8 @@ from boxplus.systems.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.excitation import RotationExcitation
 from boxplus.systems.lio_config import LioConfig
 from boxplus.systems.plane_measurement import PlaneMeasurement
-from boxplus.systems.start import Start, deskew_first, find_start
+from boxplus.systems.standstill import Standstill
+from boxplus.systems.start import Start, deskew_first, find_start, joined_imu
 
 _CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
@@ -50,6 +51,7 @@ class LidarInertialOdometry:
         self._voxel_filter = VoxelFilter(self.config.scan_voxel)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
+        self._standstill: Standstill | None = None
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._time_ns = 0
@@ -104,6 +106,8 @@ class LidarInertialOdometry:
             return []
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
+        if found.kind == "static":
+            self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         first, *rest = self._waiting
         self._waiting = []
         p_lidar = deskew_first(first, found.state, self.config)
@@ -115,6 +119,8 @@ class LidarInertialOdometry:
         """One scan, line by line as in SPEC.md 9.11."""
         clock = _Stopwatch()
         p_lidar = self._propagate(frame)
+        if self._standstill is not None and self._standstill.active:
+            self._standstill.update(frame.imu, self._x, self._cov)
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")

@@ -12,7 +12,7 @@ from boxplus._jit import run_chunks
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, GATED, MEASURED_DOF, NOT_A_PLANE, USED, accumulate_planes
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.maps.plane_matching import NEIGHBOURS, match_planes
+from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 from boxplus.systems.lio_config import LioConfig
 
 _CHUNK = 512
@@ -50,7 +50,7 @@ class PlaneMeasurement:
         self._config = config
         self._with_extrinsic = with_extrinsic
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
-        self._planes = np.zeros((n, 6))
+        self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
@@ -62,15 +62,13 @@ class PlaneMeasurement:
             self._match(x)
         A = np.zeros((MEASURED_DOF, MEASURED_DOF))
         b = np.zeros(MEASURED_DOF)
-        sums = np.zeros(3)
+        sums = np.zeros(2)
         config = self._config
         accumulate_planes(
             x,
             self._p_lidar,
             self._planes,
             self._fate,
-            0,
-            len(self._p_lidar),
             config.range_sigma**2,
             config.map_sigma**2,
             self._with_extrinsic,

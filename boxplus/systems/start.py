@@ -35,8 +35,10 @@ from boxplus.systems.plane_measurement import PlaneMeasurement
 _REST_GYRO_STD = 0.1  # rad/s, SPEC.md 9.4
 _REST_ACCEL_STD = 0.5  # m/s²
 _REST_ACCEL_NORM = (9.0, 10.6)
-_REST_DISPLACEMENT = 0.05  # m the LiDAR may seem to move over the window
-_REST_ROTATION = 0.02  # rad
+_REST_MISFIT = (1.25, 0.005)  # at rest, aligning the last scan gains no more than this factor and this much [m] ...
+_REST_MISFIT_MAX = 0.08  # ... it fits to this [m] ...
+_REST_MATCHED = 0.5  # ... with this share of its points
+_REST_SCANS = 3
 _MIN_MOVING_SCANS = 8
 
 
@@ -62,7 +64,7 @@ class Start:
 
 def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet."""
-    imu = _joined_imu(frames)
+    imu = joined_imu(frames)
     duration = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
     extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
     gyro_std = float(imu.gyro.std(axis=0).max())
@@ -71,24 +73,51 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     low, high = _REST_ACCEL_NORM
     still = gyro_std < _REST_GYRO_STD and accel_std < _REST_ACCEL_STD and low <= norm <= high and len(imu) > 10
     evidence = f"gyro std {gyro_std:.3f} rad/s, accelerometer std {accel_std:.2f} m/s² around {norm:.2f} m/s²"
-    path = _LidarPath(frames, config, extrinsic)
-    if len(frames) > 1:  # the first scans were moved by a biased gyro and without a velocity: once more, knowing both
-        path = _LidarPath(frames, config, replace(extrinsic, v_world_imu=path.first_velocity, bias_gyro=path.gyro_bias(imu)))
-    turned = float(np.linalg.norm(so3.log(path.rotations[0].T @ path.rotations[-1])))
-    displacement = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
-    evidence += f"; over {duration:.1f} s the LiDAR moved {displacement:.3f} m and turned {np.degrees(turned):.2f}°"
-    if still and displacement < _REST_DISPLACEMENT and turned < _REST_ROTATION:
-        state, covariance = _static_state(imu, extrinsic, config)
-        return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}")
-    if len(frames) < _MIN_MOVING_SCANS or path.failed:
+    if still:
+        at_rest, moved, aligned = _standstill(frames, config, extrinsic)
+        evidence += f"; the last scan lies {moved * 100:.1f} cm off the first ones unmoved, {aligned * 100:.1f} cm aligned"
+        if at_rest:
+            state, covariance = _static_state(imu, extrinsic, config)
+            return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}")
+    if len(frames) < _MIN_MOVING_SCANS:
         return f"not at rest ({evidence}), and {len(frames)} scans are not enough for a moving start; waiting for more data"
+    path = _LidarPath(frames, config, extrinsic)
+    # The first scans were moved by a biased gyro and without a velocity: once more, knowing both.
+    path = _LidarPath(frames, config, replace(extrinsic, v_world_imu=path.first_velocity, bias_gyro=path.gyro_bias(imu)))
+    if path.failed:
+        return f"not at rest ({evidence}), and the first scans do not overlap enough for a moving start; waiting for more data"
     state, covariance, misfit = _moving_state(frames, path, extrinsic, config)
     speed = float(np.linalg.norm(state.v_world_imu))
     text = f"moving at {speed:.2f} m/s: {evidence}; batch over {len(frames)} scans fits to {misfit * 100:.1f} cm"
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
 
 
-def _joined_imu(frames: Sequence[Frame]) -> ImuSamples:
+def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState) -> tuple[bool, float, float]:
+    """Whether the last scans fit the first ones without any motion as well as with the best one; both misfits [m].
+
+    A displacement found by registration cannot decide: a narrow field of view leaves directions in which it slides.
+    """
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    voxel_filter = VoxelFilter(config.scan_voxel)
+    for frame in frames[:_REST_SCANS]:
+        p_imu = voxel_filter(frame.scan.p_lidar)[1] @ extrinsic.R_imu_lidar.T + extrinsic.p_imu_lidar
+        tree.insert(p_imu, downsample=True)
+    unmoved, aligned, points_seen = [], [], 0
+    for frame in frames[-_REST_SCANS:]:
+        points = voxel_filter(frame.scan.p_lidar)[0]
+        points_seen += len(points)
+        x = extrinsic.pack()
+        unmoved.append(PlaneMeasurement(points, tree, config, with_extrinsic=False).at(x, rematch=True))
+        align(points, tree, x, config)
+        aligned.append(PlaneMeasurement(points, tree, config, with_extrinsic=False).at(x, rematch=True))
+    factor, margin = _REST_MISFIT
+    off, best = (float(np.mean([i.residual_rms for i in group])) for group in (unmoved, aligned))
+    kept = sum(i.used for i in unmoved) >= max(0.9 * sum(i.used for i in aligned), _REST_MATCHED * points_seen)
+    return bool(kept and off <= min(factor * best + margin, _REST_MISFIT_MAX)), off, best
+
+
+def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
+    """The IMU samples of several frames, each once."""
     time = np.concatenate([f.imu.time_ns for f in frames])
     time, first = np.unique(time, return_index=True)
     return ImuSamples(
@@ -137,7 +166,8 @@ def _static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tu
         extrinsic.R_imu_lidar,
         extrinsic.p_imu_lidar,
     )
-    covariance = _first_covariance(gyro_sigma=5e-3, accel_sigma=0.1, velocity_sigma=0.02, gravity_sigma=0.1)
+    gyro_sigma = max(float(imu.gyro.std(axis=0).max()) / np.sqrt(len(imu)), 1e-4)
+    covariance = _first_covariance(gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=0.1)
     return state, covariance
 
 
@@ -159,7 +189,7 @@ class _LidarPath:
             before = NavState.unpack(x)
             points, map_points = voxel_filter(deskew_at_constant_velocity(frame, x, config))
             if index > 0:
-                self.failed |= not self._align(points, tree, x, config)
+                self.failed |= not align(points, tree, x, config)
                 x[12:15] = (x[9:12] - before.p_world_imu) / ((frame.scan.end_ns - frame.begin_ns) * 1e-9)
             now = NavState.unpack(x)
             self.rotations.append(now.R_world_imu)
@@ -182,21 +212,21 @@ class _LidarPath:
         bias: NDArray[np.float64] = imu.gyro[inside].mean(axis=0) - lidar_rate
         return bias
 
-    @staticmethod
-    def _align(points: NDArray[np.float32], tree: IkdTree, x: NDArray[np.float64], config: LioConfig) -> bool:
-        """Gauss-Newton on the pose alone; x (36,) is replaced. False when too few points match."""
-        measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
-        delta = np.zeros(TANGENT)
-        for _ in range(15):
-            information = measurement.at(x, rematch=True)
-            if information.used < config.min_points:
-                return False
-            directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
-            delta[:6] = strong_step(information.A, information.b, directions)
-            boxplus_into(x, delta, x)
-            if np.abs(delta).max() < 1e-4:
-                break
-        return True
+
+def align(points: NDArray[np.float32], tree: IkdTree, x: NDArray[np.float64], config: LioConfig) -> bool:
+    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. False when too few points match."""
+    measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
+    delta = np.zeros(TANGENT)
+    for _ in range(15):
+        information = measurement.at(x, rematch=True)
+        if information.used < config.min_points:
+            return False
+        directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
+        delta[:6] = strong_step(information.A, information.b, directions)
+        boxplus_into(x, delta, x)
+        if np.abs(delta).max() < 1e-4:
+            break
+    return True
 
 
 def deskew_at_constant_velocity(frame: Frame, x: NDArray[np.float64], config: LioConfig) -> NDArray[np.float32]:
@@ -226,7 +256,7 @@ def _moving_state(
     R is the LiDAR path's rotation, so the biases are left to the filter; their prior is wide.
     """
     t0 = frames[0].scan.end_ns
-    imu = _joined_imu(frames)
+    imu = joined_imu(frames)
     ends = np.array([(f.scan.end_ns - t0) * 1e-9 for f in frames])
     # Specific force in the path's frame, integrated twice with the rotations of the path in between turned by the gyro.
     time = np.concatenate([ends, (imu.time_ns - t0) * 1e-9])
