@@ -9,6 +9,7 @@ VENV ?= .venv
 OUTPUT ?= demo
 JOBS ?= 2
 PYTEST_ARGS ?=
+DEMO_ARGS ?=
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet --quiet
@@ -16,7 +17,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet --qui
 .PHONY: demo test lint clean
 
 demo: $(VENV)/.runtime
-	@$(BIN)/boxplus demo -o $(OUTPUT)
+	@$(BIN)/boxplus demo -o $(OUTPUT) $(DEMO_ARGS)
 
 test: $(VENV)/.dev
 	@$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)

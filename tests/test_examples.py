@@ -1,0 +1,41 @@
+"""Every example is short and runs as it is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+
+# What the output must say for the example to have shown what it is about.
+SHOWS = {
+    "dynamic_kdtree": "after delete_box: 24668 (332 removed)",
+    "evaluate_trajectory": "ATE rmse: 1.7",
+    "odometry_from_arrays": "position error:",
+    "read_recording": "19 scans, 401 IMU samples; left out: nothing",
+}
+
+
+def test_every_example_is_known() -> None:
+    assert {example.stem for example in EXAMPLES} == set(SHOWS)
+
+
+@pytest.mark.parametrize("example", [pytest.param(path, id=path.stem) for path in EXAMPLES])
+def test_example_runs(example: Path, tmp_path: Path) -> None:
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= 60
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(example)], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert SHOWS[example.stem] in done.stdout
+    assert not list(tmp_path.iterdir())  # leaves nothing behind
+
+
+def test_odometry_from_arrays_is_accurate(tmp_path: Path) -> None:
+    script = next(example for example in EXAMPLES if example.stem == "odometry_from_arrays")
+    output = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    line = next(line for line in output.splitlines() if line.startswith("position error:"))
+    assert float(line.split()[2]) < 50.0  # mm

@@ -1,0 +1,133 @@
+"""The package as a whole: quick to import, typed, pure Python, and its house rules."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import boxplus
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted((ROOT / "boxplus").rglob("*.py"))
+HEAVY = ["numba", "scipy", "matplotlib", "plotly", "rosbags", "pydantic", "typer", "rich", "yaml", "numpy"]
+# From the lowest room to the highest: each imports only from those before it.
+ROOMS = "manifolds formats filtering maps sensors recordings systems evaluation simulation report cli".split()
+
+
+def modules_after(code: str) -> set[str]:
+    """Top-level modules in a fresh interpreter after `code`."""
+    program = f"{code}\nimport sys\nsys.stdout.write(' '.join(sorted({{name.split('.')[0] for name in sys.modules}})))"
+    return set(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split())
+
+
+def setuptools_knows_licence_expressions() -> bool:
+    try:
+        return int(importlib.metadata.version("setuptools").split(".")[0]) >= 77
+    except importlib.metadata.PackageNotFoundError:
+        return False
+
+
+def test_import_pulls_in_nothing_heavy() -> None:
+    assert not modules_after("import boxplus") & set(HEAVY)
+
+
+def test_command_line_starts_without_the_numerics() -> None:
+    code = (
+        "import sys\nfrom boxplus.cli import app\nsys.argv = ['boxplus', '--help']\ntry:\n    app()\nexcept SystemExit:\n    pass"
+    )
+    assert not modules_after(code) & {"numba", "scipy", "matplotlib", "plotly", "rosbags"}
+
+
+def test_sensor_types_need_no_compiler() -> None:
+    assert not modules_after("from boxplus import Scan, ImuSamples, RecordingOptions, InputError") & {"numba", "scipy", "rosbags"}
+
+
+def test_public_names_are_what_they_are_in_their_homes() -> None:
+    for name in boxplus.__all__:
+        assert getattr(boxplus, name) is not None
+    assert set(boxplus.__all__) <= set(dir(boxplus))
+    assert boxplus.__all__ == sorted(boxplus.__all__)
+    from boxplus.maps.ikd_tree import IkdTree
+
+    assert boxplus.IkdTree is IkdTree
+    with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
+        boxplus.Nothing  # noqa: B018
+
+
+def test_type_checkers_see_the_same_names_as_programs() -> None:
+    tree = ast.parse((ROOT / "boxplus" / "__init__.py").read_text(encoding="utf-8"))
+    typed = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("boxplus.")
+        for alias in node.names
+    }
+    assert typed == {name: f"boxplus.{home}" for name, home in boxplus._HOME.items()}
+    assert set(boxplus.__all__) == {*typed, "__version__"}
+
+
+def test_version_is_that_of_the_changelog() -> None:
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## {re.escape(boxplus.__version__)}\b", changelog, re.MULTILINE)
+
+
+def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
+    if not setuptools_knows_licence_expressions():
+        pytest.skip("setuptools 77 or later is not installed here, and building must not download anything")
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        (source / name).write_bytes((ROOT / name).read_bytes())
+    for path in [*SOURCES, ROOT / "boxplus" / "py.typed"]:
+        target = source / path.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    build = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name == f"boxplus-{boxplus.__version__}-py3-none-any.whl"
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        (metadata,) = [archive.read(name).decode() for name in names if name.endswith("METADATA")]
+        (entries,) = [archive.read(name).decode() for name in names if name.endswith("entry_points.txt")]
+    assert "boxplus/py.typed" in names
+    assert {name.split("/")[0] for name in names} == {"boxplus", f"boxplus-{boxplus.__version__}.dist-info"}
+    assert {str(path.relative_to(ROOT)) for path in SOURCES} <= set(names)
+    assert "License-Expression: MIT" in metadata
+    assert "boxplus = boxplus.cli:main" in entries
+
+
+@pytest.mark.parametrize("path", [pytest.param(path, id=str(path.relative_to(ROOT))) for path in SOURCES])
+def test_house_rules(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 400, "a file is one noun, at most 400 lines"
+    tree = ast.parse(text)
+    room = path.relative_to(ROOT / "boxplus").parts[0]
+    for node in ast.walk(tree):
+        assert not isinstance(node, ast.Assert), f"line {node.lineno}: assert in library code"
+        assert not (isinstance(node, ast.ExceptHandler) and node.type is None), f"line {node.lineno}: bare except"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id not in ("print", "exit", "quit"), f"line {node.lineno}: {node.func.id} in library code"
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sys":
+            assert node.attr != "exit" or room == "cli", f"line {node.lineno}: sys.exit in library code"
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: relative import"
+
+
+@pytest.mark.parametrize("room", [room for room in ROOMS if (ROOT / "boxplus" / room).is_dir()])
+def test_rooms_import_downwards_only(room: str) -> None:
+    """Imports at the top of a file; a command or a test of the wiring may reach further inside a function."""
+    for path in sorted((ROOT / "boxplus" / room).rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("boxplus."):
+                used = node.module.split(".")[1]
+                if used in ROOMS:
+                    assert ROOMS.index(used) <= ROOMS.index(room), f"{path.relative_to(ROOT)} imports {node.module}"
