@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def warmup() -> None:
-    """Compile everything now, so that the first run does not have to. Takes less than a minute, and a few seconds when nothing is left."""
+    """Compile everything now, so that the first run does not have to. Takes half a minute, once."""
     import tempfile
     import time
     from pathlib import Path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -42,6 +43,18 @@ class RunConfig(BaseModel):
 
 
 _SECTIONS: dict[str, type[BaseModel]] = {"recording": RecordingOptions, "odometry": LioConfig, "map": MapConfig}
+
+
+class _Yaml(yaml.SafeLoader):
+    """As YAML 1.2: only true and false are truth values; `off` and `on` are words, as `extrinsic_estimation` takes them."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+_Yaml.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
 
 
 def load_run_config(
@@ -93,7 +106,7 @@ def describe_key(dotted: str) -> str:
 
 def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), _Yaml)
     except OSError as error:
         raise InputError("a readable configuration file", f"{path}: {error.strerror}", "check the path") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -133,7 +146,7 @@ def _parse_setting(text: str) -> tuple[str, str, object]:
     if section not in _SECTIONS:
         raise InputError(f"a section ({', '.join(_SECTIONS)})", repr(section), _suggest(section, list(_SECTIONS), "section"))
     try:
-        return section, key, yaml.safe_load(value)
+        return section, key, yaml.load(value, _Yaml)
     except yaml.YAMLError as error:
         raise InputError(f"a value for {section}.{key}", repr(value), "write a number, a word or a [list]") from error
 

@@ -37,7 +37,7 @@ def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]
     """
     stripped = text.strip()
     tag, body = _split_tag(stripped)
-    if tag is None and not _is_numbers(body):
+    if tag is None and re.search(r"[^\s,;\[\]()0-9eE+.-]", body):
         stripped = _read_file(stripped, name)
         mapping = _mapping(stripped)
         if mapping is not None:
@@ -53,10 +53,6 @@ def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]
 def _split_tag(text: str) -> tuple[str | None, str]:
     tag, colon, body = text.partition(":")
     return (tag.strip(), body) if colon and tag.strip() in _TAGS else (None, text)
-
-
-def _is_numbers(text: str) -> bool:
-    return bool(re.fullmatch(r"[\s,;\[\]()0-9eE+.-]+", text)) and not Path(text).is_file()
 
 
 def _read_file(path: str, name: str) -> str:
