@@ -7,10 +7,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.maps.ikd_batch import update_batch
 from boxplus.maps.ikd_build import BUILDER, BUILT, build_step, start_build
 from boxplus.maps.ikd_pool import (
+    BUCKET,
     FILL,
+    LABEL_NONE,
     LEFT,
+    NIL,
     ROOT,
     Pool,
     free_subtree,
@@ -20,10 +24,24 @@ from boxplus.maps.ikd_pool import (
     slot_counts,
     take_inner,
 )
-from boxplus.maps.ikd_rebuild import copy_step, graft, replay_step, start_job
-from boxplus.maps.ikd_update import BUILDING, COPYING, IDLE, JOB, OPERATION, PATH_DEPTH, QUEUE_SIZE, REPLAYING, SLOT, Work
+from boxplus.maps.ikd_rebuild import copy_step
+from boxplus.maps.ikd_update import (
+    BUILDING,
+    COPYING,
+    IDLE,
+    JOB,
+    OPERATION,
+    PATH_DEPTH,
+    PENDING,
+    QUEUE_SIZE,
+    REPLAYING,
+    SLOT,
+    Work,
+)
 
 _NO_POINTS = np.empty((0, 4), np.float32)
+_NO_ORIGIN = np.zeros(3)  # the log has no downsampled inserts
+_REPLAY_COST = 128  # point visits an operation of the log counts for
 UNLIMITED = 1 << 60
 
 
@@ -37,14 +55,15 @@ def new_work(in_place: int, balance: float, check: int) -> Work:
         slots=np.empty(PATH_DEPTH, SLOT),
         log=np.empty(1, OPERATION),
         ancestors=np.empty(PATH_DEPTH, np.uint32),
-        queue=np.empty((QUEUE_SIZE, 3), np.float32),
-        path=np.empty(PATH_DEPTH, SLOT),
+        queue=np.empty(QUEUE_SIZE, np.uint64),
+        path=np.empty(PATH_DEPTH, np.uint32),
         small=np.empty((max(in_place, 64) + 1, 4), np.float32),
         small_builder=np.zeros(1, BUILDER),
         walk=np.empty(2 * PATH_DEPTH, SLOT),
         gather=np.empty(PATH_DEPTH, SLOT),
-        cell_slots=np.empty(PATH_DEPTH, SLOT),
-        scratch=np.zeros(16, np.float32),
+        cell_stack=np.empty(PATH_DEPTH, PENDING),
+        scratch=np.zeros(19, np.float32),
+        order=np.empty(BUCKET, np.uint32),
     )
 
 
@@ -98,10 +117,16 @@ class Rebuilder:
         else:
             reserve(pool, 1, 0)
             self._target = pool
-            self._slot = (take_inner(pool), LEFT)
+            self._slot = (np.uint32(take_inner(pool)), LEFT)
         self.work = self.work._replace(copy=np.empty((size, 4), np.float32))
-        ancestors = np.uint32(0 if whole else self.work.job[0]["ancestors"])
-        start_job(self.work, np.uint32(node), np.uint32(side), ancestors, keep_dead)
+        ancestors = 0 if whole else self.work.job[0]["ancestors"]
+        job, first = self.work.job[0], self.work.slots[0]
+        job["phase"], job["node"], job["side"], job["ancestors"] = COPYING, node, side, ancestors
+        job["stamp"] += 1
+        job["keep_dead"] = keep_dead
+        job["copied"] = job["logged"] = job["replayed"] = 0
+        first["node"], first["side"], first["label"] = node, side, LABEL_NONE
+        job["top"] = 1
 
     def make_log_room(self, operations: int) -> None:
         """Let the log of a running rebuild take so many more operations."""
@@ -115,7 +140,7 @@ class Rebuilder:
         target = self._target
         if not self.running or self.finished or target is None:
             return
-        nodes = min(budget, len(self.work.copy)) // (FILL // 2) + 64
+        nodes = min(budget // 64, len(self.work.copy) // FILL) + 64  # a slice that needs more goes on in the next call
         reserve(target, nodes, nodes)
         if self._executor is None:
             self._run(pool, target, budget)
@@ -139,8 +164,11 @@ class Rebuilder:
             left = build_step(target, self._builder, self.work.copy, left)
             if self._builder[0]["phase"] == BUILT:
                 job["phase"] = REPLAYING
+                self.work = self.work._replace(copy=_NO_POINTS)
         if job["phase"] == REPLAYING and left > 0:
-            replay_step(target, self.work, self._resting, *self._slot, left)
+            begin = int(job["replayed"])
+            end = min(int(job["logged"]), begin + int(left) // _REPLAY_COST + 1)
+            job["replayed"] = update_batch(target, self._resting, self.work.log, begin, end, *self._slot, 0.0, _NO_ORIGIN)
 
     def complete(self, pool: Pool) -> None:
         """Do all the rest of the running rebuild now."""
@@ -155,15 +183,38 @@ class Rebuilder:
         if target is None:
             return pool
         if target is pool:
-            graft(pool, self.work, self._slot[0])
+            self._graft(pool)
+        self._take_over_notes()
         self._rest()
         return target
+
+    def _graft(self, pool: Pool) -> None:
+        """Hang the new subtree, held by a spare node, where the old one was. The counts above stay as they are."""
+        job = self.work.job[0]
+        slot, spare, side = pool.inner[job["node"]], pool.inner[self._slot[0]], int(job["side"])
+        free_subtree(pool, np.uint32(slot["child"][side]))
+        for field in ("child", "label", "box"):
+            slot[field][side] = spare[field][LEFT]
+        spare["child"] = NIL
+        free_subtree(pool, self._slot[0])
+
+    def _take_over_notes(self) -> None:
+        """What fell out of balance in the new subtree during the replay is noted for the tree, below the slot's path."""
+        job, new = self.work.job[0], self._resting.job[0]
+        slot = 1 if self._slot[0] == ROOT else int(job["path"])
+        for path in self._resting.queue[: new["queued"]].tolist():
+            whole = int(f"{slot:b}" + f"{path:b}"[1:], 2)
+            if whole < 1 << 62 and job["queued"] < QUEUE_SIZE:
+                self.work.queue[job["queued"]] = whole
+                job["queued"] += 1
+        new["queued"] = 0
 
     def cancel(self, pool: Pool) -> None:
         """Give the running rebuild up; the tree is as if it had never begun."""
         self.wait()
         if self._target is pool and self.running:
             free_subtree(pool, self._slot[0])
+        self._resting.job[0]["queued"] = 0
         self._rest()
 
     def _rest(self) -> None:

@@ -255,3 +255,12 @@ def slot_counts(pool: Pool, node: np.uint32, side: np.uint32) -> tuple[np.uint32
     elif label == LABEL_LIVE:
         dead = ZERO
     return size, dead
+
+
+@kernel
+def slot_size(pool: Pool, node: np.uint32, side: np.uint32) -> np.uint32:
+    """Stored points below a slot."""
+    ref = pool.inner[node]["child"][side]
+    if ref == NIL:
+        return ZERO
+    return np.uint32(pool.leaf[ref & INDEX_MASK]["count"] if ref & LEAF_BIT else pool.count[ref]["size"])

@@ -1,8 +1,7 @@
-"""Rebuilding a large subtree of an ikd-tree in slices: copy, build, replay the operation log, swap (SPEC 10.6).
+"""Rebuilding subtrees of an ikd-tree: small ones at once, the copy of large ones in slices (SPEC 10.4, 10.6).
 
-The copy is a snapshot of the subtree at the start of the rebuild (`save_leaf` sees to that), the tree stays in use, and
-all later operations are logged. Every step does a bounded number of point visits, so a caller decides by counting, never
-by a clock, when the work is done; on which thread does not matter.
+The copy of a large subtree is a snapshot of the moment its rebuild began (`save_leaf` sees to that), while the tree stays
+in use and all later operations are logged.
 """
 
 from __future__ import annotations
@@ -10,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_build import build_step, start_build
 from boxplus.maps.ikd_pool import (
+    FILL,
     INDEX_MASK,
     LABEL_NONE,
     LEAF_BIT,
@@ -24,42 +25,104 @@ from boxplus.maps.ikd_pool import (
     free_subtree,
     has_room,
     live_bits,
-    slot_counts,
+    slot_size,
 )
-from boxplus.maps.ikd_update import (
-    BUILDING,
-    COPYING,
-    IDLE,
-    INSERT,
-    Work,
-    insert_point,
-    may_rebuild,
-    rebuild_in_place,
-    save_leaf,
-    unbalanced,
-    update_box,
-)
-
-_REPLAY_COST = 64  # point visits an operation of the log counts for
+from boxplus.maps.ikd_update import BUILDING, IDLE, Work, save_leaf, unbalanced
 
 
 @kernel
-def start_job(work: Work, node: np.uint32, side: np.uint32, ancestors: np.uint32, keep_dead: bool) -> None:
-    """Begin to rebuild the subtree of a slot. The copy must have room for all its points."""
+def gather(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> np.uint32:
+    """Copy all points below a slot to the rows of `small`; returns how many there are."""
+    row = ZERO
+    out, slots = work.small, work.gather
+    slots[0]["node"] = node
+    slots[0]["side"] = side
+    slots[0]["label"] = LABEL_NONE
+    top = ONE
+    while top > ZERO:
+        top -= ONE
+        node, side, label = np.uint32(slots[top]["node"]), np.uint32(slots[top]["side"]), np.uint8(slots[top]["label"])
+        ref = np.uint32(pool.inner[node]["child"][side])
+        if ref == NIL:
+            continue
+        if label == LABEL_NONE:
+            label = np.uint8(pool.inner[node]["label"][side])
+        if ref < LEAF_BIT:
+            for child in range(2):
+                slots[top]["node"] = ref
+                slots[top]["side"] = np.uint32(1 - child)
+                slots[top]["label"] = label
+                top += ONE
+            continue
+        index = np.uint32(ref & INDEX_MASK)
+        leaf = pool.leaf[index]
+        live = live_bits(pool.leaf, index, label)
+        for i in range(np.uint32(leaf["count"])):
+            out[row, 0] = leaf["x"][i]
+            out[row, 1] = leaf["y"][i]
+            out[row, 2] = leaf["z"][i]
+            out[row, 3] = np.float32((live >> np.uint32(i)) & ONE == ZERO)
+            row += ONE
+    return row
+
+
+@kernel
+def rebuild_in_place(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> None:
+    """Rebuild a small subtree at once. Room for its nodes must be there."""
+    points = gather(pool, work, node, side)
+    free_subtree(pool, pool.inner[node]["child"][side])
+    pool.inner[node]["child"][side] = NIL
+    start_build(work.small_builder, points, node, side)
+    build_step(pool, work.small_builder, work.small, np.int64(1) << np.int64(62))
+
+
+@kernel
+def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside: bool) -> bool:
+    """Whether a small subtree may be replaced now: neither inside the one being rebuilt nor above it."""
     job = work.job[0]
-    job["phase"] = np.uint32(COPYING)
-    job["node"] = node
-    job["side"] = side
-    job["ancestors"] = ancestors
-    job["stamp"] += ONE
-    job["keep_dead"] = np.uint32(keep_dead)
-    job["copied"] = ZERO
-    job["logged"] = ZERO
-    job["replayed"] = ZERO
-    work.slots[0]["node"] = node
-    work.slots[0]["side"] = side
-    work.slots[0]["label"] = LABEL_NONE
-    job["top"] = ONE
+    if job["phase"] == IDLE:
+        return True
+    if inside:
+        return False
+    ref = pool.inner[node]["child"][side]
+    for i in range(np.uint32(job["ancestors"])):
+        if work.ancestors[i] == ref:
+            return False
+    return True
+
+
+@kernel
+def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32, np.uint32, np.uint32, bool]:
+    """The topmost unbalanced subtree on a path: its slot (node NIL if there is none), its depth, and whether it lies in the
+    subtree being rebuilt. `Work.path` gets the inner nodes above it."""
+    job = work.job[0]
+    node, side, depth = ROOT, LEFT, ZERO
+    inside = False
+    bit = np.uint64(1)
+    while (path >> np.uint64(1)) >= bit:
+        bit <<= np.uint64(1)
+    while True:
+        ref = np.uint32(pool.inner[node]["child"][side])
+        inside = inside or (job["phase"] != IDLE and node == job["node"] and side == job["side"])
+        if ref >= LEAF_BIT:
+            return NIL, LEFT, ZERO, inside
+        if unbalanced(pool, work, ref):
+            return node, side, depth, inside
+        if bit == np.uint64(1):
+            return NIL, LEFT, ZERO, inside
+        bit >>= np.uint64(1)
+        work.path[depth] = ref
+        depth += ONE
+        node = ref
+        side = np.uint32((path & bit) != np.uint64(0))
+
+
+@kernel
+def trim_path(path: np.uint64, depth: np.uint32) -> np.uint64:
+    """The first `depth` steps of a path."""
+    while path >> np.uint64(1) >= np.uint64(1) << np.uint64(depth):
+        path >>= np.uint64(1)
+    return path
 
 
 @kernel
@@ -72,59 +135,35 @@ def settle(pool: Pool, work: Work) -> bool:
     kept = ZERO
     chosen = False
     for row in range(np.uint32(job["queued"])):
-        x, y, z = work.queue[row, 0], work.queue[row, 1], work.queue[row, 2]
-        if chosen:
-            keep = True
-        else:
-            node, side, depth = find_unbalanced(pool, work, x, y, z)
-            keep = False
+        path = work.queue[row]
+        keep = chosen
+        if not chosen:
+            node, side, depth, inside = find_unbalanced(pool, work, path)
             if node != NIL:
-                ref = np.uint32(pool.inner[node]["child"][side])
-                size = np.uint32(pool.count[ref]["size"])
+                size = np.uint32(pool.count[pool.inner[node]["child"][side]]["size"])
+                leaves = np.uint32(np.uint32(2) * size // np.uint32(FILL) + np.uint32(4))
                 if size <= job["in_place"]:
-                    leaves = np.uint32(size // np.uint32(8) + np.uint32(4))
-                    keep = not (may_rebuild(pool, work, node, side, True) and has_room(pool, leaves, leaves))
+                    keep = not (may_rebuild(pool, work, node, side, inside) and has_room(pool, leaves, leaves))
                     if not keep:
                         rebuild_in_place(pool, work, node, side)
                 elif job["phase"] == IDLE:
                     chosen = True
-                    total, _ = slot_counts(pool, ROOT, LEFT)
-                    if np.uint64(2) * np.uint64(size) > np.uint64(total):
+                    total = slot_size(pool, ROOT, LEFT)
+                    if np.uint64(2) * np.uint64(size) > np.uint64(total):  # most of the tree: then all of it
                         node, side, depth = ROOT, LEFT, ZERO
                     for i in range(depth):
-                        work.ancestors[i] = work.path[i]["node"]
+                        work.ancestors[i] = work.path[i]
                     job["node"] = node
                     job["side"] = side
                     job["ancestors"] = depth
+                    job["path"] = trim_path(path, depth)
                 else:
                     keep = True
         if keep:
-            work.queue[kept, 0] = x
-            work.queue[kept, 1] = y
-            work.queue[kept, 2] = z
+            work.queue[kept] = path
             kept += ONE
     job["queued"] = kept
     return chosen
-
-
-@kernel
-def find_unbalanced(
-    pool: Pool, work: Work, x: np.float32, y: np.float32, z: np.float32
-) -> tuple[np.uint32, np.uint32, np.uint32]:
-    """The topmost unbalanced subtree on the path of a point: its slot (NIL if none) and depth; `path` gets the nodes above."""
-    node, side, depth = ROOT, LEFT, ZERO
-    while True:
-        ref = np.uint32(pool.inner[node]["child"][side])
-        if ref >= LEAF_BIT:
-            return NIL, LEFT, ZERO
-        if unbalanced(pool, work, ref):
-            return node, side, depth
-        work.path[depth]["node"] = ref
-        depth += ONE
-        axis = pool.inner[ref]["axis"]
-        value = x if axis == 0 else (y if axis == 1 else z)
-        node = ref
-        side = np.uint32(value >= pool.inner[ref]["split"])
 
 
 @kernel
@@ -156,41 +195,3 @@ def copy_step(pool: Pool, work: Work, budget: np.int64) -> np.int64:
     if job["top"] == ZERO:
         job["phase"] = np.uint32(BUILDING)
     return budget
-
-
-@kernel
-def replay_step(target: Pool, work: Work, resting: Work, node: np.uint32, side: np.uint32, budget: np.int64) -> np.int64:
-    """Apply logged operations to the new subtree until none is left or the budget is spent; returns what is left of it.
-
-    `resting` is `work` with a job at rest: nothing is copied or logged for the new subtree.
-    """
-    job = work.job[0]
-    box = resting.scratch
-    while budget > 0 and job["replayed"] < job["logged"]:
-        if not has_room(target, np.uint32(2), np.uint32(3)):
-            return np.int64(0)
-        entry = work.log[job["replayed"]]
-        for i in range(6):
-            box[i] = entry["box"][i]
-        if entry["kind"] == INSERT:
-            insert_point(target, resting, node, side, box[0], box[1], box[2])
-        else:
-            update_box(target, resting, node, side, box, np.int64(entry["kind"]))
-        job["replayed"] += ONE
-        budget -= _REPLAY_COST
-    return budget
-
-
-@kernel
-def graft(pool: Pool, work: Work, holder: np.uint32) -> None:
-    """Put the new subtree, held in the left slot of `holder`, in the place of the old one. Counts above stay the same."""
-    job = work.job[0]
-    node, side = np.uint32(job["node"]), np.uint32(job["side"])
-    record, source = pool.inner[node], pool.inner[holder]
-    free_subtree(pool, record["child"][side])
-    record["child"][side] = source["child"][LEFT]
-    record["label"][side] = source["label"][LEFT]
-    for i in range(6):
-        record["box"][side, i] = source["box"][LEFT, i]
-    source["child"][LEFT] = NIL
-    free_subtree(pool, holder)

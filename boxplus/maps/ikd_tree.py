@@ -10,21 +10,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
-from boxplus.maps.ikd_batch import box_batch, insert_batch
+from boxplus.maps.ikd_batch import update_batch
+from boxplus.maps.ikd_check import check_tree
 from boxplus.maps.ikd_collect import collect, nearest_batch
 from boxplus.maps.ikd_job import Rebuilder, build_pool, new_work
 from boxplus.maps.ikd_pool import BUCKET, LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
 from boxplus.maps.ikd_rebuild import settle
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH, IkdView
-from boxplus.maps.ikd_update import DELETE, MAX_DEPTH, REVIVE
+from boxplus.maps.ikd_update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPTH, OPERATION, REVIVE
 
 MAX_EXTENT = 100_000.0  # [m] from the origin, per axis: float32 resolves 8 mm there
 DELETE_TOLERANCE = 1e-6  # [m] per axis
 IN_PLACE = 1500  # points; larger subtrees are rebuilt in slices
-_CHECK = 4 * BUCKET  # subtrees up to this size are not checked for balance
+_CHECK = 6 * BUCKET  # smaller subtrees are not checked for balance: a few leaves cannot always be halved
 _BATCH = 2048  # points inserted in one kernel call
 _BUDGET = 20_000  # point visits of a rebuild a call ...
 _BUDGET_PER_POINT = 300  # ... and for every point the call changed
+_ROOM = 128  # nodes made ready for a kernel call; it stops and asks again when they are used up
 _QUERY_CHUNK = 2048
 
 
@@ -121,7 +123,7 @@ class IkdTree:
         self._rebuilder.cancel(self._pool)
         self._placed = False
         relative, not_finite, too_far = self._to_relative(world)
-        self._pool = build_pool(relative)
+        self._pool = build_pool(np.pad(relative, ((0, 0), (0, 1))))
         self._job["live"], self._job["queued"], self._job["depth"] = len(relative), 0, 0
         self._revivable = 0
         return InsertReport(len(relative), 0, not_finite, too_far)
@@ -139,12 +141,11 @@ class IkdTree:
         if downsample and self.cell_size is None:
             raise InputError("a cell_size for a downsampled insert", "none", "give IkdTree a cell_size, or insert all points")
         relative, not_finite, too_far = self._to_relative(_as_points(points, "points"))
-        xyz = np.ascontiguousarray(relative[:, :3])
-        cell = float(self.cell_size or 0.0) if downsample else 0.0
-        inserted = 0
-        for begin in range(0, len(xyz), _BATCH):
-            inserted += self._insert_batch(xyz[begin : begin + _BATCH], cell)
-        return InsertReport(inserted, len(xyz) - inserted, not_finite, too_far)
+        operations = np.empty(len(relative), OPERATION)
+        operations["box"][:, :3] = relative
+        operations["kind"] = INSERT_DOWNSAMPLED if downsample else INSERT
+        inserted = self._update(operations)
+        return InsertReport(inserted, len(relative) - inserted, not_finite, too_far)
 
     def delete_points(self, points: ArrayLike) -> int:
         """Delete the live points within 1e-6 m on each axis of any of `points`, (N, 3) [m]; returns how many there were.
@@ -153,9 +154,9 @@ class IkdTree:
             InputError: wrong shape.
         """
         relative, _, _ = self._to_relative(_as_points(points, "points"))
-        centers = relative[:, :3].astype(np.float64)
+        centers = relative.astype(np.float64)
         low, high = _round_up(centers - DELETE_TOLERANCE), _round_up(np.nextafter(centers + DELETE_TOLERANCE, np.inf))
-        return self._update_boxes(np.concatenate([low, high], axis=1), DELETE)
+        return self._delete(np.concatenate([low, high], axis=1))
 
     def delete_box(self, lo: ArrayLike, hi: ArrayLike) -> int:
         """Delete the points with `lo ≤ p < hi` on every axis, (3,) each [m]; returns how many live ones there were.
@@ -163,7 +164,7 @@ class IkdTree:
         Raises:
             InputError: wrong shape or NaN.
         """
-        return self._update_boxes(self._relative_box(lo, hi), DELETE)
+        return self._delete(self._relative_box(lo, hi))
 
     def reinsert_box(self, lo: ArrayLike, hi: ArrayLike) -> int:
         """Revive the deleted points with `lo ≤ p < hi` on every axis, (3,) each [m]; returns how many there were.
@@ -261,6 +262,19 @@ class IkdTree:
         """Bytes of the tree and of a running rebuild."""
         return pool_bytes(self._pool) + self._rebuilder.memory_bytes(self._pool)
 
+    def check_invariants(self) -> int:
+        """Check every node in Python (slow; for tests) and return the height of the tree.
+
+        The balance (I6) is not asked for while a rebuild is running or noted.
+
+        Raises:
+            InvariantError: an invariant of SPEC 10.2 is violated.
+        """
+        self._rebuilder.wait()
+        pending = self._rebuilder.running or self._job["queued"] > 0
+        balance = 1.0 if pending else float(self._job["balance"])
+        return check_tree(self._pool, len(self), balance=balance, smallest=int(self._job["check"])).height
+
     # ------------------------------------------------------------------------------------------------- life and rebuild
 
     def close(self) -> None:
@@ -277,31 +291,35 @@ class IkdTree:
     def _job(self) -> np.void:
         return self._rebuilder.work.job[0]
 
-    def _insert_batch(self, xyz: NDArray[np.float32], cell: float) -> int:
-        live_before, row, inserted = int(self._job["live"]), 0, 0
-        self._begin_update(2 * len(xyz) + 2)
-        while row < len(xyz):
-            reserve(self._pool, len(xyz) - row + 2, len(xyz) - row + 3)
-            row = insert_batch(self._pool, self._rebuilder.work, xyz, row, cell, self.origin)
-            if self._job["depth"] > MAX_DEPTH:
-                self._rebuild_all()
-        inserted = int(self._job["live"]) - live_before
-        self._end_update(len(xyz))
-        return inserted
+    def _delete(self, boxes: NDArray[np.float32]) -> int:
+        deleted = self._update_boxes(boxes, DELETE)
+        self._revivable += deleted
+        if self._revivable > self._delete_ratio * (len(self) + self._revivable):
+            self._forget()
+        return deleted
 
-    def _update_boxes(self, boxes: NDArray[np.float32], kind: int) -> int:
-        if not len(boxes):
-            return 0
-        self._begin_update(len(boxes))
-        changed = int(box_batch(self._pool, self._rebuilder.work, np.ascontiguousarray(boxes), kind))
-        if kind == DELETE:
-            self._job["live"] -= changed
-            self._revivable += changed
-            if self._revivable > self._delete_ratio * (len(self) + self._revivable):
-                self._forget()
-        else:
-            self._job["live"] += changed
-        self._end_update(changed)
+    def _update_boxes(self, boxes: NDArray[np.float32], kind: np.int64) -> int:
+        operations = np.empty(len(boxes), OPERATION)
+        operations["box"] = boxes
+        operations["kind"] = kind
+        return self._update(operations)
+
+    def _update(self, operations: NDArray[np.void]) -> int:
+        """Apply operations and do the share of a rebuild that goes with them; returns how many points they changed."""
+        changed = 0
+        for begin in range(0, len(operations), _BATCH):
+            row, end = begin, min(begin + _BATCH, len(operations))
+            self._job["changed"] = 0
+            self._begin_update(2 * (end - begin) + 2)
+            while row < end:
+                reserve(self._pool, _ROOM, _ROOM)
+                work = self._rebuilder.work
+                size = self.cell_size or 0.0
+                row = update_batch(self._pool, work, operations, row, end, ROOT, LEFT, size, self.origin)
+                if self._job["depth"] > MAX_DEPTH:
+                    self._rebuild_all()
+            changed += int(self._job["changed"])
+            self._end_update(int(self._job["changed"]))
         return changed
 
     def _begin_update(self, operations: int) -> None:
@@ -316,7 +334,8 @@ class IkdTree:
     def _end_update(self, points: int) -> None:
         """Give the running rebuild its share of work, and begin one where the balance is lost."""
         rebuilder = self._rebuilder
-        while not rebuilder.running and settle(self._pool, rebuilder.work):
+        reserve(self._pool, _ROOM, _ROOM)
+        while settle(self._pool, rebuilder.work):
             rebuilder.start(self._pool, int(self._job["node"]), int(self._job["side"]), keep_dead=True)
             if self._rebuild == "inplace":
                 self._complete()
@@ -345,22 +364,20 @@ class IkdTree:
     # ------------------------------------------------------------------------------------------------------ coordinates
 
     def _to_relative(self, world: NDArray[np.float64]) -> tuple[NDArray[np.float32], int, int]:
-        """(N, 4) float32 relative to the origin (the last column 0), and how many points were not finite or too far."""
-        finite = np.isfinite(world).all(axis=1)
-        not_finite = len(world) - int(np.count_nonzero(finite))
-        if not_finite:
-            world = world[finite]
-        if not self._placed and len(world):
-            self.origin = np.round(np.median(world, axis=0))
-            self._placed = True
+        """(N, 3) float32 relative to the origin, and how many points were not finite or too far."""
+        if not self._placed:
+            finite = world[np.isfinite(world).all(axis=1)]
+            if len(finite):
+                self.origin = np.round(np.median(finite, axis=0))
+                self._placed = True
         relative = world - self.origin
-        near = (np.abs(relative) <= MAX_EXTENT).all(axis=1)
-        too_far = len(world) - int(np.count_nonzero(near))
-        if too_far:
+        not_finite = too_far = 0
+        if len(relative) and not np.abs(relative).max() <= MAX_EXTENT:
+            near = (np.abs(relative) <= MAX_EXTENT).all(axis=1)
+            not_finite = int(np.count_nonzero(~np.isfinite(world).all(axis=1)))
+            too_far = len(world) - int(np.count_nonzero(near)) - not_finite
             relative = relative[near]
-        points = np.zeros((len(relative), 4), np.float32)
-        points[:, :3] = relative
-        return points, not_finite, too_far
+        return relative.astype(np.float32), not_finite, too_far
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""

@@ -1,4 +1,4 @@
-"""Single updates of an ikd-tree: insert a point, delete, revive or drop a box; small rebuilds in place.
+"""Single updates of an ikd-tree: insert a point; delete, revive or drop a box.
 
 All boxes are half open, `lo ≤ x < hi`, in float32 relative to the tree's origin. Every update descends with push-down of
 the lazy labels, so a leaf it touches knows the state of its points; on the way back the counts are pulled up (SPEC 10.3).
@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_box import contained, disjoint, in_box
-from boxplus.maps.ikd_build import build_step, start_build
 from boxplus.maps.ikd_pool import (
     BUCKET,
-    FILL,
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -33,9 +31,10 @@ from boxplus.maps.ikd_pool import (
     Pool,
     count_bits,
     free_subtree,
-    has_room,
     live_bits,
     slot_counts,
+    slot_size,
+    take_inner,
     take_leaf,
 )
 
@@ -43,9 +42,10 @@ MAX_DEPTH = 160  # deeper than this the whole tree is rebuilt at once; searches 
 PATH_DEPTH = 512
 QUEUE_SIZE = 256
 
-DELETE, REVIVE, DROP = 0, 1, 2  # what a box update does: mark, unmark, or remove for good
+# Kinds of operations. A downsampled insert is logged as DROP and INSERT.
+DELETE, REVIVE, DROP, INSERT, INSERT_DOWNSAMPLED = np.int64(0), np.int64(1), np.int64(2), np.int64(3), np.int64(4)
 
-IDLE, COPYING, BUILDING, REPLAYING = 0, 1, 2, 3  # phases of a rebuild
+IDLE, COPYING, BUILDING, REPLAYING = np.uint32(0), np.uint32(1), np.uint32(2), np.uint32(3)  # phases of a rebuild
 
 JOB = np.dtype(
     [
@@ -58,6 +58,7 @@ JOB = np.dtype(
         ("top", np.uint32),  # slots still to copy
         ("logged", np.uint32),
         ("replayed", np.uint32),
+        ("path", np.uint64),  # the slot's path
         ("ancestors", np.uint32),  # how many inner nodes lie above the slot; they are in Work.ancestors
         ("queued", np.uint32),  # subtrees noted as out of balance
         ("in_place", np.uint32),  # subtrees up to this many points are rebuilt at once
@@ -65,13 +66,15 @@ JOB = np.dtype(
         ("balance", np.float32),
         ("check", np.uint32),  # no balance check up to this size
         ("live", np.int64),  # live points of the tree
+        ("changed", np.int64),  # points deleted, revived and stored by the last call
     ],
     align=True,
 )
-SLOT = np.dtype([("node", np.uint32), ("side", np.uint32), ("label", np.uint8)], align=True)
+SLOT = np.dtype([("node", np.uint32), ("side", np.uint32), ("label", np.uint8), ("path", np.uint64)], align=True)
+PENDING = np.dtype([("ref", np.uint32), ("label", np.uint8)], align=True)
 OPERATION = np.dtype([("box", np.float32, 6), ("kind", np.uint32)], align=True)
+_LONG_PATH = np.uint64(1) << np.uint64(62)  # a path is the sides from the root, after a leading 1
 _ENTER, _LEAVE, _INSIDE = np.uint8(0), np.uint8(1), np.uint8(2)  # states of a slot in a box update
-INSERT = 3  # kind of a logged operation, besides the box updates
 
 
 class Work(NamedTuple):
@@ -82,14 +85,15 @@ class Work(NamedTuple):
     slots: NDArray[np.void]  # slots still to copy
     log: NDArray[np.void]  # operations since the rebuild began
     ancestors: NDArray[np.uint32]
-    queue: NDArray[np.float32]  # (QUEUE_SIZE, 3): a point in each subtree out of balance
-    path: NDArray[np.void]  # slots passed by the last insert
+    queue: NDArray[np.uint64]  # (QUEUE_SIZE,): paths of the subtrees noted as out of balance
+    path: NDArray[np.uint32]  # (PATH_DEPTH,): inner nodes passed by the last descent
     small: NDArray[np.float32]  # copy of a subtree rebuilt in place
     small_builder: NDArray[np.void]
     walk: NDArray[np.void]  # scratch of the box updates
     gather: NDArray[np.void]  # scratch of the copy of a small subtree
-    cell_slots: NDArray[np.void]  # scratch of the search of a cell
+    cell_stack: NDArray[np.void]  # scratch of the search of a cell
     scratch: NDArray[np.float32]  # (16,)
+    order: NDArray[np.uint32]  # (BUCKET,)
 
 
 @kernel
@@ -149,100 +153,13 @@ def save_leaf(pool: Pool, work: Work, index: np.uint32, live: np.uint32) -> None
 
 
 @kernel
-def gather(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> np.uint32:
-    """Copy all points below a slot to the rows of `small`; returns how many there are."""
-    row = ZERO
-    out, slots = work.small, work.gather
-    slots[0]["node"] = node
-    slots[0]["side"] = side
-    slots[0]["label"] = LABEL_NONE
-    top = ONE
-    while top > ZERO:
-        top -= ONE
-        node, side, label = np.uint32(slots[top]["node"]), np.uint32(slots[top]["side"]), np.uint8(slots[top]["label"])
-        ref = np.uint32(pool.inner[node]["child"][side])
-        if ref == NIL:
-            continue
-        if label == LABEL_NONE:
-            label = np.uint8(pool.inner[node]["label"][side])
-        if ref < LEAF_BIT:
-            for child in range(2):
-                slots[top]["node"] = ref
-                slots[top]["side"] = np.uint32(1 - child)
-                slots[top]["label"] = label
-                top += ONE
-            continue
-        index = np.uint32(ref & INDEX_MASK)
-        leaf = pool.leaf[index]
-        live = live_bits(pool.leaf, index, label)
-        for i in range(np.uint32(leaf["count"])):
-            out[row, 0] = leaf["x"][i]
-            out[row, 1] = leaf["y"][i]
-            out[row, 2] = leaf["z"][i]
-            out[row, 3] = np.float32((live >> np.uint32(i)) & ONE == ZERO)
-            row += ONE
-    return row
-
-
-@kernel
-def rebuild_in_place(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> None:
-    """Rebuild a small subtree at once."""
-    build_small(pool, work, node, side, gather(pool, work, node, side))
-
-
-@kernel
-def build_small(pool: Pool, work: Work, node: np.uint32, side: np.uint32, points: np.uint32) -> None:
-    """Replace what is in a slot by a tree of the first `points` rows of the scratch copy."""
-    free_subtree(pool, pool.inner[node]["child"][side])
-    pool.inner[node]["child"][side] = NIL
-    start_build(work.small_builder, points, node, side)
-    build_step(pool, work.small_builder, work.small, np.int64(1) << np.int64(62))
-
-
-@kernel
 def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
     """Whether an inner node violates the balance criterion (SPEC 10.4)."""
     size = np.uint32(pool.count[ref]["size"])
     if size <= work.job[0]["check"]:
         return False
-    left, _ = slot_counts(pool, ref, LEFT)
+    left = slot_size(pool, ref, LEFT)
     return max(left, np.uint32(size - left)) > work.job[0]["balance"] * np.float32(size - ONE)
-
-
-@kernel
-def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside: bool) -> bool:
-    """Whether a small subtree may be replaced now: not while it is being copied, nor if the running rebuild hangs below it."""
-    job = work.job[0]
-    if job["phase"] == IDLE:
-        return True
-    if (inside and job["phase"] == COPYING) or (node == job["node"] and side == job["side"]):
-        return False
-    ref = pool.inner[node]["child"][side]
-    for i in range(np.uint32(job["ancestors"])):
-        if work.ancestors[i] == ref:
-            return False
-    return True
-
-
-@kernel
-def restore_balance(
-    pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32, inside: bool
-) -> None:
-    """Rebuild an unbalanced subtree if it is small, else note a point of it for a rebuild in slices."""
-    ref = pool.inner[node]["child"][side]
-    job = work.job[0]
-    size = np.uint32(pool.count[ref]["size"])
-    leaves = np.uint32(np.uint32(2) * size // np.uint32(FILL) + np.uint32(4))
-    if size <= job["in_place"] and may_rebuild(pool, work, node, side, inside) and has_room(pool, leaves, leaves):
-        rebuild_in_place(pool, work, node, side)
-        return
-    if pool.inner[ref]["queued"] == 0 and job["queued"] < np.uint32(QUEUE_SIZE):
-        pool.inner[ref]["queued"] = np.uint8(1)
-        row = job["queued"]
-        work.queue[row, 0] = x
-        work.queue[row, 1] = y
-        work.queue[row, 2] = z
-        job["queued"] = row + ONE
 
 
 @kernel
@@ -258,78 +175,122 @@ def extend_box(pool: Pool, node: np.uint32, side: np.uint32, x: np.float32, y: n
 
 
 @kernel
-def add_to_leaf(
-    pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32, copying: bool
-) -> None:
-    """Store a live point in the leaf of a slot (none yet, or one that a full bucket turns into two)."""
-    ref = pool.inner[node]["child"][side]
-    if ref == NIL:
-        index = take_leaf(pool)
-        ref = np.uint32(index | LEAF_BIT)
-        pool.leaf[index]["count"] = ZERO
-        pool.leaf[index]["live"] = ZERO
-        pool.leaf[index]["stamp"] = ZERO
-        pool.inner[node]["child"][side] = ref
-        pool.inner[node]["label"][side] = LABEL_NONE
-    index = np.uint32(ref & INDEX_MASK)
+def note_unbalanced(pool: Pool, work: Work, ref: np.uint32, path: np.uint64) -> None:
+    """Note a subtree out of balance, once; `settle` deals with it."""
+    job = work.job[0]
+    if pool.inner[ref]["queued"] == 0 and job["queued"] < np.uint32(QUEUE_SIZE) and path < _LONG_PATH:
+        pool.inner[ref]["queued"] = np.uint8(1)
+        work.queue[job["queued"]] = path
+        job["queued"] += ONE
+
+
+@kernel
+def put_in_leaf(pool: Pool, index: np.uint32, x: np.float32, y: np.float32, z: np.float32, live: np.uint32) -> None:
+    """Append a point to a leaf that has room for it; `live` is 0 or 1."""
     leaf = pool.leaf[index]
-    if copying:
-        save_leaf(pool, work, index, np.uint32(leaf["live"]))
     count = np.uint32(leaf["count"])
-    if count < np.uint32(BUCKET):
-        leaf["x"][count] = x
-        leaf["y"][count] = y
-        leaf["z"][count] = z
-        leaf["live"] |= ONE << count
-        leaf["count"] = count + ONE
-        return
-    points = gather(pool, work, node, side)
-    work.small[points, 0] = x
-    work.small[points, 1] = y
-    work.small[points, 2] = z
-    work.small[points, 3] = np.float32(0)
-    build_small(pool, work, node, side, np.uint32(points + ONE))
-    if copying:
-        child = pool.inner[pool.inner[node]["child"][side]]["child"]
-        pool.leaf[child[0] & INDEX_MASK]["stamp"] = work.job[0]["stamp"]
-        pool.leaf[child[1] & INDEX_MASK]["stamp"] = work.job[0]["stamp"]
+    leaf["x"][count] = x
+    leaf["y"][count] = y
+    leaf["z"][count] = z
+    leaf["live"] |= live << count
+    leaf["count"] = count + ONE
+
+
+@kernel
+def new_leaf(pool: Pool, stamp: np.uint32) -> np.uint32:
+    """The index of an empty leaf."""
+    index = take_leaf(pool)
+    leaf = pool.leaf[index]
+    leaf["count"] = ZERO
+    leaf["live"] = ZERO
+    leaf["stamp"] = stamp
+    return index
+
+
+@kernel
+def split_leaf(pool: Pool, order: NDArray[np.uint32], node: np.uint32, side: np.uint32) -> np.uint32:
+    """Replace a full leaf by an inner node over its lower and upper half along the longest axis; returns the inner node."""
+    slot = pool.inner[node]
+    box = slot["box"]
+    old = np.uint32(slot["child"][side] & INDEX_MASK)
+    leaf = pool.leaf[old]
+    dx, dy, dz = box[side, 3] - box[side, 0], box[side, 4] - box[side, 1], box[side, 5] - box[side, 2]
+    axis = 0 if dx >= dy and dx >= dz else (1 if dy >= dz else 2)
+    values = leaf["x"] if axis == 0 else (leaf["y"] if axis == 1 else leaf["z"])
+    for i in range(BUCKET):
+        j = i
+        while j > 0 and values[order[j - 1]] > values[i]:
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = np.uint32(i)
+    ref = take_inner(pool)
+    inner = pool.inner[ref]
+    inner["axis"] = np.uint8(axis)
+    inner["split"] = values[order[BUCKET // 2]]
+    live = np.uint32(leaf["live"])
+    pool.count[ref]["size"] = np.uint32(BUCKET)
+    pool.count[ref]["dead"] = np.uint32(np.uint32(BUCKET) - count_bits(live))
+    for half in range(2):
+        child = np.uint32(half)
+        for axis in range(3):
+            inner["box"][child, axis] = np.inf
+            inner["box"][child, axis + 3] = -np.inf
+        index = new_leaf(pool, np.uint32(leaf["stamp"]))
+        inner["child"][child] = index | LEAF_BIT
+        for j in range(half * (BUCKET // 2), (half + 1) * (BUCKET // 2)):
+            i = order[j]
+            x, y, z = leaf["x"][i], leaf["y"][i], leaf["z"][i]
+            put_in_leaf(pool, index, x, y, z, (live >> i) & ONE)
+            extend_box(pool, ref, child, x, y, z)
+    free_subtree(pool, np.uint32(slot["child"][side]))
+    slot["child"][side] = ref
+    return ref
 
 
 @kernel
 def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> bool:
-    """Insert a point below a slot and restore the balance of its path.
+    """Insert a point below a slot; notes the topmost subtree of its path that is out of balance.
 
-    Room for two leaves and an inner node must be there. Returns whether the point lies in the subtree being rebuilt.
+    Room for three leaves and an inner node must be there. Returns whether the point lies in the subtree being rebuilt.
     """
     job = work.job[0]
     running = job["phase"] != IDLE
     inside = False
-    path = work.path
     depth = ZERO
+    path = np.uint64(1)
+    above = ZERO
+    noted = False
     while True:
         extend_box(pool, node, side, x, y, z)
         inside = inside or (running and node == job["node"] and side == job["side"])
         push_down(pool, node, side)
         ref = np.uint32(pool.inner[node]["child"][side])
-        if ref >= LEAF_BIT:
-            break
-        path[depth]["node"] = node
-        path[depth]["side"] = side
+        if ref == NIL:
+            ref = np.uint32(new_leaf(pool, ZERO) | LEAF_BIT)
+            pool.inner[node]["child"][side] = ref
+        if ref & LEAF_BIT:
+            index = np.uint32(ref & INDEX_MASK)
+            if inside and job["phase"] == COPYING:
+                save_leaf(pool, work, index, np.uint32(pool.leaf[index]["live"]))
+            if pool.leaf[index]["count"] < np.uint32(BUCKET):
+                put_in_leaf(pool, index, x, y, z, ONE)
+                break
+            ref = split_leaf(pool, work.order, node, side)
+        size = np.uint32(pool.count[ref]["size"]) + ONE
+        pool.count[ref]["size"] = size
         depth += ONE
-        pool.count[ref]["size"] += ONE
+        # Only the side that grows can upset the balance of the node above.
+        if above > job["check"] and not noted and size > job["balance"] * np.float32(above - ONE):
+            if not inside:
+                note_unbalanced(pool, work, node, path >> np.uint64(1))
+            noted = True
+        above = size
         axis = pool.inner[ref]["axis"]
         value = x if axis == 0 else (y if axis == 1 else z)
         node = ref
         side = np.uint32(value >= pool.inner[ref]["split"])
-    add_to_leaf(pool, work, node, side, x, y, z, inside and job["phase"] == COPYING)
+        path = (path << np.uint64(1)) | np.uint64(side) if path < _LONG_PATH else path
     job["depth"] = max(np.uint32(job["depth"]), np.uint32(depth + ONE))
-    below_job = False
-    for i in range(depth):
-        node, side = np.uint32(path[i]["node"]), np.uint32(path[i]["side"])
-        below_job = below_job or (running and node == job["node"] and side == job["side"])
-        if unbalanced(pool, work, pool.inner[node]["child"][side]):
-            restore_balance(pool, work, node, side, x, y, z, below_job)
-            break
     return inside
 
 
@@ -372,6 +333,7 @@ def update_box(pool: Pool, work: Work, node: np.uint32, side: np.uint32, box: ND
     slots[0]["node"] = node
     slots[0]["side"] = side
     slots[0]["label"] = _ENTER
+    slots[0]["path"] = np.uint64(1)
     top = ONE
     while top > ZERO:
         top -= ONE
@@ -381,9 +343,8 @@ def update_box(pool: Pool, work: Work, node: np.uint32, side: np.uint32, box: ND
         inside = state & _INSIDE != 0
         if state & _LEAVE:
             pull_up(pool, node, side)
-            if kind == DROP and unbalanced(pool, work, ref):
-                inner_box = pool.inner[ref]["box"]
-                restore_balance(pool, work, node, side, inner_box[0, 0], inner_box[0, 1], inner_box[0, 2], inside)
+            if kind == DROP and not inside and unbalanced(pool, work, ref):
+                note_unbalanced(pool, work, ref, np.uint64(slots[top]["path"]))
             continue
         if ref == NIL or disjoint(record["box"], side, box):
             continue
@@ -402,11 +363,13 @@ def update_box(pool: Pool, work: Work, node: np.uint32, side: np.uint32, box: ND
             changed += update_leaf(pool.leaf, index, box, kind)
             continue
         mark = _INSIDE if inside else _ENTER
+        path = np.uint64(slots[top]["path"])
         slots[top]["label"] = np.uint8(mark | _LEAVE)  # node and side are still there
         top += ONE
         for child in range(2):
             slots[top]["node"] = ref
             slots[top]["side"] = np.uint32(child)
             slots[top]["label"] = mark
+            slots[top]["path"] = (path << np.uint64(1)) | np.uint64(child) if path < _LONG_PATH else path
             top += ONE
     return changed
