@@ -1,0 +1,128 @@
+"""Every command and every line of Python in the README and in the pages for users runs; every link leads somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from boxplus.recordings.options import RecordingOptions
+from boxplus.simulation import simulate, write_recording
+from boxplus.systems.lio_config import LioConfig
+from boxplus.systems.run_config import MapConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PYTHON_PAGES = [ROOT / "README.md", ROOT / "docs" / "library_use.md"]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+COMMANDS = [line for block in blocks(ROOT / "README.md", "sh") for line in block.splitlines() if line.strip()]
+
+
+@pytest.fixture(scope="session")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the recording that the README speaks of: flight.bag and flight.gt.tum."""
+    folder = tmp_path_factory.mktemp("flight")
+    write_recording(simulate("walk", duration_s=6.0), folder / "flight", "ros1")
+    return folder
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    """Run a command; its output. A make that runs the tests must not lend its settings to a make within them."""
+    environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
+    done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, f"{shlex.join(arguments)}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def make(target: str, *settings: str) -> str:
+    """Run a target of the Makefile in the environment of this test, which is set up already."""
+    old = [argument for stamp in (".python", ".runtime", ".dev") for argument in ("-o", f"{sys.prefix}/{stamp}")]
+    return run(["make", "--no-print-directory", *old, target, f"VENV={sys.prefix}", *settings], ROOT)
+
+
+def test_the_readme_has_the_two_commands_and_the_main_job() -> None:
+    assert COMMANDS[:2] == ["make demo", "make test"]
+    assert any(" lio " in command for command in COMMANDS)
+
+
+def test_make_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
+    output = make("demo", f"OUTPUT={tmp_path}", "DEMO_ARGS=--duration 8")
+    accuracy, speed, report = output.strip().splitlines()[-3:]
+    number = re.fullmatch(r"accuracy +([0-9.]+) cm position, .*", accuracy)
+    assert number is not None and float(number[1]) < 10.0
+    assert re.fullmatch(r"speed +[0-9.]+ ms per scan .*", speed)
+    assert "report" in report and Path(report.split()[1]).stat().st_size > 10_000
+
+
+def test_make_test_runs_the_suite_on_two_processes() -> None:
+    output = make("test", "PYTEST_ARGS=tests/test_package.py -k version")
+    assert re.search(r"\d+ passed", output.splitlines()[-1])
+    plan = make("test", "-n")
+    assert "-m pytest -n 2" in plan
+
+
+def test_a_python_that_is_too_old_is_refused_with_a_sentence(tmp_path: Path) -> None:
+    old = tmp_path / "python"
+    old.write_text('#!/bin/sh\n[ "$1" = --version ] && echo "Python 3.8.10" && exit 0\nexit 1\n')
+    old.chmod(0o755)
+    done = subprocess.run(
+        ["make", "demo", f"PYTHON={old}", f"VENV={tmp_path}/venv"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode != 0
+    assert "boxplus needs Python 3.11 or later" in done.stderr and "Python 3.8.10" in done.stderr
+    assert not (tmp_path / "venv").exists()
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.name) for page in PYTHON_PAGES])
+def test_python_of_the_pages_runs(page: Path, workspace: Path) -> None:
+    code = blocks(page, "python")
+    assert code
+    run([sys.executable, "-W", "error", "-c", "\n".join(code)], workspace)
+
+
+def test_commands_for_a_recording_run(workspace: Path) -> None:
+    commands = [shlex.split(command) for command in COMMANDS if not command.startswith("make ")]
+    assert {command[1] for command in commands} == {"inspect", "lio", "eval"}
+    for program, *arguments in commands:
+        assert program == ".venv/bin/boxplus"
+        run([sys.executable, "-c", "from boxplus.cli import main; main()", *arguments], workspace)
+    assert {"report.html", "trajectory.tum", "map.ply", "config.yaml", "run.json"} <= {
+        path.name for path in (workspace / "flight").iterdir()
+    }
+
+
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.name) for page in PAGES])
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("https://"):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name != "index.md" and page.name not in index]
+    assert not missing
+
+
+@pytest.mark.parametrize("model", [LioConfig, RecordingOptions, MapConfig])
+def test_configuration_page_names_every_setting_and_its_default(
+    model: type[LioConfig] | type[RecordingOptions] | type[MapConfig],
+) -> None:
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    rows = {cells[0].strip(" `"): cells[1].strip() for cells in re.findall(r"^\| (`\w+`) \| ([^|]+) \|", page, re.MULTILINE)}
+    spelled = {True: "true", False: "false", None: "null", float("inf"): "none"}
+    for name, field in model.model_fields.items():
+        value = field.default
+        text = str(spelled.get(value, value)) if not isinstance(value, float) or value == float("inf") else f"{value:g}"
+        assert rows.get(name, "").strip("`") == text, f"{name}: {rows.get(name)!r}, not {text!r}"
