@@ -86,19 +86,25 @@ def voxel_centroids(
 
 
 class VoxelFilter:
-    """Keeps its scratch memory from scan to scan.
+    """Thins scans; keeps its scratch memory from scan to scan.
+
+    With `max_points` the voxels adapt to the surroundings: where a scan leaves more, they grow for the next one, and shrink
+    back to `voxel_size` where there are fewer.
 
     Args:
-        voxel_size: side of a voxel [m].
+        voxel_size: side of a voxel, the least one [m].
+        max_points: how many voxels a scan should have at most, or None.
 
     Raises:
         InputError: `voxel_size` is not positive.
     """
 
-    def __init__(self, voxel_size: float) -> None:
+    def __init__(self, voxel_size: float, max_points: int | None = None) -> None:
         if not (np.isfinite(voxel_size) and voxel_size > 0):
             raise InputError("voxel_size as a positive length in metres", f"{voxel_size}", "typical values are 0.2 to 1.0")
         self.voxel_size = voxel_size
+        self._least = voxel_size
+        self._max_points = max_points
         self._reserve(1024)
 
     def _reserve(self, points: int) -> None:
@@ -129,4 +135,8 @@ class VoxelFilter:
             self._nearest,
             self._distances,
         )
+        if self._max_points is not None:
+            # Surfaces fill voxels with the square of their size.
+            fitting = self.voxel_size * (used / self._max_points) ** 0.5
+            self.voxel_size = max(self._least, 0.5 * (self.voxel_size + fitting))
         return self._sums[:used].copy(), points[self._nearest[:used]]

@@ -48,7 +48,7 @@ class LidarInertialOdometry:
         self.start_problem: str | None = None
         self._sequencer = Sequencer()
         self._waiting: list[Frame] = []
-        self._voxel_filter = VoxelFilter(self.config.scan_voxel)
+        self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
@@ -124,9 +124,10 @@ class LidarInertialOdometry:
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
+        voxel = self._voxel_filter.voxel_size
         points, map_points = self._voxel_filter(p_lidar)
         clock.lap("voxel filter")
-        return self._update(frame, p_lidar, points, map_points, clock)
+        return self._update(frame, p_lidar, points, map_points, voxel, clock)
 
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
@@ -162,6 +163,7 @@ class LidarInertialOdometry:
         p_lidar: NDArray[np.float32],
         points: NDArray[np.float32],
         map_points: NDArray[np.float32],
+        voxel: float,
         clock: _Stopwatch,
     ) -> Estimate:
         """The iterated update (SPEC.md 9.8, 9.9), then the map takes the points at the posterior pose."""
@@ -170,7 +172,7 @@ class LidarInertialOdometry:
         with_extrinsic = config.extrinsic_estimation == "on" or (
             config.extrinsic_estimation == "gated" and self._excitation.sufficient
         )
-        measurement = PlaneMeasurement(points, self.map, config, with_extrinsic=with_extrinsic)
+        measurement = PlaneMeasurement(points, self.map, config, voxel=voxel, with_extrinsic=with_extrinsic)
         delta = np.zeros(TANGENT)
         posterior = np.zeros((TANGENT, TANGENT))
         directions: PoseDirections | None = None

@@ -22,12 +22,17 @@ class LioConfig(BaseModel):
     extrinsic_estimation: Literal["off", "on", "gated"] = Field(
         "off", description="refine T_imu_lidar while running: never, always, or only while the motion makes it observable"
     )
-    scan_voxel: float = Field(0.25, gt=0, description="side of the voxels that thin a scan before the update [m]")
+    scan_voxel: float = Field(0.15, gt=0, description="side of the voxels that thin a scan before the update, at least [m]")
+    max_points: int = Field(
+        3000, ge=100, description="about how many points of a scan the update takes; the voxels grow until it is so"
+    )
     map_cell: float = Field(0.25, gt=0, description="side of the map's cells, each keeps one point [m]")
     max_iterations: int = Field(4, ge=1, le=50, description="most Gauss-Newton steps after the first, per scan")
     max_neighbour_distance: float = Field(2.236, gt=0, description="the fifth neighbour of a point lies within this [m]")
     plane_threshold: float = Field(0.1, gt=0, description="a plane's five points lie within this of it [m]")
-    range_sigma: float = Field(0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal [m]")
+    range_sigma: float = Field(
+        0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal, for voxels of 0.5 m and more [m]"
+    )
     map_sigma: float = Field(0.02, ge=0, description="standard deviation of a map point along a plane's normal [m]")
     gyro_noise: float = Field(2e-3, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included")
     accel_noise: float = Field(2e-2, gt=0, description="accelerometer noise [m/s²/√Hz], vibration included")

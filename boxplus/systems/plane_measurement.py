@@ -16,6 +16,7 @@ from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 from boxplus.systems.lio_config import LioConfig
 
 _CHUNK = 512
+_INDEPENDENT = 0.5  # m between points whose errors are independent
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
     NOT_A_PLANE: "neighbours not on a plane",
@@ -40,10 +41,13 @@ class PlaneMeasurement:
         p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame.
         tree: the map, which must not change while the measurement lives.
         config: noise, gates and threads.
+        voxel: side of the voxels that thinned the scan [m].
         with_extrinsic: whether the extrinsic is measured.
     """
 
-    def __init__(self, p_lidar: NDArray[np.float32], tree: IkdTree, config: LioConfig, *, with_extrinsic: bool) -> None:
+    def __init__(
+        self, p_lidar: NDArray[np.float32], tree: IkdTree, config: LioConfig, *, voxel: float, with_extrinsic: bool
+    ) -> None:
         n = len(p_lidar)
         self._p_lidar = p_lidar
         self._tree = tree
@@ -53,6 +57,8 @@ class PlaneMeasurement:
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
+        # Points that share map neighbours share their error: finer voxels give more points, not more information.
+        self._range_variance = (config.range_sigma * max(1.0, _INDEPENDENT / voxel)) ** 2
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
         self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
 
@@ -69,7 +75,7 @@ class PlaneMeasurement:
             self._p_lidar,
             self._planes,
             self._fate,
-            config.range_sigma**2,
+            self._range_variance,
             config.map_sigma**2,
             self._with_extrinsic,
             A,

@@ -107,9 +107,9 @@ def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState)
         points = voxel_filter(frame.scan.p_lidar)[0]
         points_seen += len(points)
         x = extrinsic.pack()
-        unmoved.append(PlaneMeasurement(points, tree, config, with_extrinsic=False).at(x, rematch=True))
+        unmoved.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
         align(points, tree, x, config)
-        aligned.append(PlaneMeasurement(points, tree, config, with_extrinsic=False).at(x, rematch=True))
+        aligned.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
     factor, margin = _REST_MISFIT
     off, best = (float(np.mean([i.residual_rms for i in group])) for group in (unmoved, aligned))
     kept = sum(i.used for i in unmoved) >= max(0.9 * sum(i.used for i in aligned), _REST_MATCHED * points_seen)
@@ -215,7 +215,7 @@ class _LidarPath:
 
 def align(points: NDArray[np.float32], tree: IkdTree, x: NDArray[np.float64], config: LioConfig) -> bool:
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. False when too few points match."""
-    measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
+    measurement = PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False)
     delta = np.zeros(TANGENT)
     for _ in range(15):
         information = measurement.at(x, rematch=True)
