@@ -1,0 +1,146 @@
+"""The report: its sections, that it needs nothing from elsewhere, and that it draws any run."""
+
+from __future__ import annotations
+
+import re
+import types
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boxplus.errors import InputError
+from boxplus.report import palette, run_data, write_report
+from boxplus.report.run_data import load_run
+from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation.live_recording import as_recording
+from boxplus.systems.odometry_run import run_odometry
+from boxplus.systems.run_config import load_run_config
+from boxplus.systems.run_folder import PLOTS
+from boxplus.systems.run_summary import Gap, WarningFacts, read_summary
+
+LIDAR = SpinningLidar(azimuth_steps=200)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "out"
+    run_odometry(as_recording(simulate("walk", duration_s=3.0, lidar=LIDAR)), path)
+    return path
+
+
+class _Page(HTMLParser):
+    """Collects headings, and every address a browser would load by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.headings: list[str] = []
+        self.loads: list[str] = []
+        self.scripts = 0
+        self._in_heading = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._in_heading = tag in ("h1", "h2")
+        self.scripts += tag == "script"
+        self.loads += [value or "" for name, value in attrs if name in ("src", "srcset", "data", "poster")]
+        if tag == "link":
+            self.loads += [value or "" for name, value in attrs if name == "href"]
+
+    def handle_data(self, data: str) -> None:
+        if self._in_heading:
+            self.headings.append(data)
+            self._in_heading = False
+
+
+def test_page_is_self_contained_and_has_its_sections(folder: Path) -> None:
+    report = write_report(folder)
+    text = report.read_text(encoding="utf-8")
+    page = _Page()
+    page.feed(text)
+    assert page.loads == []
+    assert "@import" not in text.split("</style>")[0]
+    assert page.headings == [
+        "walk (simulated)",
+        "Warnings",
+        "Map and trajectory",
+        "Status and information",
+        "Timing",
+        "Velocity",
+        "Uncertainty",
+        "Biases",
+        "Gravity",
+        "Extrinsic",
+        "Points",
+        "Gaps and rejections",
+        "Run",
+        "How the recording was read",
+    ]
+    assert len(re.findall(r"Plotly\.newPlot\(", text.split("</script>", 1)[1])) == 8
+    for name in PLOTS:
+        assert (folder / "plots" / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_troubles_are_on_the_page_and_markup_is_escaped(folder: Path, tmp_path: Path) -> None:
+    summary = read_summary(folder / "run.json")
+    troubled = summary.model_copy(
+        update={
+            "state": "failed",
+            "error": "expected to write <b> – got a full disk – free some space",
+            "warnings": [WarningFacts(text="IMU gap of 0.50 s & more", count=7, first_s=1.25)],
+            "imu_gaps": [Gap(begin_s=1.0, duration_s=0.5)],
+        }
+    )
+    copy = tmp_path / "out"
+    copy.mkdir()
+    for name in ("scans.csv", "trajectory.csv"):
+        (copy / name).write_bytes((folder / name).read_bytes())
+    troubled.write(copy / "run.json")
+    text = write_report(copy).read_text(encoding="utf-8").split("<body>")[1]
+    assert "stopped by an error after 29 scans" in text
+    assert "got a full disk" in text
+    assert "expected to write &lt;b&gt;" in text
+    assert "IMU gap of 0.50 s &amp; more <small>(7 times, first at 1.2 s)</small>" in text
+    assert "1 (longest 0.50 s) of the IMU, none of the scans" in text
+    assert "The run kept no map" in text
+
+
+def test_refined_extrinsic_is_drawn(tmp_path: Path) -> None:
+    config = load_run_config(settings=["extrinsic_estimation=on", "map.save=false"])
+    run_odometry(as_recording(simulate("walk", duration_s=2.0, lidar=LIDAR)), tmp_path / "out", config)
+    text = write_report(tmp_path / "out").read_text(encoding="utf-8").split("<body>")[1]
+    assert "refined throughout" in text
+    assert "rotation, from the first" in text
+
+
+def test_map_is_thinned_evenly(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = load_run(folder).map_points
+    monkeypatch.setattr(run_data, "_MOST_POINTS", 2000)
+    few = load_run(folder).map_points
+    assert 500 < len(few) <= 2000 < len(whole)
+    np.testing.assert_allclose(few.min(axis=0), whole.min(axis=0), atol=3.0)
+    np.testing.assert_allclose(few.max(axis=0), whole.max(axis=0), atol=3.0)
+
+
+def test_long_runs_show_their_worst_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(palette, "_MOST_ROWS", 5)
+    data = load_run(folder)
+    status = np.full(len(data.scans), "ok", dtype="<U4")
+    status[7] = "lost"
+    total = np.zeros(len(data.scans))
+    total[11] = 99.0
+    scans = types.SimpleNamespace(column=lambda name: total)
+    fake = types.SimpleNamespace(seconds=data.seconds, status=status, scans=scans)
+    rows = palette.shown_rows(fake)  # type: ignore[arg-type]
+    assert {0, 7, 11, len(status) - 1} <= set(rows.tolist())
+    assert (np.diff(rows) > 0).all()
+
+
+def test_folder_of_something_else(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected the output folder of a run, with run.json – got .* – check the path"):
+        write_report(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(
+        InputError, match=r"expected run.json as this version of boxplus writes it – got versions: Field required"
+    ):
+        write_report(tmp_path)
