@@ -45,7 +45,7 @@ class RunConfig(BaseModel):
 _SECTIONS: dict[str, type[BaseModel]] = {"recording": RecordingOptions, "odometry": LioConfig, "map": MapConfig}
 
 
-class _Yaml(yaml.SafeLoader):
+class _Yaml(yaml.SafeLoader):  # type: ignore[misc]
     """As YAML 1.2: only true and false are truth values; `off` and `on` are words, as `extrinsic_estimation` takes them."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012

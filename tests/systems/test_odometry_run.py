@@ -269,13 +269,15 @@ def test_gaps_are_found(tmp_path: Path) -> None:
 
 def test_view_sees_every_estimate(tmp_path: Path) -> None:
     class Eye:
-        times: list[int] = []
+        def __init__(self) -> None:
+            self.times: list[int] = []
 
         def show(self, estimate: odometry_run.Estimate) -> None:
             self.times.append(estimate.time_ns)
 
-    run_odometry(walk(2.0), tmp_path / "out", view=Eye())
-    np.testing.assert_array_equal(Eye.times, read_trajectory(tmp_path / "out" / "trajectory.csv").times)
+    eye = Eye()
+    run_odometry(walk(2.0), tmp_path / "out", view=eye)
+    np.testing.assert_array_equal(eye.times, read_trajectory(tmp_path / "out" / "trajectory.csv").times)
 
 
 def test_extrinsic_is_estimated_when_nobody_gives_it() -> None:

@@ -70,7 +70,7 @@ def test_wrong_files_are_explained(tmp_path: Path, text: str, message: str) -> N
 
 
 def test_missing_file() -> None:
-    with pytest.raises(InputError, match="expected a readable configuration file – got nowhere.yaml"):
+    with pytest.raises(InputError, match=r"expected a readable configuration file – got nowhere.yaml"):
         load_run_config("nowhere.yaml")
 
 
