@@ -193,7 +193,7 @@ class LidarInertialOdometry:
             boxplus_into(self._x, delta, self._x)
             steps += 1
             converged = bool(np.abs(delta).max() < _CONVERGED)
-            if converged and converged_before:
+            if converged and (converged_before or not measurement.has_moved(self._x)):
                 break
             last_but_one = iteration == config.max_iterations - 1
             rematch = converged or (last_but_one and not converged_before)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
+from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, GATED, MEASURED_DOF, NOT_A_PLANE, USED, accumulate_planes
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
@@ -16,6 +17,7 @@ from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 from boxplus.systems.lio_config import LioConfig
 
 _CHUNK = 512
+_SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
 _INDEPENDENT = 0.5  # m between points whose errors are independent
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
@@ -57,6 +59,7 @@ class PlaneMeasurement:
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
+        self._matched_at = np.zeros(PACKED)
         # Points that share map neighbours share their error: finer voxels give more points, not more information.
         self._range_variance = (config.range_sigma * max(1.0, _INDEPENDENT / voxel)) ** 2
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
@@ -85,6 +88,13 @@ class PlaneMeasurement:
         A += np.triu(A, 1).T
         used = int(sums[0])
         return Information(A, b, used, float(np.sqrt(sums[1] / used)) if used else 0.0)
+
+    def has_moved(self, x: NDArray[np.float64]) -> bool:
+        """Whether the points have moved far enough since the last search for some to have other neighbours."""
+        delta = np.zeros(TANGENT)
+        boxminus_into(x, self._matched_at, delta)
+        shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
+        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._config.map_cell
 
     def rejected(self) -> Mapping[str, int]:
         """Points that were not used, by reason."""
@@ -120,3 +130,4 @@ class PlaneMeasurement:
 
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
+        self._matched_at = x.copy()
