@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from boxplus.recordings.options import RecordingOptions
 from boxplus.simulation import simulate, write_recording
@@ -121,8 +122,7 @@ def test_configuration_page_names_every_setting_and_its_default(
 ) -> None:
     page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     rows = {cells[0].strip(" `"): cells[1].strip() for cells in re.findall(r"^\| (`\w+`) \| ([^|]+) \|", page, re.MULTILINE)}
-    spelled = {True: "true", False: "false", None: "null", float("inf"): "none"}
     for name, field in model.model_fields.items():
         value = field.default
-        text = str(spelled.get(value, value)) if not isinstance(value, float) or value == float("inf") else f"{value:g}"
+        text = f"{value:g}" if type(value) in (int, float) else yaml.safe_dump(value).splitlines()[0].strip("'")
         assert rows.get(name, "").strip("`") == text, f"{name}: {rows.get(name)!r}, not {text!r}"
