@@ -129,8 +129,8 @@ def split_range(pool: Pool, builder: NDArray[np.void], middle: np.uint32, split:
     index = take_inner(pool)
     pool.inner[index]["axis"] = np.uint8(state["axis"])
     pool.inner[index]["split"] = split
-    pool.count[index]["size"] = np.uint32(end - begin)
-    pool.count[index]["dead"] = np.uint32(state["dead"])
+    pool.counts[index]["size"] = np.uint32(end - begin)
+    pool.counts[index]["dead"] = np.uint32(state["dead"])
     pool.inner[state["node"]]["child"][state["side"]] = index
     push_task(builder, middle, end, index, ONE)
     push_task(builder, begin, middle, index, ZERO)

@@ -67,7 +67,7 @@ def _check_slot(pool: Pool, node: int, side: int, above: int, used: set[int], ba
             np.concatenate([left.points, right.points]),
             np.concatenate([left.live, right.live]),
         )
-        size, dead = int(pool.count[ref]["size"]), int(pool.count[ref]["dead"])
+        size, dead = int(pool.counts[ref]["size"]), int(pool.counts[ref]["dead"])
         if label:
             dead = size if label == LABEL_DEAD else 0
         _require(size == len(tree.points), f"I1: node {ref} counts {size} points and holds {len(tree.points)}")
@@ -77,7 +77,7 @@ def _check_slot(pool: Pool, node: int, side: int, above: int, used: set[int], ba
         _require(bool(ordered), f"I4: node {ref} has points on the wrong side of its split")
         larger = max(len(left.points), len(right.points))
         allowed = np.float32(balance) * np.float32(size - 1)
-        _require(size <= smallest or larger <= allowed, f"I6: node {ref} has {larger} of {size} points on one side")
+        _require(bool(size <= smallest or larger <= allowed), f"I6: node {ref} has {larger} of {size} points on one side")
     inside = (tree.points >= box[:3]).all() and (tree.points <= box[3:]).all()
     _require(bool(inside), f"I3: the box of {ref:#x} does not cover its points")
     _require(label != LABEL_DEAD or not tree.live.any(), f"I5: {ref:#x} is labelled deleted and holds live points")
@@ -101,7 +101,7 @@ def _free_records(pool: Pool) -> set[int]:
     pending, ref = [], int(head["subtree_free"])
     while ref != NIL:
         pending.append(ref)
-        ref = int(pool.count[ref]["size"])
+        ref = int(pool.counts[ref]["size"])
     while pending:
         ref = pending.pop()
         _require(ref not in free, f"record {ref:#x} is free twice")

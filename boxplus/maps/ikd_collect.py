@@ -39,7 +39,6 @@ def nearest_batch(
     points: NDArray[np.float64],
     counts: NDArray[np.int64],
     sq: NDArray[np.float32],
-    ids: NDArray[np.uint32],
     stack: NDArray[np.void],
 ) -> None:
     """The k nearest neighbours of the queries `begin` to `end`, written to the rows of the outputs.
@@ -50,19 +49,22 @@ def nearest_batch(
     k = len(sq)
     width = np.uint32(BUCKET)
     leaf = view.leaf
-    found = 0
+    first = np.uint32(len(stack) - k)
+    found = np.int64(0)
     for row in range(begin, end):
         x, y, z = queries[row, 0], queries[row, 1], queries[row, 2]
         bound = max_sq
         if found == k:
             farthest = np.float32(0)
             for i in range(k):
-                farthest = max(farthest, point_sq(leaf, np.uint32(ids[i] // width), np.uint32(ids[i] % width), x, y, z))
+                point = np.uint32(stack[first + np.uint32(i)]["ref"])
+                farthest = max(farthest, point_sq(leaf, np.uint32(point // width), np.uint32(point % width), x, y, z))
             bound = min(bound, farthest)
-        found = np.int64(knn(view, x, y, z, bound, sq, ids, stack))
+        found = np.int64(knn(view, x, y, z, bound, sq, stack))
         counts[row] = found
         for i in range(found):
-            record, j = leaf[ids[i] // width], np.uint32(ids[i] % width)
+            point = np.uint32(stack[first + np.uint32(i)]["ref"])
+            record, j = leaf[point // width], np.uint32(point % width)
             distances[row, i] = math.sqrt(np.float64(sq[i]))
             points[row, i, 0] = np.float64(record["x"][j]) + origin[0]
             points[row, i, 1] = np.float64(record["y"][j]) + origin[1]

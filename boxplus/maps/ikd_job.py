@@ -108,7 +108,8 @@ class Rebuilder:
 
     def start(self, pool: Pool, node: int, side: int, *, keep_dead: bool) -> None:
         """Begin to rebuild the subtree of a slot. The whole tree is built into arrays of its own, which replace the old."""
-        size = int(slot_counts(pool, np.uint32(node), np.uint32(side))[0])
+        stored, dead = (int(count) for count in slot_counts(pool, np.uint32(node), np.uint32(side)))
+        size = stored if keep_dead else stored - dead
         whole = node == ROOT
         if whole:
             leaves = size // FILL + size // (16 * FILL) + 64

@@ -75,7 +75,7 @@ class Pool(NamedTuple):
     """The arrays that hold a tree."""
 
     inner: NDArray[np.void]
-    count: NDArray[np.void]
+    counts: NDArray[np.void]
     leaf: NDArray[np.void]
     head: NDArray[np.void]
 
@@ -88,7 +88,7 @@ def new_pool(inner: int, leaves: int) -> Pool:
     pool.inner[0] = np.zeros((), INNER)
     pool.inner[0]["child"] = NIL
     pool.inner[0]["box"][:, :3], pool.inner[0]["box"][:, 3:] = np.inf, -np.inf
-    pool.count[0] = 0
+    pool.counts[0] = 0
     head["inner_used"] = 1
     return pool
 
@@ -106,7 +106,7 @@ def reserve(pool: Pool, inner: int, leaves: int) -> None:
     if short > 0:
         size = len(pool.inner) + max(short, len(pool.inner) // 16)
         pool.inner.resize(size, refcheck=False)
-        pool.count.resize(size, refcheck=False)
+        pool.counts.resize(size, refcheck=False)
     short = leaves - (len(pool.leaf) - int(head["leaf_used"])) - int(head["leaf_free_count"])
     if short > 0:
         pool.leaf.resize(len(pool.leaf) + max(short, len(pool.leaf) // 16), refcheck=False)
@@ -124,7 +124,7 @@ def free_subtree(pool: Pool, ref: np.uint32) -> None:
         head["leaf_free"] = index
         head["leaf_free_count"] += ONE
     else:
-        pool.count[ref]["size"] = head["subtree_free"]
+        pool.counts[ref]["size"] = head["subtree_free"]
         head["subtree_free"] = ref
 
 
@@ -133,7 +133,7 @@ def take_apart(pool: Pool) -> None:
     """Free the root of one discarded subtree; its children become discarded subtrees."""
     head = pool.head[0]
     node = head["subtree_free"]
-    head["subtree_free"] = pool.count[node]["size"]
+    head["subtree_free"] = pool.counts[node]["size"]
     child = pool.inner[node]["child"]
     free_subtree(pool, child[0])
     free_subtree(pool, child[1])
@@ -155,7 +155,7 @@ def has_room(pool: Pool, inner: np.uint32, leaves: np.uint32) -> bool:
     """Whether so many nodes can be taken without growing the arrays."""
     sweep(pool, inner, leaves)
     head = pool.head[0]
-    return (
+    return bool(
         len(pool.inner) - np.int64(head["inner_used"]) + np.int64(head["inner_free_count"]) >= inner
         and len(pool.leaf) - np.int64(head["leaf_used"]) + np.int64(head["leaf_free_count"]) >= leaves
     )
@@ -180,7 +180,7 @@ def take_inner(pool: Pool) -> np.uint32:
     record["label"][0] = LABEL_NONE
     record["label"][1] = LABEL_NONE
     record["queued"] = np.uint8(0)
-    return node
+    return np.uint32(node)
 
 
 @kernel
@@ -196,7 +196,7 @@ def take_leaf(pool: Pool) -> np.uint32:
     else:
         index = np.uint32(head["leaf_used"])
         head["leaf_used"] = index + ONE
-    return index
+    return np.uint32(index)
 
 
 @kernel(inline=True)
@@ -233,7 +233,7 @@ def live_bits(pool_leaf: NDArray[np.void], index: np.uint32, label: np.uint8) ->
         return np.uint32(pool_leaf[index]["live"])
     if label == LABEL_DEAD:
         return ZERO
-    return all_bits(np.uint32(pool_leaf[index]["count"]))
+    return np.uint32(all_bits(np.uint32(pool_leaf[index]["count"])))
 
 
 @kernel
@@ -248,8 +248,8 @@ def slot_counts(pool: Pool, node: np.uint32, side: np.uint32) -> tuple[np.uint32
         size = np.uint32(leaf["count"])
         dead = np.uint32(size - count_bits(np.uint32(leaf["live"])))
     else:
-        size = np.uint32(pool.count[ref]["size"])
-        dead = np.uint32(pool.count[ref]["dead"])
+        size = np.uint32(pool.counts[ref]["size"])
+        dead = np.uint32(pool.counts[ref]["dead"])
     if label == LABEL_DEAD:
         dead = size
     elif label == LABEL_LIVE:
@@ -263,4 +263,4 @@ def slot_size(pool: Pool, node: np.uint32, side: np.uint32) -> np.uint32:
     ref = pool.inner[node]["child"][side]
     if ref == NIL:
         return ZERO
-    return np.uint32(pool.leaf[ref & INDEX_MASK]["count"] if ref & LEAF_BIT else pool.count[ref]["size"])
+    return np.uint32(pool.leaf[ref & INDEX_MASK]["count"] if ref & LEAF_BIT else pool.counts[ref]["size"])

@@ -85,10 +85,10 @@ def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside
     if inside:
         return False
     ref = pool.inner[node]["child"][side]
+    above = False
     for i in range(np.uint32(job["ancestors"])):
-        if work.ancestors[i] == ref:
-            return False
-    return True
+        above = above or work.ancestors[i] == ref
+    return not above
 
 
 @kernel
@@ -108,6 +108,7 @@ def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32,
             return NIL, LEFT, ZERO, inside
         if unbalanced(pool, work, ref):
             return node, side, depth, inside
+        pool.inner[ref]["queued"] = np.uint8(0)
         if bit == np.uint64(1):
             return NIL, LEFT, ZERO, inside
         bit >>= np.uint64(1)
@@ -140,7 +141,7 @@ def settle(pool: Pool, work: Work) -> bool:
         if not chosen:
             node, side, depth, inside = find_unbalanced(pool, work, path)
             if node != NIL:
-                size = np.uint32(pool.count[pool.inner[node]["child"][side]]["size"])
+                size = np.uint32(pool.counts[pool.inner[node]["child"][side]]["size"])
                 leaves = np.uint32(np.uint32(2) * size // np.uint32(FILL) + np.uint32(4))
                 if size <= job["in_place"]:
                     keep = not (may_rebuild(pool, work, node, side, inside) and has_room(pool, leaves, leaves))

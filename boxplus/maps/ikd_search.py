@@ -9,6 +9,7 @@ distances do not depend on the shape of the tree (SPEC 10.7).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ def box_sq(box: NDArray[np.float32], side: np.uint32, qx: np.float32, qy: np.flo
     below, above = box[side, 2] - qz, qz - box[side, 5]
     dz = below if below > above else above
     dz = dz if dz > _ZERO_F else _ZERO_F
-    return dx * dx + dy * dy + dz * dz
+    return np.float32(dx * dx + dy * dy + dz * dz)
 
 
 @kernel(inline=True)
@@ -85,7 +86,7 @@ def point_sq(
     """Squared distance to one point of a leaf, to the same bits as the vectorised scan."""
     record = leaf[index]
     dx, dy, dz = record["x"][i] - qx, record["y"][i] - qy, record["z"][i] - qz
-    return dx * dx + dy * dy + dz * dz
+    return np.float32(dx * dx + dy * dy + dz * dz)
 
 
 @kernel
@@ -102,6 +103,12 @@ def precedes(leaf: NDArray[np.void], a: np.uint32, b: np.uint32) -> bool:
     return bool(p["z"][i] < q["z"][j])
 
 
+@kernel(inline=True)
+def comes_before(leaf: NDArray[np.void], sq: np.float32, point: np.uint32, other_sq: np.float32, other: np.uint32) -> bool:
+    """Whether a point is nearer than another, or as near and earlier by (x, y, z)."""
+    return bool(sq < other_sq or (sq == other_sq and precedes(leaf, point, other)))
+
+
 @kernel
 def knn(
     view: IkdView,
@@ -110,7 +117,6 @@ def knn(
     qz: np.float32,
     max_sq: np.float32,
     out_sq: NDArray[np.float32],
-    out_id: NDArray[np.uint32],
     stack: NDArray[np.void],
 ) -> np.int64:
     """The k nearest live points within `max_sq` (inclusive); returns how many there are.
@@ -120,25 +126,35 @@ def knn(
         qx, qy, qz: query, float32, relative to the tree's origin [m].
         max_sq: squared range [m²]; any upper bound on the last distance² is a warm start.
         out_sq: (k,) float32, overwritten with the squared distances, ascending; `max_sq` where there is none.
-        out_id: (k,) uint32, overwritten with the points as leaf · BUCKET + place; NIL where there is none.
-        stack: (STACK_DEPTH,) of STACK, scratch of the calling thread.
+        stack: (at least STACK_DEPTH - 5 + k,) of STACK, scratch of the calling thread; the fields `ref` of its last k rows
+            are overwritten with the points as leaf · BUCKET + place, NIL where there is none.
     """
     inner, leaf = view
     k = len(out_sq)
-    last = k - 1
+    last = np.uint32(k - 1)
+    first = np.uint32(len(stack) - k)
     worst = max_sq
     found = 0
     for i in range(k):
         out_sq[i] = max_sq
-        out_id[i] = NIL
+        stack[first + np.uint32(i)]["ref"] = NIL
     width = np.uint32(BUCKET)
     top = ZERO
     live = ZERO
-    ref = inner[ROOT]["child"][LEFT]
-    if ref == NIL or inner[ROOT]["label"][LEFT] == LABEL_DEAD or box_sq(inner[ROOT]["box"], LEFT, qx, qy, qz) > worst:
-        ref = NIL
-    elif inner[ROOT]["label"][LEFT] == LABEL_LIVE:
-        live = ONE
+    ref, label = np.uint32(inner[ROOT]["child"][LEFT]), np.uint8(inner[ROOT]["label"][LEFT])
+    if not math.isfinite(np.float64(qx) + np.float64(qy) + np.float64(qz)):
+        return np.int64(0)
+    # As long as the ball lies on one side of the split, one comparison a level will do.
+    while ref < LEAF_BIT:
+        axis = inner[ref]["axis"]
+        offset = (qx if axis == 0 else (qy if axis == 1 else qz)) - inner[ref]["split"]
+        if not offset * offset > worst:
+            break
+        side = np.uint32(offset > 0)
+        label = label if label else np.uint8(inner[ref]["label"][side])
+        ref = np.uint32(inner[ref]["child"][side])
+    live = np.uint32(label == LABEL_LIVE)
+    ref = NIL if label == LABEL_DEAD else ref
     while True:
         while ref < LEAF_BIT:
             node = inner[ref]
@@ -177,16 +193,17 @@ def knn(
                 bits &= bits - ONE
                 sq = point_sq(leaf, index, i, qx, qy, qz)
                 new = np.uint32(index * width + i)
-                if sq < worst or (sq == worst and precedes(leaf, new, out_id[last])):
-                    j = last
-                    while j > 0 and (sq < out_sq[j - 1] or (sq == out_sq[j - 1] and precedes(leaf, new, out_id[j - 1]))):
-                        out_sq[j] = out_sq[j - 1]
-                        out_id[j] = out_id[j - 1]
-                        j -= 1
-                    out_sq[j] = sq
-                    out_id[j] = new
-                    worst = out_sq[last]
-                    found += 1
+                place = last
+                if not comes_before(leaf, sq, new, worst, stack[first + last]["ref"]):
+                    continue
+                while place > ZERO and comes_before(leaf, sq, new, out_sq[place - ONE], stack[first + place - ONE]["ref"]):
+                    out_sq[place] = out_sq[place - ONE]
+                    stack[first + place]["ref"] = stack[first + place - ONE]["ref"]
+                    place -= ONE
+                out_sq[place] = sq
+                stack[first + place]["ref"] = new
+                worst = out_sq[last]
+                found += 1
         while True:
             if top == ZERO:
                 ref = NIL
@@ -198,7 +215,7 @@ def knn(
                 break
         if ref == NIL:
             break
-    return min(found, k)
+    return np.int64(min(found, k))
 
 
 @kernel
@@ -211,7 +228,7 @@ def knn5(
     out_xyz: NDArray[np.float32],
     out_sq: NDArray[np.float32],
     stack: NDArray[np.void],
-) -> np.uint32:
+) -> np.int64:
     """The five nearest live points within `max_sq` (inclusive); returns how many there are.
 
     Args:
@@ -222,102 +239,13 @@ def knn5(
         out_sq: (5,) float32, their squared distances; `max_sq` where there is none.
         stack: (STACK_DEPTH,) of STACK, scratch of the calling thread.
     """
-    inner, leaf = view
-    sq0 = sq1 = sq2 = sq3 = sq4 = max_sq
-    id0 = id1 = id2 = id3 = id4 = NIL
-    width = np.uint32(BUCKET)
-    top = ZERO
-    live = ZERO
-    ref = inner[ROOT]["child"][LEFT]
-    if ref == NIL or inner[ROOT]["label"][LEFT] == LABEL_DEAD or box_sq(inner[ROOT]["box"], LEFT, qx, qy, qz) > sq4:
-        ref = NIL
-    elif inner[ROOT]["label"][LEFT] == LABEL_LIVE:
-        live = ONE
-    while True:
-        while ref < LEAF_BIT:
-            node = inner[ref]
-            box, child, label = node["box"], node["child"], node["label"]
-            sq_left = box_sq(box, LEFT, qx, qy, qz)
-            sq_right = box_sq(box, RIGHT, qx, qy, qz)
-            left, right = child[0], child[1]
-            live_left = live_right = live
-            if label[0] | label[1] and not live:
-                left = NIL if label[0] == LABEL_DEAD else left
-                right = NIL if label[1] == LABEL_DEAD else right
-                live_left = np.uint32(label[0] == LABEL_LIVE)
-                live_right = np.uint32(label[1] == LABEL_LIVE)
-            # Two branches rather than one exchange: near the last query the processor guesses the path and runs ahead.
-            if sq_left <= sq_right:
-                if sq_right <= sq4 and right != NIL:
-                    stack[top]["ref"] = right
-                    stack[top]["sq"] = sq_right
-                    stack[top]["live"] = live_right
-                    top += ONE
-                ref = left if sq_left <= sq4 else NIL
-                live = live_left
-            else:
-                if sq_left <= sq4 and left != NIL:
-                    stack[top]["ref"] = left
-                    stack[top]["sq"] = sq_left
-                    stack[top]["live"] = live_left
-                    top += ONE
-                ref = right if sq_right <= sq4 else NIL
-                live = live_right
-        if ref != NIL:
-            index = ref & INDEX_MASK
-            bits = leaf_within(leaf, index, qx, qy, qz, sq4, live)
-            while bits != ZERO:
-                i = lowest_bit(bits)
-                bits &= bits - ONE
-                sq = point_sq(leaf, index, i, qx, qy, qz)
-                new = np.uint32(index * width + i)
-                if sq < sq4 or (sq == sq4 and precedes(leaf, new, id4)):
-                    if sq < sq3 or (sq == sq3 and precedes(leaf, new, id3)):
-                        sq4, id4 = sq3, id3
-                        if sq < sq2 or (sq == sq2 and precedes(leaf, new, id2)):
-                            sq3, id3 = sq2, id2
-                            if sq < sq1 or (sq == sq1 and precedes(leaf, new, id1)):
-                                sq2, id2 = sq1, id1
-                                if sq < sq0 or (sq == sq0 and precedes(leaf, new, id0)):
-                                    sq1, id1 = sq0, id0
-                                    sq0, id0 = sq, new
-                                else:
-                                    sq1, id1 = sq, new
-                            else:
-                                sq2, id2 = sq, new
-                        else:
-                            sq3, id3 = sq, new
-                    else:
-                        sq4, id4 = sq, new
-        while True:
-            if top == ZERO:
-                ref = NIL
-                break
-            top -= ONE
-            if stack[top]["sq"] <= sq4:
-                ref = stack[top]["ref"]
-                live = stack[top]["live"]
-                break
-        if ref == NIL:
-            break
-    out_sq[0], out_sq[1], out_sq[2], out_sq[3], out_sq[4] = sq0, sq1, sq2, sq3, sq4
-    return np.uint32(
-        write_point(leaf, id0, out_xyz, 0)
-        + write_point(leaf, id1, out_xyz, 1)
-        + write_point(leaf, id2, out_xyz, 2)
-        + write_point(leaf, id3, out_xyz, 3)
-        + write_point(leaf, id4, out_xyz, 4)
-    )
-
-
-@kernel(inline=True)
-def write_point(leaf: NDArray[np.void], point: np.uint32, out_xyz: NDArray[np.float32], row: int) -> np.uint32:
-    """Copy a point to a row of the output; returns 0 where there is none."""
-    if point == NIL:
-        return ZERO
-    record = leaf[point // np.uint32(BUCKET)]
-    i = point % np.uint32(BUCKET)
-    out_xyz[row, 0] = record["x"][i]
-    out_xyz[row, 1] = record["y"][i]
-    out_xyz[row, 2] = record["z"][i]
-    return ONE
+    found = knn(view, qx, qy, qz, max_sq, out_sq, stack)
+    first = len(stack) - len(out_sq)
+    for i in range(found):
+        point = np.uint32(stack[first + i]["ref"])
+        record = view.leaf[point // np.uint32(BUCKET)]
+        j = np.uint32(point % np.uint32(BUCKET))
+        out_xyz[i, 0] = record["x"][j]
+        out_xyz[i, 1] = record["y"][j]
+        out_xyz[i, 2] = record["z"][j]
+    return np.int64(found)

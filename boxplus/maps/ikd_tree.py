@@ -209,8 +209,8 @@ class IkdTree:
         view = self.view()
 
         def work(_: int, begin: int, end: int) -> None:
-            sq, ids, stack = np.empty(k, np.float32), np.empty(k, np.uint32), np.empty(STACK_DEPTH, STACK)
-            nearest_batch(view, relative, begin, end, max_sq, self.origin, *result, sq, ids, stack)
+            sq, stack = np.empty(k, np.float32), np.empty(STACK_DEPTH + k, STACK)
+            nearest_batch(view, relative, begin, end, max_sq, self.origin, *result, sq, stack)
 
         run_chunks(work, size, _QUERY_CHUNK, self.threads)
         return result
@@ -289,7 +289,8 @@ class IkdTree:
 
     @property
     def _job(self) -> np.void:
-        return self._rebuilder.work.job[0]
+        job: np.void = self._rebuilder.work.job[0]
+        return job
 
     def _delete(self, boxes: NDArray[np.float32]) -> int:
         deleted = self._update_boxes(boxes, DELETE)

@@ -113,7 +113,7 @@ def push_down(pool: Pool, node: np.uint32, side: np.uint32) -> None:
     else:
         pool.inner[ref]["label"][0] = label
         pool.inner[ref]["label"][1] = label
-        pool.count[ref]["dead"] = pool.count[ref]["size"] if label == LABEL_DEAD else ZERO
+        pool.counts[ref]["dead"] = pool.counts[ref]["size"] if label == LABEL_DEAD else ZERO
 
 
 @kernel
@@ -123,8 +123,8 @@ def pull_up(pool: Pool, node: np.uint32, side: np.uint32) -> None:
     size_left, dead_left = slot_counts(pool, ref, LEFT)
     size_right, dead_right = slot_counts(pool, ref, RIGHT)
     size, dead = np.uint32(size_left + size_right), np.uint32(dead_left + dead_right)
-    pool.count[ref]["size"] = size
-    pool.count[ref]["dead"] = dead
+    pool.counts[ref]["size"] = size
+    pool.counts[ref]["dead"] = dead
     if size == dead:
         pool.inner[node]["label"][side] = LABEL_DEAD
 
@@ -155,11 +155,11 @@ def save_leaf(pool: Pool, work: Work, index: np.uint32, live: np.uint32) -> None
 @kernel
 def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
     """Whether an inner node violates the balance criterion (SPEC 10.4)."""
-    size = np.uint32(pool.count[ref]["size"])
+    size = np.uint32(pool.counts[ref]["size"])
     if size <= work.job[0]["check"]:
         return False
     left = slot_size(pool, ref, LEFT)
-    return max(left, np.uint32(size - left)) > work.job[0]["balance"] * np.float32(size - ONE)
+    return bool(max(left, np.uint32(size - left)) > work.job[0]["balance"] * np.float32(size - ONE))
 
 
 @kernel
@@ -204,7 +204,7 @@ def new_leaf(pool: Pool, stamp: np.uint32) -> np.uint32:
     leaf["count"] = ZERO
     leaf["live"] = ZERO
     leaf["stamp"] = stamp
-    return index
+    return np.uint32(index)
 
 
 @kernel
@@ -228,8 +228,8 @@ def split_leaf(pool: Pool, order: NDArray[np.uint32], node: np.uint32, side: np.
     inner["axis"] = np.uint8(axis)
     inner["split"] = values[order[BUCKET // 2]]
     live = np.uint32(leaf["live"])
-    pool.count[ref]["size"] = np.uint32(BUCKET)
-    pool.count[ref]["dead"] = np.uint32(np.uint32(BUCKET) - count_bits(live))
+    pool.counts[ref]["size"] = np.uint32(BUCKET)
+    pool.counts[ref]["dead"] = np.uint32(np.uint32(BUCKET) - count_bits(live))
     for half in range(2):
         child = np.uint32(half)
         for axis in range(3):
@@ -244,7 +244,7 @@ def split_leaf(pool: Pool, order: NDArray[np.uint32], node: np.uint32, side: np.
             extend_box(pool, ref, child, x, y, z)
     free_subtree(pool, np.uint32(slot["child"][side]))
     slot["child"][side] = ref
-    return ref
+    return np.uint32(ref)
 
 
 @kernel
@@ -276,8 +276,8 @@ def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np
                 put_in_leaf(pool, index, x, y, z, ONE)
                 break
             ref = split_leaf(pool, work.order, node, side)
-        size = np.uint32(pool.count[ref]["size"]) + ONE
-        pool.count[ref]["size"] = size
+        size = np.uint32(pool.counts[ref]["size"]) + ONE
+        pool.counts[ref]["size"] = size
         depth += ONE
         # Only the side that grows can upset the balance of the node above.
         if above > job["check"] and not noted and size > job["balance"] * np.float32(above - ONE):
