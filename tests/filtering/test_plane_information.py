@@ -99,7 +99,9 @@ def test_without_the_extrinsic_only_the_pose_is_measured() -> None:
     assert not b[6:].any()
 
 
-@pytest.mark.parametrize(("metres", "z", "fate"), [(9.0, 0.33, USED), (9.0, 0.34, GATED), (36.0, -0.66, USED), (36.0, -0.67, GATED)])
+@pytest.mark.parametrize(
+    ("metres", "z", "fate"), [(9.0, 0.33, USED), (9.0, 0.34, GATED), (36.0, -0.66, USED), (36.0, -0.67, GATED)]
+)
 def test_the_gate_opens_with_the_root_of_the_range(metres: float, z: float, fate: int) -> None:
     random = np.random.default_rng(1)
     x, point = random_state(random), np.array([[0.0, 0.0, metres]], np.float32)

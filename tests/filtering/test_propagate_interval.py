@@ -35,9 +35,7 @@ def _reference(
         middle = 0.5 * (begin + end)
         after = int(np.searchsorted(time, middle))
         around = [max(after - 1, 0), min(after, len(time) - 1)]
-        propagate_step(
-            packed, cov, gyro[around].mean(axis=0), accel[around].mean(axis=0), end - begin, DENSITY, np.zeros(NODE)
-        )
+        propagate_step(packed, cov, gyro[around].mean(axis=0), accel[around].mean(axis=0), end - begin, DENSITY, np.zeros(NODE))
     return NavState.unpack(packed), cov, bounds
 
 
@@ -80,7 +78,9 @@ def test_a_constant_input_does_not_care_where_the_samples_lie() -> None:
     expected = None
     for time in ([0.05], [-0.01, 0.2], [0.0, 0.1], [-0.05, 0.02, 0.07]):
         n = len(time)
-        state, _, _ = _forward(x, np.eye(TANGENT), np.array(time), np.tile(gyro, (n, 1)), np.tile(accel, (n, 1)), 0.1, max_gap=1.0)
+        state, _, _ = _forward(
+            x, np.eye(TANGENT), np.array(time), np.tile(gyro, (n, 1)), np.tile(accel, (n, 1)), 0.1, max_gap=1.0
+        )
         expected = state if expected is None else expected
         assert np.allclose(state.R_world_imu, expected.R_world_imu, atol=1e-12)
 

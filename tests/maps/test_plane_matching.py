@@ -1,0 +1,141 @@
+"""Matching a scan with planes of the map against brute force (SPEC.md 9.6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from boxplus.filtering.nav_state import NavState
+from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, USED
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_search import STACK, STACK_DEPTH
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
+
+MAX_DISTANCE = 0.8
+THRESHOLD = 0.1
+seeds = st.integers(0, 2**32 - 1)
+
+
+@dataclass
+class Match:
+    neighbours: np.ndarray
+    planes: np.ndarray
+    fate: np.ndarray
+
+
+def _new(count: int) -> Match:
+    return Match(np.zeros((count, NEIGHBOURS, 3), np.float32), np.zeros((count, PLANE)), np.zeros(count, np.uint8))
+
+
+def _match(tree: IkdTree, x: NavState, points: np.ndarray, into: Match | None = None) -> Match:
+    match = into or _new(len(points))
+    match_planes(
+        tree.view(),
+        tree.origin,
+        x.pack(),
+        points,
+        0,
+        len(points),
+        MAX_DISTANCE**2,
+        THRESHOLD,
+        into is not None,
+        match.neighbours,
+        match.planes,
+        match.fate,
+        np.zeros(NEIGHBOURS, np.float32),
+        np.zeros(STACK_DEPTH, STACK),
+    )
+    return match
+
+
+def _corner(seed: int, far: bool = False) -> tuple[IkdTree, np.ndarray, NavState, np.ndarray]:
+    """A map of three rough walls, a state that looks into them, and a scan."""
+    random = np.random.default_rng(seed)
+    walls = [np.insert(random.uniform(0.0, 4.0, (120, 2)), axis, 0.0, axis=1) for axis in range(3)]
+    offset = np.array([3000.0, -2000.0, 100.0]) if far else np.zeros(3)
+    world = np.concatenate(walls) + 0.02 * random.normal(size=(360, 3)) + offset
+    R, R_L = so3.exp(random.normal(size=(2, 3)))
+    zero = np.zeros(3)
+    p_L = 0.2 * random.normal(size=3)
+    x = NavState(R, np.array([2.0, 1.5, 1.0]) + offset, zero, zero, zero, zero, R_L, p_L)
+    seen = world[random.integers(360, size=40)] + 0.1 * random.normal(size=(40, 3))
+    seen[-5:] += 1.0  # in the air, with few neighbours or none
+    points = (((seen - x.p_world_imu) @ R - p_L) @ R_L).astype(np.float32)
+    return IkdTree(world), world, x, points
+
+
+def _world(x: NavState, points: np.ndarray) -> np.ndarray:
+    return (points.astype(np.float64) @ x.R_imu_lidar.T + x.p_imu_lidar) @ x.R_world_imu.T + x.p_world_imu
+
+
+@settings(max_examples=15)
+@given(seeds, st.booleans())
+def test_against_brute_force(seed: int, far: bool) -> None:
+    tree, _, x, points = _corner(seed, far)
+    match = _match(tree, x, points)
+    stored = tree.points()
+    for n, y in enumerate(_world(x, points)):
+        squared = np.sum((stored - y) ** 2, axis=1)
+        nearest = np.argsort(squared)[:NEIGHBOURS]
+        if abs(squared[nearest[-1]] - MAX_DISTANCE**2) < 1e-4:
+            continue
+        if squared[nearest[-1]] > MAX_DISTANCE**2:
+            assert match.fate[n] == FEW_NEIGHBOURS
+            continue
+        five = stored[nearest]
+        found = match.neighbours[n] + tree.origin
+        assert np.allclose(np.sort(np.linalg.norm(found - y, axis=1)), np.sqrt(squared[nearest]), atol=1e-4)
+        centroid = five.mean(axis=0)
+        _, singular, Vt = np.linalg.svd(five - centroid)
+        distance = np.abs((five - centroid) @ Vt[2]).max()
+        if match.fate[n] == NOT_A_PLANE:
+            assert distance > THRESHOLD - 1e-4 or singular[1] < 0.051 * singular[0]
+            continue
+        assert match.fate[n] == USED
+        assert distance < THRESHOLD + 1e-4
+        if singular[1] - singular[2] > 0.05:
+            u = match.planes[n, :3]
+            assert np.isclose(abs(u @ Vt[2]), 1.0, atol=1e-5)
+            assert np.isclose(match.planes[n, 3], u @ centroid, atol=2e-3 if far else 1e-4)
+            assert np.isclose(match.planes[n, 4], singular[2] ** 2 / 2.0, atol=1e-4)
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_the_uncertainty_of_the_normal(seed: int) -> None:
+    tree, _, x, points = _corner(seed)
+    match = _match(tree, x, points)
+    for n in np.flatnonzero(match.fate == USED):
+        plane, five = match.planes[n], match.neighbours[n].astype(np.float64) + tree.origin
+        centroid = five.mean(axis=0)
+        u, g = plane[:3], np.stack([plane[5:8], plane[9:12]])
+        assert np.allclose(g @ u, 0, atol=1e-6 * np.abs(g).max())
+        # Their outer products are the inverse of the scatter of the five points within the plane.
+        inside = (five - centroid) @ (np.eye(3) - np.outer(u, u))
+        assert np.allclose(g.T @ g, np.linalg.pinv(inside.T @ inside, rcond=1e-9), rtol=1e-3, atol=1e-3 * np.abs(g).max() ** 2)
+        assert np.allclose(plane[[8, 12]], g @ centroid, rtol=1e-6, atol=1e-4 * np.abs(g).max())
+
+
+@settings(max_examples=15)
+@given(seeds, st.sampled_from([0.0, 0.01, 0.3]))
+def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float) -> None:
+    tree, _, x, points = _corner(seed)
+    match = _match(tree, x, points)
+    shift = np.zeros(24)
+    shift[:6] = moved * np.random.default_rng(seed + 1).normal(size=6)
+    elsewhere = x.boxplus(shift)
+    warm, cold = _match(tree, elsewhere, points, into=match), _match(tree, elsewhere, points)
+    assert np.array_equal(warm.fate, cold.fate)
+    matched = cold.fate != FEW_NEIGHBOURS
+    assert np.array_equal(warm.neighbours[matched], cold.neighbours[matched])
+    used = cold.fate == USED
+    assert np.array_equal(warm.planes[used], cold.planes[used])
+
+
+def test_an_empty_map_has_no_planes() -> None:
+    points = np.ones((3, 3), np.float32)
+    assert np.all(_match(IkdTree(), NavState.identity(), points).fate == FEW_NEIGHBOURS)

@@ -1,0 +1,208 @@
+"""Whatever arrives, in whatever order: every scan is in one frame or counted, and so is every IMU sample."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame, Sequencer
+
+MS = 1_000_000
+T0 = 1_700_000_000_000_000_000
+
+
+def _imu(*times_ms: float, gyro: float = 0.0) -> ImuSamples:
+    time = T0 + np.round(np.array(times_ms) * MS).astype(np.int64)
+    return ImuSamples.from_arrays(time, np.full((len(time), 3), gyro), np.tile([0.0, 0.0, 9.81], (len(time), 1)))
+
+
+def _scan(begin_ms: float, end_ms: float, points: int = 3) -> Scan:
+    time = T0 + np.round(np.linspace(begin_ms, end_ms, points) * MS).astype(np.int64)
+    return Scan.from_arrays(np.ones((points, 3)), time)
+
+
+def _check(frame: Frame) -> None:
+    end = frame.scan.end_ns
+    time = frame.imu.time_ns
+    assert len(time)
+    assert np.all(np.diff(time) > 0)
+    assert np.isfinite(frame.imu.gyro).all()
+    assert np.isfinite(frame.imu.accel).all()
+    assert frame.covered == bool(time[-1] >= end)
+    # From the last one at or before the begin to the first one at or after the end.
+    assert np.sum(time <= frame.begin_ns) <= 1
+    assert np.sum(time >= end) <= 1
+    assert frame.largest_gap_s >= 0.0
+    inside = np.diff(time)[(time[1:] > frame.begin_ns) & (time[:-1] < end)]
+    assert frame.largest_gap_s >= inside.max(initial=0) * 1e-9 - 1e-12
+
+
+class SequencerMachine(RuleBasedStateMachine):
+    """Blocks of samples and scans with every fault there is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.frames: list[Frame] = []
+        self.offered_scans = 0
+        self.offered_samples = 0
+        self.kept_samples: set[int] = set()
+
+    @initialize(wait=st.sampled_from([0.05, 0.5]))
+    def begin(self, wait: float) -> None:
+        self.sequencer = Sequencer(max_wait_s=wait)
+        self.now = 0.0
+
+    @rule(
+        steps=st.lists(st.sampled_from([5.0, 5.0, 5.0, 0.0, -7.0, 400.0, 20_000.0]), min_size=1, max_size=12),
+        bad=st.sets(st.integers(0, 11), max_size=2),
+    )
+    def imu(self, steps: list[float], bad: set[int]) -> None:
+        samples = _imu(*(self.now + np.cumsum(steps)))
+        for row in bad & set(range(len(samples))):
+            samples.gyro[row, row % 3] = [np.nan, np.inf][row % 2]
+        self.offered_samples += len(samples)
+        self.now += sum(step for step in steps if step < 1000.0)
+        self.sequencer.add_imu(samples)
+
+    @rule(
+        lag=st.sampled_from([0.0, 0.0, 30.0, -40.0, 300.0, 30_000.0, -1000.0]),
+        length=st.sampled_from([0.0, 20.0, 100.0]),
+        points=st.sampled_from([0, 1, 3]),
+    )
+    def scan(self, lag: float, length: float, points: int) -> None:
+        self.offered_scans += 1
+        self.sequencer.add_scan(_scan(self.now - length - lag, self.now - lag, points))
+
+    @rule(flush=st.booleans())
+    def take(self, flush: bool) -> None:
+        self.frames += self.sequencer.frames(flush=flush)
+
+    @invariant()
+    def frames_are_whole_and_in_order(self) -> None:
+        ends = [frame.scan.end_ns for frame in self.frames]
+        assert all(a < b for a, b in zip(ends, ends[1:], strict=False))
+        for before, frame in zip(self.frames, self.frames[1:], strict=False):
+            assert frame.begin_ns == before.scan.end_ns
+        for frame in self.frames:
+            _check(frame)
+
+    def teardown(self) -> None:
+        if not hasattr(self, "sequencer"):
+            return
+        self.frames += self.sequencer.frames(flush=True)
+        self.frames_are_whole_and_in_order()
+        counted = {
+            kind: sum(n for reason, n in self.sequencer.rejected.items() if reason.startswith(kind)) for kind in ("scan", "IMU")
+        }
+        assert sum(counted.values()) == self.sequencer.rejected.total()
+        assert len(self.frames) + counted["scan"] == self.offered_scans
+        assert len({id(frame.scan) for frame in self.frames}) == len(self.frames)
+        seen = np.unique(np.concatenate([np.zeros(0, np.int64), *(frame.imu.time_ns for frame in self.frames)]))
+        assert len(seen) + counted["IMU"] <= self.offered_samples
+        assert self.sequencer.frames(flush=True) == []
+
+
+SequencerMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=25)
+TestSequencer = SequencerMachine.TestCase
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_frames_do_not_depend_on_how_the_stream_is_cut(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.uniform(2.0, 8.0, 200))
+    scans = [_scan(begin, begin + 95.0) for begin in np.arange(10.0, times[-1] - 100.0, 100.0)]
+    whole = Sequencer()
+    whole.add_imu(_imu(*times))
+    for scan in scans:
+        whole.add_scan(scan)
+    expected = whole.frames()
+    pieces, found, pending = Sequencer(), [], list(scans)
+    for block in np.split(times, np.sort(random.integers(0, 200, 30))):
+        pieces.add_imu(_imu(*block))
+        while pending and len(block) and pending[0].end_ns <= T0 + block[-1] * MS:
+            pieces.add_scan(pending.pop(0))
+        found += pieces.frames()
+    for scan in pending:
+        pieces.add_scan(scan)
+    found += pieces.frames()
+    assert len(found) == len(expected) == len(scans)
+    for one, other in zip(found, expected, strict=True):
+        assert one.scan is other.scan
+        assert np.array_equal(one.imu.time_ns, other.imu.time_ns)
+        assert (one.begin_ns, one.covered, one.largest_gap_s) == (other.begin_ns, other.covered, other.largest_gap_s)
+
+
+def test_a_scan_waits_for_the_samples_that_cover_it() -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(0, 50, 99))
+    sequencer.add_scan(_scan(0, 100))
+    assert sequencer.frames() == []
+    sequencer.add_imu(_imu(101, 105))
+    (frame,) = sequencer.frames()
+    assert frame.covered
+    assert (frame.imu.time_ns - T0).tolist() == [0, 50 * MS, 99 * MS, 101 * MS]
+    assert frame.largest_gap_s == pytest.approx(0.05)
+
+
+def test_it_does_not_wait_for_ever() -> None:
+    sequencer = Sequencer(max_wait_s=0.5)
+    sequencer.add_imu(_imu(0, 50))
+    for index in range(6):
+        sequencer.add_scan(_scan(100 * index, 100 * index + 99))
+    (frame,) = sequencer.frames()
+    assert not frame.covered
+    assert frame.largest_gap_s == pytest.approx(0.05)
+
+
+def test_the_end_of_the_data_releases_everything() -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(0, 5))
+    sequencer.add_scan(_scan(0, 100))
+    assert sequencer.frames() == []
+    (frame,) = sequencer.frames(flush=True)
+    assert not frame.covered
+    assert frame.largest_gap_s == pytest.approx(0.095)
+
+
+def test_every_fault_is_counted_by_its_name() -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(0, 5, 5, 3, 10))
+    sequencer.add_imu(_imu(20, gyro=np.nan))
+    sequencer.add_imu(_imu(99_000))
+    for scan in (_scan(0, 8), _scan(0, 8), _scan(0, 7), _scan(0, 9, 0), _scan(90_000, 90_100)):
+        sequencer.add_scan(scan)
+    assert sequencer.rejected == {
+        "IMU sample with a repeated time": 1,
+        "IMU sample going back in time": 1,
+        "IMU sample not finite": 1,
+        "IMU sample jumping ahead in time": 1,
+        "scan with a repeated time": 1,
+        "scan going back in time": 1,
+        "scan without a valid point": 1,
+        "scan jumping ahead in time": 1,
+    }
+    assert [frame.scan.end_ns for frame in sequencer.frames()] == [T0 + 8 * MS]
+
+
+def test_a_jump_that_lasts_is_the_new_time() -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(0, 5, 10))
+    later = 60_000.0 + 5.0 * np.arange(30)
+    sequencer.add_imu(_imu(*later))
+    assert sequencer.rejected == {"IMU sample not finite": 0, "IMU sample jumping ahead in time": 10}
+    sequencer.add_scan(_scan(60_060, 60_100))
+    (frame,) = sequencer.frames()
+    assert frame.covered
+
+
+def test_without_any_sample_a_scan_is_counted() -> None:
+    sequencer = Sequencer()
+    sequencer.add_scan(_scan(0, 100))
+    assert sequencer.frames(flush=True) == []
+    assert sequencer.rejected["scan without any IMU sample"] == 1
