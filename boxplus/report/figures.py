@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from boxplus.report.palette import FAINT, GRID, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
+from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
 from boxplus.report.run_data import RunData
 from boxplus.systems.estimate import AXES
 
@@ -32,7 +32,7 @@ def map_and_trajectory(data: RunData) -> go.Figure:
             marker={
                 "size": 1.5,
                 "color": points[:, 2],
-                "colorscale": "Viridis",
+                "colorscale": list(HEIGHT),
                 "cmin": float(low),
                 "cmax": float(high),
                 "opacity": 0.75,
@@ -41,7 +41,7 @@ def map_and_trajectory(data: RunData) -> go.Figure:
         )
     rows = shown_rows(data)
     path, seconds, status = data.position[rows], data.seconds[rows], data.status[rows]
-    line = {"color": "#1b1b1b", "width": 3}
+    line = {"color": STATUS["ok"], "width": 6}
     figure.add_scatter3d(x=path[:, 0], y=path[:, 1], z=path[:, 2], mode="lines", name="trajectory", hoverinfo="skip", line=line)
     for name, color in STATUS.items():
         here = status == name
@@ -52,7 +52,7 @@ def map_and_trajectory(data: RunData) -> go.Figure:
                 z=path[here, 2],
                 mode="markers",
                 name=f"{name} ({int((data.status == name).sum())})",
-                marker={"size": 2.5 if name == "ok" else 4.5, "color": color},
+                marker={"size": 3.5 if name == "ok" else 5.5, "color": color},
                 customdata=seconds[here],
                 hovertemplate=f"{name}, %{{customdata:.1f}} s<br>(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m<extra></extra>",
             )
@@ -71,7 +71,7 @@ def map_and_trajectory(data: RunData) -> go.Figure:
         scene={
             "aspectmode": "data",
             "dragmode": "orbit",
-            "camera": {"eye": {"x": -1.05, "y": -1.05, "z": 1.05}},
+            "camera": {"eye": {"x": -0.85, "y": -0.85, "z": 1.5}},
             **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
         },
     )

@@ -167,7 +167,7 @@ def _weak_table(data: RunData) -> str:
         return ""
     rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.scans}", i.text) for i in intervals[:200]]
     table = _table(rows, ("time", "status", "scans", "at its beginning"))
-    return f"<details><summary>{len(intervals)} intervals that were not ok</summary>{table}</details>"
+    return f"<details><summary>Intervals that were not ok: {len(intervals)}</summary>{table}</details>"
 
 
 def _timing_text(data: RunData) -> str:

@@ -11,6 +11,8 @@ STATUS = {"ok": "#2f7d5b", "weak": "#e09f3e", "lost": "#c1443c"}
 XYZ = ("#b5443c", "#3a8f4d", "#3568a8")
 """Of the axes x, y and z."""
 SERIES = ("#3568a8", "#e09f3e", "#2f7d5b", "#9b5aa5", "#c1443c", "#6b7a8f", "#5fa8a0", "#a5813c")
+HEIGHT = ("#c9d3dc", "#93abc2", "#5c7594", "#33415c")
+"""Of the map, from low to high: quiet, so that the trajectory stands out."""
 REJECTED = ("#e09f3e", "#c1443c", "#9b5aa5", "#6b7a8f", "#3568a8", "#a5813c")
 INK, FAINT, GRID = "#22303c", "#6b7a8f", "#e4e8ec"
 

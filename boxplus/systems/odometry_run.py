@@ -306,7 +306,8 @@ class _Run:
             ),
             peak_memory_mb=_peak_memory_mb(),
             warnings=[
-                *self._statistics.warnings.facts(origin),
+                *statistics.status_warnings(),
+                *statistics.warnings.facts(origin),
                 *(
                     WarningFacts(text=f"{e.key}: {e.text}", count=1)
                     for e in info.evidence

@@ -146,14 +146,26 @@ class RunStatistics:
                 self._weak[-1] = last.model_copy(update={"end_s": since_s, "scans": last.scans + 1})
             elif len(self._weak) < _MOST_ENTRIES:
                 if estimate.status == "lost":
-                    text = "no update was possible: too few points on known planes; the motion is predicted from the IMU alone"
+                    text = "had too few points on known planes for an update: the motion is predicted from the IMU alone"
                 else:
                     text = "; ".join(
                         f"{d} ({d.information_share:.2%} of the points' information)" for d in estimate.weak_directions
                     )
-                    text = f"not determined by the LiDAR: {text}"
+                    text = f"was not determined by the LiDAR in its {text}"
                 self._weak.append(WeakInterval(begin_s=since_s, end_s=since_s, status=estimate.status, scans=1, text=text))
         self._previous_status = estimate.status
+
+    def status_warnings(self) -> list[WarningFacts]:
+        """One warning for each status other than ok, with its longest interval."""
+        found = []
+        for status in ("weak", "lost"):
+            intervals = [interval for interval in self._weak if interval.status == status]
+            if intervals:
+                longest = max(intervals, key=lambda interval: interval.scans)
+                count, when = self.status[status], f"{longest.begin_s:.1f} to {longest.end_s:.1f} s"
+                text = f"{count} of {self.scans} scans are {status}; the longest stretch, from {when}, {longest.text}"
+                found.append(WarningFacts(text=text, count=1, first_s=intervals[0].begin_s))
+        return found
 
     @property
     def duration_s(self) -> float:

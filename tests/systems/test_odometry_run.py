@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -265,6 +266,16 @@ def test_gaps_are_found(tmp_path: Path) -> None:
     assert [round(gap.duration_s, 1) for gap in summary.imu_gaps] == [0.5]
     assert summary.scan_gaps == []
     assert any("IMU gap of" in warning.text and warning.count > 1 for warning in summary.warnings)
+
+
+def test_corridor_says_what_was_not_measured(tmp_path: Path) -> None:
+    config = load_run_config(settings=["weak_threshold=0.1"])
+    summary = run_odometry(as_recording(simulate("corridor", duration_s=6.0, lidar=LIDAR)), tmp_path / "out", config)
+    assert summary.status["weak"] > 0.8 * summary.scans
+    text = summary.warnings[0].text
+    assert re.match(rf"{summary.status['weak']} of {summary.scans} scans are weak; the longest stretch, from ", text)
+    assert "was not determined by the LiDAR in its " in text
+    assert "position along (" in text
 
 
 def test_view_sees_every_estimate(tmp_path: Path) -> None:
