@@ -131,7 +131,7 @@ def propagate_interval(
     now = 0.0
     count = 0
     upper = 0
-    while now < duration:
+    while now < duration or count == 0:  # a scan of one instant has a node too
         while upper < n and imu_time[upper] <= now:
             upper += 1
         end = duration if upper >= n else min(duration, imu_time[upper])
