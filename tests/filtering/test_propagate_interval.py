@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,7 +33,7 @@ def _reference(
     """The same in the words of SPEC.md 9.5: the mean of the two samples around each step, the nearest one outside of them."""
     bounds = [0.0, *[t for t in time if 0.0 < t < duration], duration]
     packed, cov = x.pack(), cov.copy()
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in pairwise(bounds):
         middle = 0.5 * (begin + end)
         after = int(np.searchsorted(time, middle))
         around = [max(after - 1, 0), min(after, len(time) - 1)]
@@ -130,3 +132,12 @@ def test_thousands_of_steps_leave_a_rotation() -> None:
         x, cov, _ = _forward(x, cov, time, 5.0 * random.normal(size=(21, 3)), random.normal(size=(21, 3)), 0.1)
     assert so3.is_rotation(x.R_world_imu, 1e-13)
     assert so3.is_rotation(x.R_imu_lidar, 1e-13)
+
+
+def test_an_interval_without_length_has_a_node_and_changes_nothing() -> None:
+    random = np.random.default_rng(3)
+    x, cov = random_state(random), random_covariance(random)
+    state, covariance, nodes = _forward(x, cov, np.array([-0.1, 0.1]), np.ones((2, 3)), np.ones((2, 3)), 0.0)
+    assert len(nodes) == 1
+    assert np.allclose(state.pack(), x.pack(), atol=1e-14)
+    assert np.allclose(covariance, cov, rtol=1e-12)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -85,8 +87,8 @@ class SequencerMachine(RuleBasedStateMachine):
     @invariant()
     def frames_are_whole_and_in_order(self) -> None:
         ends = [frame.scan.end_ns for frame in self.frames]
-        assert all(a < b for a, b in zip(ends, ends[1:], strict=False))
-        for before, frame in zip(self.frames, self.frames[1:], strict=False):
+        assert all(a < b for a, b in pairwise(ends))
+        for before, frame in pairwise(self.frames):
             assert frame.begin_ns == before.scan.end_ns
         for frame in self.frames:
             _check(frame)
