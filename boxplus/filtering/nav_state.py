@@ -116,10 +116,12 @@ def check_transform(name: str, T: object) -> NDArray[np.float64]:
     rotation_ok = np.isfinite(matrix).all() and so3.is_rotation(matrix[:3, :3], tolerance=1e-3)
     if not rotation_ok or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
         R_given = matrix[:3, :3]
-        deviation = np.abs(R_given.T @ R_given - np.eye(3)).max() if np.isfinite(matrix).all() else np.nan
+        finite = bool(np.isfinite(matrix).all())
+        deviation = np.abs(R_given.T @ R_given - np.eye(3)).max() if finite else np.nan
+        determinant = np.linalg.det(R_given) if finite else np.nan
         raise InputError(
             f"{name} with an orthonormal rotation of determinant +1 and last row 0 0 0 1",
-            f"RᵀR off by {deviation:.2g}, determinant {np.linalg.det(R_given):.3g}, last row {matrix[3].tolist()}",
+            f"RᵀR off by {deviation:.2g}, determinant {determinant:.3g}, last row {matrix[3].tolist()}",
             "check the order of the numbers (row-major) and that all digits were copied",
         )
     clean = matrix.copy()
