@@ -207,6 +207,9 @@ class LidarInertialOdometry:
         if not lost or len(self.map) == 0:
             self._insert(map_points)
         clock.lap("map insertion")
+        rejected = dict(measurement.rejected())
+        if lost and information is not None and information.used:
+            rejected["scan without an update"] = information.used
         status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
         return self._estimate(
             frame,
@@ -216,7 +219,7 @@ class LidarInertialOdometry:
             share=np.zeros(6) if lost else _lidar_share(cov_prior, self._cov),
             points_filtered=len(points),
             points_used=information.used if information is not None and not lost else 0,
-            rejected=measurement.rejected(),
+            rejected=rejected,
             residual_rms=information.residual_rms if information is not None else 0.0,
             iterations=steps,
             converged=converged,
