@@ -262,12 +262,18 @@ def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np
     noted = False
     while True:
         extend_box(pool, node, side, x, y, z)
-        inside = inside or (running and node == job["node"] and side == job["side"])
         push_down(pool, node, side)
         ref = np.uint32(pool.inner[node]["child"][side])
         if ref == NIL:
             ref = np.uint32(new_leaf(pool, ZERO) | LEAF_BIT)
             pool.inner[node]["child"][side] = ref
+        size = np.uint32(slot_size(pool, node, side) + ONE)
+        if above > job["check"] and not noted and max(size, np.uint32(above - size)) > job["balance"] * np.float32(above - ONE):
+            noted = True
+            if not inside:
+                note_unbalanced(pool, work, node, path >> np.uint64(1))
+        above = size
+        inside = inside or (running and node == job["node"] and side == job["side"])
         if ref & LEAF_BIT:
             index = np.uint32(ref & INDEX_MASK)
             if inside and job["phase"] == COPYING:
@@ -276,15 +282,8 @@ def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np
                 put_in_leaf(pool, index, x, y, z, ONE)
                 break
             ref = split_leaf(pool, work.order, node, side)
-        size = np.uint32(pool.counts[ref]["size"]) + ONE
-        pool.counts[ref]["size"] = size
+        pool.counts[ref]["size"] += ONE
         depth += ONE
-        # Only the side that grows can upset the balance of the node above.
-        if above > job["check"] and not noted and size > job["balance"] * np.float32(above - ONE):
-            if not inside:
-                note_unbalanced(pool, work, node, path >> np.uint64(1))
-            noted = True
-        above = size
         axis = pool.inner[ref]["axis"]
         value = x if axis == 0 else (y if axis == 1 else z)
         node = ref

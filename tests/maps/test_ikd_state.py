@@ -139,8 +139,8 @@ def test_trees_agree_with_brute_force(in_place: int, monkeypatch: pytest.MonkeyP
     run_state_machine_as_test(
         TreesAgainstBruteForce,
         settings=settings(
-            max_examples=40 if compiled else 2,
-            stateful_step_count=25 if compiled else 5,
+            max_examples=20 if compiled else 2,
+            stateful_step_count=20 if compiled else 5,
             deadline=None,
             suppress_health_check=list(HealthCheck),
         ),
