@@ -34,7 +34,7 @@ class ImuSamples:
             accel: (N, 3) or (3,), m/s².
 
         Raises:
-            InputError: wrong shape, or times that are not integers.
+            InputError: wrong shape, values that are not numbers, or times that are not integers.
         """
         time = np.atleast_1d(np.asarray(time_ns))
         if time.ndim != 1 or time.dtype.kind not in "iu":
@@ -45,14 +45,14 @@ class ImuSamples:
             )
         vectors = []
         for name, values in (("gyro", gyro), ("accel", accel)):
-            array = np.atleast_2d(np.asarray(values, dtype=np.float64))
-            if array.shape != (time.size, 3):
+            array = np.atleast_2d(np.asarray(values))
+            if array.shape != (time.size, 3) or array.dtype.kind not in "fiu":
                 raise InputError(
-                    f"{name} of shape ({time.size}, 3), one row per time stamp",
-                    f"shape {np.shape(values)}",
+                    f"{name} as numbers of shape ({time.size}, 3), one row per time stamp",
+                    f"{array.dtype} of shape {np.shape(values)}",
                     "give one row (x, y, z) for every entry of time_ns",
                 )
-            vectors.append(np.ascontiguousarray(array))
+            vectors.append(np.ascontiguousarray(array, dtype=np.float64))
         return cls(time.astype(np.int64), vectors[0], vectors[1])
 
     def __len__(self) -> int:

@@ -67,13 +67,14 @@ class Scan:
         time = time.astype(np.int64, copy=False)
         strength = None
         if intensity is not None:
-            strength = np.asarray(intensity, dtype=np.float32)
-            if strength.shape != (len(points),):
+            given = np.asarray(intensity)
+            if given.shape != (len(points),) or given.dtype.kind not in "fiu":
                 raise InputError(
-                    f"intensity of shape ({len(points)},), one per point",
-                    f"shape {strength.shape}",
+                    f"intensity as numbers of shape ({len(points)},), one per point",
+                    f"{given.dtype} of shape {given.shape}",
                     "give one value per point or None",
                 )
+            strength = given.astype(np.float32)
         xyz = points.astype(np.float32, copy=False)
         squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
         not_finite = ~np.isfinite(squared)

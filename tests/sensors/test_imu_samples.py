@@ -38,8 +38,19 @@ def test_no_samples() -> None:
     [
         ([0.0, 0.1], np.zeros((2, 3)), np.zeros((2, 3)), "expected time_ns as integer nanoseconds of shape (N,) – got float64"),
         ([[0, 1]], np.zeros((2, 3)), np.zeros((2, 3)), "got int64 of shape (1, 2) – convert seconds with np.round"),
-        ([0, 1], np.zeros((3, 2)), np.zeros((2, 3)), "expected gyro of shape (2, 3), one row per time stamp – got shape (3, 2)"),
-        ([0, 1], np.zeros((2, 3)), np.zeros(3), "expected accel of shape (2, 3), one row per time stamp – got shape (3,)"),
+        (
+            [0, 1],
+            np.zeros((3, 2)),
+            np.zeros((2, 3)),
+            "expected gyro as numbers of shape (2, 3), one row per time stamp – got float64 of shape (3, 2)",
+        ),
+        (
+            [0, 1],
+            np.zeros((2, 3)),
+            np.zeros(3),
+            "expected accel as numbers of shape (2, 3), one row per time stamp – got float64 of shape (3,)",
+        ),
+        ([0], [["a", "b", "c"]], np.zeros(3), "expected gyro as numbers of shape (1, 3), one row per time stamp – got <U1"),
     ],
 )
 def test_wrong_shapes_are_explained(time: object, gyro: object, accel: object, message: str) -> None:

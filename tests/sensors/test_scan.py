@@ -66,7 +66,13 @@ def test_an_empty_scan() -> None:
         ([["a", "b", "c"]], [0], None, "expected p_lidar as numbers"),
         (np.ones((2, 3)), [0.0, 0.1], None, "expected time_ns as integer nanoseconds of shape (2,), one per point – got float64"),
         (np.ones((2, 3)), [0], None, "got int64 of shape (1,) – give every point its own absolute time"),
-        (np.ones((2, 3)), [0, 1], [1.0], "expected intensity of shape (2,), one per point – got shape (1,)"),
+        (
+            np.ones((2, 3)),
+            [0, 1],
+            [1.0],
+            "expected intensity as numbers of shape (2,), one per point – got float64 of shape (1,)",
+        ),
+        (np.ones((1, 3)), [0], [1j], "expected intensity as numbers of shape (1,), one per point – got complex128 of shape (1,)"),
     ],
 )
 def test_wrong_shapes_are_explained(points: object, time: object, intensity: object, message: str) -> None:
