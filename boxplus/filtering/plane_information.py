@@ -11,7 +11,7 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 
 # What became of a point.
-USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED = 0, 1, 2, 3
+USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED, ONE_LINE = 0, 1, 2, 3, 4
 MEASURED_DOF = 12
 
 

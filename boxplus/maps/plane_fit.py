@@ -17,7 +17,8 @@ COLLINEAR_RATIO = 0.05
 def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float, plane: NDArray[np.float64]) -> bool:
     """Fit a plane to `points[:count]` (n, 3); False if they are coincident, collinear or off the plane by `max_distance`.
 
-    `plane` (8,) receives the unit normal u, the offset uᵀq, the centroid q, and the variance of the points about the plane.
+    `plane` (9,) receives the unit normal u, the offset uᵀq, the centroid q, the variance of the points about the plane, and
+    their sum of squares across their longest extent within it.
     """
     qx, qy, qz = 0.0, 0.0, 0.0
     for i in range(count):
@@ -74,4 +75,5 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
     plane[3] = ux * qx + uy * qy + uz * qz
     plane[4], plane[5], plane[6] = qx, qy, qz
     plane[7] = max(smallest, 0.0) / max(count - 3, 1)
+    plane[8] = middle
     return True

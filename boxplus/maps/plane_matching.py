@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
-from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, USED
+from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
 from boxplus.maps.ikd_search import IkdView, knn5
 from boxplus.maps.plane_fit import fit_plane_into
 
@@ -17,6 +17,11 @@ NEIGHBOURS = 5
 # A matched plane: unit normal u (0 to 2), offset uᵀq in the world (3), variance of its points about it (4), and twice a
 # vector g with its offset gᵀq (5 to 8, 9 to 12): the uncertainty of the normal, see `_normal_uncertainty`.
 PLANE = 13
+# Where one ring of the LiDAR alone has seen a surface, the five points lie on a line, and range noise makes them span the
+# plane of the beams: it would tie the sensor to its own scan pattern. Far away, where such a plane has the longest lever and
+# the rings lie far apart, the neighbours must spread across their longest extent by this sum of squares [m²].
+_MIN_SPREAD = 0.1
+_FAR = 15.0  # m
 # A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
 _SLACK = 1.0 + 1e-5
 
@@ -49,10 +54,10 @@ def match_planes(
         warm: `neighbours` holds the result of an earlier call on the same map: their distances bound the search.
         neighbours: (n, 5, 3), relative to `origin`.
         planes: (n, PLANE) receives the planes.
-        fate: (n,) receives USED, FEW_NEIGHBOURS or NOT_A_PLANE.
+        fate: (n,) receives USED, FEW_NEIGHBOURS, NOT_A_PLANE or ONE_LINE.
         found_sq, stack: scratch of the calling thread.
     """
-    fit = np.empty(8)
+    fit = np.empty(9)
     for n in range(begin, end):
         lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
         sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
@@ -76,8 +81,15 @@ def match_planes(
         if not fit_plane_into(near, NEIGHBOURS, plane_threshold, fit):
             fate[n] = NOT_A_PLANE
             continue
-        fate[n] = USED
         ux, uy, uz = fit[0], fit[1], fit[2]
+        rx = x[R] * (sx - x[PL]) + x[R + 1] * (sy - x[PL + 1]) + x[R + 2] * (sz - x[PL + 2])
+        ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
+        rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
+        range_sq = rx * rx + ry * ry + rz * rz
+        if fit[8] < _MIN_SPREAD * min(1.0, range_sq * range_sq / _FAR**4):
+            fate[n] = ONE_LINE
+            continue
+        fate[n] = USED
         plane = planes[n]
         plane[0], plane[1], plane[2] = ux, uy, uz
         plane[3] = fit[3] + ux * origin[0] + uy * origin[1] + uz * origin[2]

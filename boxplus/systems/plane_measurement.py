@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
-from boxplus.filtering.plane_information import FEW_NEIGHBOURS, GATED, MEASURED_DOF, NOT_A_PLANE, USED, accumulate_planes
+from boxplus.filtering.plane_information import (
+    FEW_NEIGHBOURS,
+    GATED,
+    MEASURED_DOF,
+    NOT_A_PLANE,
+    ONE_LINE,
+    USED,
+    accumulate_planes,
+)
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
@@ -23,6 +31,7 @@ REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
     NOT_A_PLANE: "neighbours not on a plane",
     GATED: "too far from the plane",
+    ONE_LINE: "neighbours along one scan line",
 }
 
 
@@ -98,7 +107,7 @@ class PlaneMeasurement:
 
     def rejected(self) -> Mapping[str, int]:
         """Points that were not used, by reason."""
-        counts = np.bincount(self._fate, minlength=4)
+        counts = np.bincount(self._fate, minlength=5)
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
 
     def used_mask(self) -> NDArray[np.bool_]:

@@ -36,8 +36,7 @@ _REST_GYRO_STD = 0.1  # rad/s, SPEC.md 9.4
 _REST_ACCEL_STD = 0.5  # m/s²
 _REST_ACCEL_NORM = (9.0, 10.6)
 _REST_MISFIT = (1.25, 0.005)  # at rest, aligning the last scan gains no more than this factor and this much [m] ...
-_REST_MISFIT_MAX = 0.08  # ... it fits to this [m] ...
-_REST_MATCHED = 0.5  # ... with this share of its points
+_REST_MISFIT_MAX = 0.08  # ... and it fits to this [m]
 _REST_SCANS = 3
 _MIN_MOVING_SCANS = 8
 
@@ -102,17 +101,16 @@ def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState)
     for frame in frames[:_REST_SCANS]:
         p_imu = voxel_filter(frame.scan.p_lidar)[1] @ extrinsic.R_imu_lidar.T + extrinsic.p_imu_lidar
         tree.insert(p_imu, downsample=True)
-    unmoved, aligned, points_seen = [], [], 0
+    unmoved, aligned = [], []
     for frame in frames[-_REST_SCANS:]:
         points = voxel_filter(frame.scan.p_lidar)[0]
-        points_seen += len(points)
         x = extrinsic.pack()
         unmoved.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
         align(points, tree, x, config)
         aligned.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
     factor, margin = _REST_MISFIT
     off, best = (float(np.mean([i.residual_rms for i in group])) for group in (unmoved, aligned))
-    kept = sum(i.used for i in unmoved) >= max(0.9 * sum(i.used for i in aligned), _REST_MATCHED * points_seen)
+    kept = sum(i.used for i in unmoved) >= max(0.9 * sum(i.used for i in aligned), config.min_points * len(unmoved))
     return bool(kept and off <= min(factor * best + margin, _REST_MISFIT_MAX)), off, best
 
 
