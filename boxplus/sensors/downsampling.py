@@ -33,25 +33,40 @@ def voxel_centroids(
 ) -> int:
     """Centroids of the occupied voxels, in the order in which the voxels are first seen; returns their number.
 
+    Returns −1 when the table would be more than half full; call again with a larger one.
+
     Args:
         points: (n, 3); inverse_size: one over the voxel's side [1/m].
-        table: (power of two ≥ 2 n,) filled with −1; keys: (n,), sums: (n, 3), counts: (n,) scratch.
+        table: (a power of two,) filled with −1; keys: (n,), sums: (n, 3), counts: (n,) scratch.
         sums: receives the centroids.
         voxel_of: (n,) receives the voxel of each point; nearest: (n,) the point nearest to each centroid;
             distances: (n,) scratch.
     """
     mask = np.uint64(table.shape[0] - 1)
+    most = table.shape[0] // 2
     used = 0
+    voxel = _EMPTY
+    last_key = np.int64(-1)
     for n in range(points.shape[0]):
         ix = np.int64(math.floor(points[n, 0] * inverse_size))
         iy = np.int64(math.floor(points[n, 1] * inverse_size))
         iz = np.int64(math.floor(points[n, 2] * inverse_size))
         key = (ix & 0x1FFFFF) | ((iy & 0x1FFFFF) << 21) | ((iz & 0x1FFFFF) << 42)
+        if key == last_key:  # neighbours in a scan mostly share their voxel
+            sums[voxel, 0] += points[n, 0]
+            sums[voxel, 1] += points[n, 1]
+            sums[voxel, 2] += points[n, 2]
+            counts[voxel] += 1
+            voxel_of[n] = voxel
+            continue
+        last_key = key
         mixed = np.uint64(ix) * _HASH_X ^ np.uint64(iy) * _HASH_Y ^ np.uint64(iz) * _HASH_Z
         slot = (mixed ^ (mixed >> np.uint64(29))) & mask
         while True:
             voxel = table[slot]
             if voxel == _EMPTY:
+                if used == most:
+                    return -1
                 voxel = np.int32(used)
                 table[slot] = voxel
                 keys[used] = key
@@ -105,10 +120,10 @@ class VoxelFilter:
         self.voxel_size = voxel_size
         self._least = voxel_size
         self._max_points = max_points
+        self._table = np.full(8192, _EMPTY, dtype=np.int32)
         self._reserve(1024)
 
     def _reserve(self, points: int) -> None:
-        self._table = np.full(1 << (2 * points - 1).bit_length(), _EMPTY, dtype=np.int32)
         self._keys = np.zeros(points, dtype=np.int64)
         self._sums = np.zeros((points, 3), dtype=np.float32)
         self._counts = np.zeros(points, dtype=np.int32)
@@ -123,18 +138,22 @@ class VoxelFilter:
         """
         if len(points) > len(self._counts):
             self._reserve(2 * len(points))
-        self._table.fill(_EMPTY)
-        used = voxel_centroids(
-            points,
-            1.0 / self.voxel_size,
-            self._table,
-            self._keys,
-            self._sums,
-            self._counts,
-            self._voxel_of,
-            self._nearest,
-            self._distances,
-        )
+        used = -1
+        while used < 0:
+            self._table.fill(_EMPTY)
+            used = voxel_centroids(
+                points,
+                1.0 / self.voxel_size,
+                self._table,
+                self._keys,
+                self._sums,
+                self._counts,
+                self._voxel_of,
+                self._nearest,
+                self._distances,
+            )
+            if used < 0:
+                self._table = np.full(2 * len(self._table), _EMPTY, dtype=np.int32)
         if self._max_points is not None:
             # Surfaces fill voxels with the square of their size.
             fitting = self.voxel_size * (used / self._max_points) ** 0.5
