@@ -48,7 +48,8 @@ class Estimate:
         state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
         covariance: (24, 24) float64 of the tangent `[θ, p, v, b_ω, b_a, g, θ_L, p_L]` at `state` (SPEC.md 9.1): rotations
             perturbed on the right (IMU frame) [rad], position and velocity along the world's axes.
-        status: "ok"; "weak": some directions were predicted only (see `weak_directions`); "lost": no update was possible.
+        status: "ok"; "weak": some directions were predicted only (see `weak_directions`); "lost": no update was possible, or too
+            few points fit the map, scan after scan.
         weak_directions: the directions the scan did not determine.
         lidar_share: (6,) for each of `AXES`, how much of the information came from the LiDAR: 1 − posterior / prior
             variance. 1 is measured, 0 is predicted only.
@@ -56,7 +57,8 @@ class Estimate:
         rejected: filtered points that were not used, by reason; they add up with `points_used` to `points_filtered`.
         residual_rms: root mean square point-to-plane distance of the used points [m].
         iterations: Gauss-Newton steps taken; converged: whether the last one was below the threshold.
-        warnings: what went wrong on the way to this scan (gaps in the IMU, missing cover, …), one sentence each.
+        warnings: what went wrong on the way to this scan (gaps or saturation of the IMU, sensors that contradict each other,
+            …), one sentence each.
         timing_s: seconds spent, by stage of the pipeline.
         p_lidar: (N, 3) float32, all points of the scan in the LiDAR frame at `time_ns`, corrected for motion.
         intensity: (N,) float32 or None.

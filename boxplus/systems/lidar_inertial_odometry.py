@@ -20,6 +20,7 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.systems.consistency import Consistency, Saturation
 from boxplus.systems.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.excitation import RotationExcitation
 from boxplus.systems.lio_config import LioConfig
@@ -29,6 +30,7 @@ from boxplus.systems.start import Start, deskew_first, find_start, joined_imu
 
 _CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
+_SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
 
 
 class LidarInertialOdometry:
@@ -52,6 +54,10 @@ class LidarInertialOdometry:
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
+        self._consistency = Consistency(self.config.min_matched_share)
+        self._saturation = Saturation()
+        self._warnings: list[str] = []
+        self._x_before: NDArray[np.float64] = np.zeros(0)
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._time_ns = 0
@@ -132,6 +138,9 @@ class LidarInertialOdometry:
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
         imu, scan = frame.imu, frame.scan
+        self._x_before = self._x.copy()
+        self._warnings = self._saturation.update(imu)
+        density = np.maximum(self._density, _SATURATED_DENSITY) if self._warnings else self._density
         seconds = (imu.time_ns - self._time_ns) * 1e-9
         nodes = np.zeros((len(imu) + 3, NODE))
         count = propagate_interval(
@@ -141,7 +150,7 @@ class LidarInertialOdometry:
             imu.gyro,
             imu.accel,
             (scan.end_ns - self._time_ns) * 1e-9,
-            self._density,
+            density,
             self.config.max_imu_gap,
             _GAP_DENSITY,
             nodes,
@@ -210,6 +219,9 @@ class LidarInertialOdometry:
         rejected = dict(measurement.rejected())
         if lost and information is not None and information.used:
             rejected["scan without an update"] = information.used
+        used = information.used if information is not None and not lost else 0
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, used / max(len(points), 1))
+        lost |= self._consistency.lost
         status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
         return self._estimate(
             frame,
@@ -218,7 +230,7 @@ class LidarInertialOdometry:
             directions=directions,
             share=np.zeros(6) if lost else _lidar_share(cov_prior, self._cov),
             points_filtered=len(points),
-            points_used=information.used if information is not None and not lost else 0,
+            points_used=used,
             rejected=rejected,
             residual_rms=information.residual_rms if information is not None else 0.0,
             iterations=steps,
@@ -247,7 +259,8 @@ class LidarInertialOdometry:
         converged: bool = True,
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
-        warnings = []
+        warnings = self._warnings
+        self._warnings = []
         if not frame.covered:
             warnings.append("no IMU sample at or after the end of the scan: the last one was held")
         if frame.largest_gap_s > self.config.max_imu_gap:

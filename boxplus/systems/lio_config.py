@@ -44,6 +44,9 @@ class LioConfig(BaseModel):
     box_side: float = Field(1000.0, gt=0, description="side of the box around the sensor within which the map is kept [m]")
     detection_range: float = Field(100.0, gt=0, description="range of the LiDAR, for moving the map box [m]")
     min_points: int = Field(20, ge=6, description="fewest used points for an update; with fewer the scan is lost")
+    min_matched_share: float = Field(
+        0.1, ge=0, lt=1, description="with less than this share of a scan's points on the map, three scans in a row, it is lost"
+    )
     weak_threshold: float = Field(
         0.004, ge=0, lt=1, description="a direction with less than this share of the points' information is only predicted"
     )

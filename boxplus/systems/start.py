@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import InputError
 from boxplus.filtering.degeneracy import pose_directions, strong_step
 from boxplus.filtering.nav_state import (
     STANDARD_GRAVITY,
@@ -35,6 +36,8 @@ from boxplus.systems.plane_measurement import PlaneMeasurement
 _REST_GYRO_STD = 0.1  # rad/s, SPEC.md 9.4
 _REST_ACCEL_STD = 0.5  # m/s²
 _REST_ACCEL_NORM = (9.0, 10.6)
+_IN_G = (0.8, 1.25)
+_STANDARD_G = 9.80665
 _REST_MISFIT = (1.25, 0.005)  # at rest, aligning the last scan gains no more than this factor and this much [m] ...
 _REST_MISFIT_MAX = 0.08  # ... and it fits to this [m]
 _REST_SCANS = 3
@@ -62,13 +65,23 @@ class Start:
 
 
 def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
-    """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet."""
+    """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet.
+
+    Raises:
+        InputError: the accelerometer reports in g.
+    """
     imu = joined_imu(frames)
     duration = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
     extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
     gyro_std = float(imu.gyro.std(axis=0).max())
     accel_std = float(imu.accel.std(axis=0).max())
     norm = float(np.linalg.norm(imu.accel.mean(axis=0)))
+    if _IN_G[0] < norm < _IN_G[1]:
+        raise InputError(
+            "accelerations in m/s², about 9.8 on average at the start",
+            f"{norm:.2f}",
+            f"the accelerometer reports in g: multiply by {_STANDARD_G} (reading a recording: --accel-unit g)",
+        )
     low, high = _REST_ACCEL_NORM
     still = gyro_std < _REST_GYRO_STD and accel_std < _REST_ACCEL_STD and low <= norm <= high and len(imu) > 10
     evidence = f"gyro std {gyro_std:.3f} rad/s, accelerometer std {accel_std:.2f} m/s² around {norm:.2f} m/s²"
