@@ -78,8 +78,14 @@ def run_pass(events: Sequence[Event], config: LioConfig, *, opponent: bool) -> P
 
 
 def config_for(simulation: Simulation, threads: int) -> LioConfig:
-    """Our settings at the opponent's filter size; everything else is the default."""
-    return LioConfig(T_imu_lidar=simulation.T_imu_lidar.tolist(), scan_voxel=VOXEL, map_cell=VOXEL, threads=threads)
+    """Our settings at the filter size that is compared; everything else is the default."""
+    return LioConfig(
+        T_imu_lidar=tuple(map(tuple, simulation.T_imu_lidar.tolist())),
+        scan_voxel=VOXEL,
+        map_cell=VOXEL,
+        max_points=1_000_000,
+        threads=threads,
+    )
 
 
 def measure(options: argparse.Namespace) -> list[Metric]:
