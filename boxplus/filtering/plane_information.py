@@ -13,6 +13,9 @@ from boxplus.filtering.nav_state import PL, RL, P, R
 # What became of a point.
 USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED, ONE_LINE = 0, 1, 2, 3, 4
 MEASURED_DOF = 12
+# Variance of a map point as far as the tilt of a plane goes [m²]: five points of one or two scan lines are not independent,
+# and what they say beside these lines is worth less than their noise suggests.
+_TILT_VARIANCE = 0.1**2
 
 
 @kernel(inline=True)
@@ -86,7 +89,8 @@ def accumulate_planes(
         t0 = plane[5] * yx + plane[6] * yy + plane[7] * yz - plane[8]
         t1 = plane[9] * yx + plane[10] * yy + plane[11] * yz - plane[12]
         # The misfit of the plane's own points says how far to trust it; the Cauchy weight, how far to trust the point.
-        variance = range_variance + (map_variance + plane[4]) * (0.2 + t0 * t0 + t1 * t1) + plane[4]
+        spread_sq = t0 * t0 + t1 * t1
+        variance = range_variance + 0.2 * map_variance + _TILT_VARIANCE * spread_sq + plane[4] * (1.2 + spread_sq)
         weight = 1.0 / (variance + z * z)
         _row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
         for i in range(size):

@@ -137,7 +137,8 @@ def propagate_interval(
         end = duration if upper >= n else min(duration, imu_time[upper])
         first = max(upper - 1, 0)
         second = min(upper, n - 1)
-        blind = end - now > max_gap or (0 < upper < n and imu_time[upper] - imu_time[upper - 1] > max_gap)
+        following = end if upper >= n else imu_time[upper]
+        blind = end - now > max_gap or (upper > 0 and following - imu_time[upper - 1] > max_gap)
         for i in range(3):
             mean_gyro[i] = 0.5 * (gyro[first, i] + gyro[second, i])
             mean_accel[i] = 0.5 * (accel[first, i] + accel[second, i])

@@ -45,7 +45,7 @@ def voxel_centroids(
     mask = np.uint64(table.shape[0] - 1)
     most = table.shape[0] // 2
     used = 0
-    voxel = _EMPTY
+    voxel: np.int32 | int = _EMPTY
     last_key = np.int64(-1)
     for n in range(points.shape[0]):
         ix = np.int64(math.floor(points[n, 0] * inverse_size))

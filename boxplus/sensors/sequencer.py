@@ -118,6 +118,12 @@ class Sequencer:
                 ready.append(frame)
         return ready
 
+    def imu_since(self, time_ns: int) -> ImuSamples:
+        """Samples from the last one at or before `time_ns` on; they stay in the sequencer."""
+        block = self._joined()
+        first = max(int(np.searchsorted(block.time_ns, time_ns, side="right")) - 1, 0)
+        return ImuSamples(block.time_ns[first:], block.gyro[first:], block.accel[first:])
+
     def _frame(self, scan: Scan, covered: bool) -> Frame | None:
         begin = scan.start_ns if self._last_end_ns is None else self._last_end_ns
         imu = self._take_until(begin, scan.end_ns)
@@ -135,20 +141,23 @@ class Sequencer:
 
     def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:
         """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""
-        if len(self._imu) > 1:
-            blocks = list(self._imu)
-            joined = ImuSamples(
-                np.concatenate([b.time_ns for b in blocks]),
-                np.concatenate([b.gyro for b in blocks]),
-                np.concatenate([b.accel for b in blocks]),
-            )
-            self._imu = deque([joined])
-        if not self._imu:
-            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-        block = self._imu[0]
+        block = self._joined()
         first = max(int(np.searchsorted(block.time_ns, begin_ns, side="right")) - 1, 0)
         stop = min(int(np.searchsorted(block.time_ns, end_ns, side="left")) + 1, len(block))
         # Two samples at or before the end stay: the next frame needs the last one before its begin.
         keep = max(stop - 2, 0)
         self._imu = deque([ImuSamples(block.time_ns[keep:], block.gyro[keep:], block.accel[keep:])])
         return ImuSamples(block.time_ns[first:stop], block.gyro[first:stop], block.accel[first:stop])
+
+    def _joined(self) -> ImuSamples:
+        """All samples kept, as one block."""
+        if not self._imu:
+            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        if len(self._imu) > 1:
+            joined = ImuSamples(
+                np.concatenate([b.time_ns for b in self._imu]),
+                np.concatenate([b.gyro for b in self._imu]),
+                np.concatenate([b.accel for b in self._imu]),
+            )
+            self._imu = deque([joined])
+        return self._imu[0]

@@ -101,3 +101,18 @@ class Estimate:
         p_world_lidar = self.state.R_world_imu @ self.state.p_imu_lidar + self.state.p_world_imu
         registered: NDArray[np.float64] = self.p_lidar @ R_world_lidar.T + p_world_lidar
         return registered
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The state between scans, from the IMU alone since the last scan.
+
+    Attributes:
+        time_ns: the newest IMU sample, absolute [ns].
+        state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
+        covariance: (24, 24), as in `Estimate`.
+    """
+
+    time_ns: int
+    state: NavState
+    covariance: NDArray[np.float64]

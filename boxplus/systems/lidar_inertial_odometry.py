@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import PoseDirections, pose_directions, project_out_weak
 from boxplus.filtering.iterated_update import map_step, move_covariance
-from boxplus.filtering.nav_state import TANGENT, NavState, boxplus_into
+from boxplus.filtering.nav_state import TANGENT, NavState, V, boxplus_into
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
@@ -21,13 +22,17 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.consistency import Consistency, Saturation
-from boxplus.systems.estimate import Estimate, Status, WeakDirection
+from boxplus.systems.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.excitation import RotationExcitation
+from boxplus.systems.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lio_config import LioConfig
 from boxplus.systems.plane_measurement import PlaneMeasurement
 from boxplus.systems.standstill import Standstill
-from boxplus.systems.start import Start, deskew_first, find_start, joined_imu
+from boxplus.systems.start import Start, align, deskew_first, find_start, joined_imu
 
+_LONGEST_START_SCANS = 30
+_BLIND_PASSES = 3
+_BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
@@ -61,7 +66,6 @@ class LidarInertialOdometry:
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._time_ns = 0
-        self._recent_imu: ImuSamples | None = None
         c = self.config
         self._density = np.array([c.gyro_noise, c.accel_noise, c.gyro_bias_walk, c.accel_bias_walk]) ** 2
 
@@ -73,8 +77,6 @@ class LidarInertialOdometry:
     def push_imu(self, samples: ImuSamples) -> list[Estimate]:
         """Take IMU samples; returns the estimates that became ready."""
         self._sequencer.add_imu(samples)
-        if len(samples):
-            self._recent_imu = samples
         return self._advance(self._sequencer.frames())
 
     def push_scan(self, scan: Scan) -> list[Estimate]:
@@ -88,6 +90,21 @@ class LidarInertialOdometry:
         if self.start is None and self._waiting:
             estimates += self._try_start(final=True)
         return estimates
+
+    def predict(self) -> Prediction | None:
+        """The state now: the last posterior, carried through all IMU samples since. None before the start.
+
+        For control, at the rate of the IMU: call it after `push_imu`. The filter itself is not touched; when the next scan
+        arrives, its estimate replaces what was predicted over the same time.
+        """
+        if self.start is None:
+            return None
+        imu = self._sequencer.imu_since(self._time_ns)
+        x, cov = self._x.copy(), self._cov.copy()
+        newest = max(int(imu.time_ns[-1]), self._time_ns) if len(imu) else self._time_ns
+        if newest > self._time_ns:
+            self._carry(x, cov, imu, newest, self._density)
+        return Prediction(newest, NavState.unpack(x), cov)
 
     def _advance(self, frames: list[Frame]) -> list[Estimate]:
         estimates: list[Estimate] = []
@@ -106,9 +123,11 @@ class LidarInertialOdometry:
         found = find_start(self._waiting, self.config)
         if isinstance(found, str):
             self.start_problem = found
-            if final or len(self._waiting) > 100:
-                self._sequencer.rejected["scan before a start could be found"] += 1
-                del self._waiting[0]
+            # The oldest scans make room, so that a start that takes long stays cheap.
+            keep = 0 if final else _LONGEST_START_SCANS
+            forgotten = max(len(self._waiting) - keep, 0)
+            self._sequencer.rejected["scan before a start could be found"] += forgotten
+            del self._waiting[:forgotten]
             return []
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
@@ -124,6 +143,8 @@ class LidarInertialOdometry:
     def _process(self, frame: Frame) -> Estimate:
         """One scan, line by line as in SPEC.md 9.11."""
         clock = _Stopwatch()
+        if begins_blind(frame, self.config.max_imu_gap):
+            frame = self._see_motion(frame)
         p_lidar = self._propagate(frame)
         if self._standstill is not None and self._standstill.active:
             self._standstill.update(frame.imu, self._x, self._cov)
@@ -135,31 +156,56 @@ class LidarInertialOdometry:
         clock.lap("voxel filter")
         return self._update(frame, p_lidar, points, map_points, voxel, clock)
 
+    def _see_motion(self, frame: Frame) -> Frame:
+        """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
+        x, cov, time_ns = self._x.copy(), self._cov.copy(), self._time_ns
+        for _ in range(_BLIND_PASSES):
+            points = self._voxel_filter(self._propagate(frame))[0]
+            fits = align(points, self.map, self._x, self.config)
+            rate, velocity = mean_motion(x, self._x, (frame.scan.end_ns - time_ns) * 1e-9)
+            self._x[:], self._cov[:], self._time_ns = x, cov, time_ns
+            if not fits:
+                break
+            frame = replace(frame, imu=with_turn_rate(frame, rate, x))
+            self._x[V : V + 3] = velocity
+        return frame
+
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
-        imu, scan = frame.imu, frame.scan
+        scan = frame.scan
         self._x_before = self._x.copy()
-        self._warnings = self._saturation.update(imu)
+        self._warnings = self._saturation.update(frame.imu)
         density = np.maximum(self._density, _SATURATED_DENSITY) if self._warnings else self._density
-        seconds = (imu.time_ns - self._time_ns) * 1e-9
+        nodes = self._carry(self._x, self._cov, frame.imu, scan.end_ns, density)
+        p_lidar = np.zeros_like(scan.p_lidar)
+        deskew_into(scan.p_lidar, (scan.time_ns - self._time_ns) * 1e-9, nodes, len(nodes), self._x, p_lidar)
+        self._time_ns = scan.end_ns
+        self._excitation.add(nodes)
+        return p_lidar
+
+    def _carry(
+        self,
+        x: NDArray[np.float64],
+        cov: NDArray[np.float64],
+        imu: ImuSamples,
+        until_ns: int,
+        density: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Propagate x (36,) and cov (24, 24) in place from the last posterior to `until_ns`; returns the nodes."""
         nodes = np.zeros((len(imu) + 3, NODE))
         count = propagate_interval(
-            self._x,
-            self._cov,
-            seconds,
+            x,
+            cov,
+            (imu.time_ns - self._time_ns) * 1e-9,
             imu.gyro,
             imu.accel,
-            (scan.end_ns - self._time_ns) * 1e-9,
+            (until_ns - self._time_ns) * 1e-9,
             density,
             self.config.max_imu_gap,
             _GAP_DENSITY,
             nodes,
         )
-        p_lidar = np.zeros_like(scan.p_lidar)
-        deskew_into(scan.p_lidar, (scan.time_ns - self._time_ns) * 1e-9, nodes, count, self._x, p_lidar)
-        self._time_ns = scan.end_ns
-        self._excitation.add(nodes[:count])
-        return p_lidar
+        return nodes[:count]
 
     def _slide_map(self) -> None:
         state = NavState.unpack(self._x)
@@ -188,6 +234,7 @@ class LidarInertialOdometry:
         rematch, converged_before, converged = True, False, False
         steps = 0
         lost = False
+        weight = _BLIND_WEIGHT if frame.largest_gap_s > config.max_imu_gap else 1.0
         information = None
         for iteration in range(config.max_iterations + 1):
             information = measurement.at(self._x, rematch=rematch)
@@ -195,7 +242,7 @@ class LidarInertialOdometry:
                 lost = True
                 break
             directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
-            A, b = project_out_weak(information.A, information.b, directions)
+            A, b = project_out_weak(information.A * weight, information.b * weight, directions)
             if not map_step(self._x, x_prior, cov_prior, A, b, delta, posterior):
                 lost = True
                 break

@@ -289,9 +289,9 @@ def _moving_state(
     # Prior: the mean specific force is gravity but for the mean acceleration, taken as 1 m/s² (one sigma).
     sigma_position, sigma_mean_acceleration = 0.02, 1.0
     up = force.mean(axis=0)
-    gravity = -STANDARD_GRAVITY * up / np.linalg.norm(up)
+    gravity: NDArray[np.float64] = -STANDARD_GRAVITY * up / np.linalg.norm(up)
     basis = np.stack([np.ones_like(ends), ends, 0.5 * ends**2], axis=1) / sigma_position
-    solution = np.zeros((3, 3))
+    solution = np.zeros((2, 3))
     for _ in range(5):
         tangent = np.linalg.svd(gravity[None, :])[2][1:]  # two directions orthogonal to g
         # Unknowns: p₀ (3), v₀ (3), two tilts of g [m/s²].
@@ -307,9 +307,9 @@ def _moving_state(
         rows[-2:, 6:] = np.eye(2) / sigma_mean_acceleration
         values[-2:] = tangent @ (prior - gravity) / sigma_mean_acceleration
         solution_vector, *_ = np.linalg.lstsq(rows, values, rcond=None)
-        gravity = gravity + tangent.T @ solution_vector[6:]
-        gravity *= STANDARD_GRAVITY / np.linalg.norm(gravity)
-        solution = solution_vector[:6].reshape(2, 3)
+        tilted = gravity + tangent.T @ solution_vector[6:]
+        gravity = (tilted * (STANDARD_GRAVITY / np.linalg.norm(tilted))).astype(np.float64)
+        solution[:] = solution_vector[:6].reshape(2, 3)
         if np.linalg.norm(solution_vector[6:]) < 1e-6:
             break
     misfit = float(np.sqrt(np.mean((rows @ solution_vector - values)[:-2] ** 2))) * sigma_position
@@ -318,7 +318,7 @@ def _moving_state(
     velocity_sigma = float(np.sqrt(spread[3:6, 3:6].diagonal().max()))
     gravity_sigma = float(np.sqrt(spread[6:, 6:].diagonal().max()))
 
-    R = _gravity_rotation(-gravity) if config.gravity_aligned else np.eye(3)
+    R = _gravity_rotation(np.asarray(-gravity, dtype=np.float64)) if config.gravity_aligned else np.eye(3)
     R0 = path.rotations[0]
     state = NavState(
         R @ R0,

@@ -1,0 +1,36 @@
+"""Across a gap of the IMU the LiDAR says how the platform moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import BW, P, R
+from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.sequencer import Frame
+
+
+def begins_blind(frame: Frame, max_gap_s: float) -> bool:
+    """Whether the scan before ended within a gap of the IMU that this scan, or its beginning, lies in as well."""
+    if frame.largest_gap_s <= max_gap_s:
+        return False
+    after = frame.imu.time_ns[frame.imu.time_ns > frame.begin_ns]
+    before = frame.imu.time_ns[frame.imu.time_ns <= frame.begin_ns]
+    return bool(len(before) and ((after[0] if len(after) else frame.scan.end_ns) - before[-1]) * 1e-9 > max_gap_s)
+
+
+def mean_motion(
+    x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn rate (3,) in the IMU frame [rad/s] and velocity (3,) in the world [m/s] that lead from one state (36,) to another."""
+    turned = so3.log(x_before[R : R + 9].reshape(3, 3).T @ x[R : R + 9].reshape(3, 3))
+    return turned / seconds, (x[P : P + 3] - x_before[P : P + 3]) / seconds
+
+
+def with_turn_rate(frame: Frame, rate: NDArray[np.float64], x: NDArray[np.float64]) -> ImuSamples:
+    """The samples of a frame that begins blind; the one that is held across the gap shows `rate` (3,) [rad/s]."""
+    imu = frame.imu
+    gyro = imu.gyro.copy()
+    gyro[imu.time_ns <= frame.begin_ns] = rate + x[BW : BW + 3]
+    return ImuSamples(imu.time_ns, gyro, imu.accel)
