@@ -137,6 +137,8 @@ class Sequencer:
         if len(imu) > 1:  # a gap that began before the frame is a gap in all of it
             between = np.diff(imu.time_ns)[(imu.time_ns[1:] > begin) & (imu.time_ns[:-1] < scan.end_ns)]
             spans = np.append(spans, between)
+        if not covered:  # and one that has not ended yet
+            spans = np.append(spans, scan.end_ns - int(imu.time_ns[-1]))
         return Frame(scan, imu, begin, covered, float(spans.max(initial=0)) * 1e-9)
 
     def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:

@@ -20,12 +20,10 @@ def begins_blind(frame: Frame, max_gap_s: float) -> bool:
     return bool(len(before) and ((after[0] if len(after) else frame.scan.end_ns) - before[-1]) * 1e-9 > max_gap_s)
 
 
-def mean_motion(
-    x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Turn rate (3,) in the IMU frame [rad/s] and velocity (3,) in the world [m/s] that lead from one state (36,) to another."""
+def mean_motion(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """(2, 3) turn rate in the IMU frame [rad/s] and velocity in the world [m/s] that lead from one state (36,) to another."""
     turned = so3.log(x_before[R : R + 9].reshape(3, 3).T @ x[R : R + 9].reshape(3, 3))
-    return turned / seconds, (x[P : P + 3] - x_before[P : P + 3]) / seconds
+    return np.stack([turned, x[P : P + 3] - x_before[P : P + 3]]) / seconds
 
 
 def with_turn_rate(frame: Frame, rate: NDArray[np.float64], x: NDArray[np.float64]) -> ImuSamples:

@@ -159,15 +159,18 @@ class LidarInertialOdometry:
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
         x, cov, time_ns = self._x.copy(), self._cov.copy(), self._time_ns
+        seconds = (frame.scan.end_ns - time_ns) * 1e-9
+        motion_before = mean_motion(self._x_before, x, seconds)
         for _ in range(_BLIND_PASSES):
             points = self._voxel_filter(self._propagate(frame))[0]
             fits = align(points, self.map, self._x, self.config)
-            rate, velocity = mean_motion(x, self._x, (frame.scan.end_ns - time_ns) * 1e-9)
+            # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
+            motion = 0.5 * (motion_before + mean_motion(x, self._x, seconds))
             self._x[:], self._cov[:], self._time_ns = x, cov, time_ns
             if not fits:
                 break
-            frame = replace(frame, imu=with_turn_rate(frame, rate, x))
-            self._x[V : V + 3] = velocity
+            frame = replace(frame, imu=with_turn_rate(frame, motion[0], x))
+            self._x[V : V + 3] = motion[1]
         return frame
 
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
@@ -313,7 +316,7 @@ class LidarInertialOdometry:
         if frame.largest_gap_s > self.config.max_imu_gap:
             warnings.append(
                 f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
-                "velocity held, covariance widened"
+                "motion taken from the LiDAR alone, covariance widened"
             )
         weak: tuple[WeakDirection, ...] = ()
         if directions is not None and status == "weak":
