@@ -125,7 +125,7 @@ def test_a_gap_in_the_imu_is_said_and_survived(room: Simulation, events: list[Sc
     assert _sound(found)
     warned = [e for e in found if e.warnings]
     assert 2 <= len(warned) <= 5
-    assert all("velocity held, covariance widened" in " ".join(e.warnings) for e in warned)
+    assert all("motion taken from the LiDAR alone, covariance widened" in " ".join(e.warnings) for e in warned)
     assert "IMU gap of 0.3" in warned[0].warnings[0]
     assert all(begin - 100 * MS <= e.time_ns <= end + 200 * MS for e in warned)
     assert position_errors(room, found).max() < 0.1
