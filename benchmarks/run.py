@@ -67,17 +67,19 @@ class Benchmark:
     """A script beside this one.
 
     Attributes:
-        quick: arguments of a smoke run.
+        quick: more arguments, for a smoke run.
         convert: makes metrics of its JSON; None when that is a list of metrics already.
+        arguments: of every run.
     """
 
     quick: Sequence[str]
     convert: Callable[..., list[Metric]] | None = None
+    arguments: Sequence[str] = ()
 
 
 BENCHMARKS = {
     "knn_static": Benchmark(("--points", "50000", "--queries", "10000", "--repeats", "2"), knn_static_metrics),
-    "map_dynamic": Benchmark(("--batches", "100", "--modes", "incremental"), map_dynamic_metrics),
+    "map_dynamic": Benchmark(("--batches", "100"), map_dynamic_metrics, ("--modes", "incremental")),
     "scan": Benchmark(("--rounds", "1", "--duration", "8")),
     "recordings": Benchmark(("--rounds", "1", "--only", "v103_velodyne")),
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
@@ -94,8 +96,8 @@ def run_benchmark(name: str, *, quick: bool) -> list[Metric]:
     benchmark = BENCHMARKS[name]
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "figures.json"
-        arguments = [sys.executable, str(HERE / f"bench_{name}.py"), "--json", str(output), *(benchmark.quick if quick else ())]
-        subprocess.run(arguments, check=True, stdout=sys.stderr)
+        command = [sys.executable, str(HERE / f"bench_{name}.py"), "--json", str(output), *benchmark.arguments]
+        subprocess.run([*command, *(benchmark.quick if quick else ())], check=True, stdout=sys.stderr)
         results = json.loads(output.read_text(encoding="utf-8"))
     return from_json(results) if benchmark.convert is None else benchmark.convert(results)
 
