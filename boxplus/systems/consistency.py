@@ -69,7 +69,7 @@ class Consistency:
         Args:
             frame: the scan and its IMU samples.
             x_before, x_prior, x: (36,) state at the end of the scan before, predicted, and after the update.
-            matched_share: points used over points filtered.
+            matched_share: points that lie on the map over points filtered.
         """
         self._frames.append(frame)
         self._unmatched = self._unmatched + 1 if matched_share < self._min_matched_share else 0
@@ -83,21 +83,21 @@ class Consistency:
         suspicious = self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned
         if (suspicious or self._unmatched) and not self._until_check and len(self._frames) >= _FEWEST_SCANS:
             self._until_check = _SCANS_BETWEEN_CHECKS
-            warnings += self._compare(x[RL : RL + 9].reshape(3, 3))
+            warnings += self._compare(x[RL : RL + 9].reshape(3, 3), mounting_too=suspicious)
         if self._unmatched == _LOST_STREAK:
             warnings.append(
-                f"only {matched_share:.0%} of the points fit the map, after {_LOST_STREAK} scans in a row with too few: the "
+                f"only {matched_share:.0%} of the points fit the map, and too few in {_LOST_STREAK} scans in a row: the "
                 "estimate has left the map and is not to be trusted"
             )
         return warnings
 
-    def _compare(self, R_imu_lidar: NDArray[np.float64]) -> list[str]:
+    def _compare(self, R_imu_lidar: NDArray[np.float64], *, mounting_too: bool) -> list[str]:
         """Gyroscope against LiDAR over the last scans, without the filter."""
         try:
             found = estimate_rotation_extrinsic([frame.scan for frame in self._frames], joined_imu(self._frames))
         except InputError:
             return []
-        text = judge_rotations(found, R_imu_lidar)
+        text = judge_unit(found) or (judge_mounting(found, R_imu_lidar) if mounting_too else None)
         return [] if text is None else [text]
 
     def _span(self, frame: Frame) -> list[str]:
@@ -114,11 +114,8 @@ class Consistency:
         ]
 
 
-def judge_rotations(found: RotationAlignment, R_imu_lidar: NDArray[np.float64]) -> str | None:
-    """What a comparison of both rotations says against the given mounting (3, 3) and units: a sentence, or None.
-
-    Only axes that the motion shows to 5 degrees count.
-    """
+def judge_unit(found: RotationAlignment) -> str | None:
+    """What a comparison of both rotations says against the gyroscope's unit: a sentence, or None."""
     low, high = _DEGREES
     if low < found.gyro_scale < high:
         return (
@@ -130,6 +127,11 @@ def judge_rotations(found: RotationAlignment, R_imu_lidar: NDArray[np.float64]) 
             f"over {found.intervals} scans the LiDAR turned {1.0 / found.gyro_scale:.0f} times as far as the gyroscope: its "
             "rates were taken for deg/s and are rad/s (reading a recording: --gyro-unit rad/s)"
         )
+    return None
+
+
+def judge_mounting(found: RotationAlignment, R_imu_lidar: NDArray[np.float64]) -> str | None:
+    """What it says against the given R_imu_lidar (3, 3): a sentence, or None. Axes known to 5 degrees count."""
     seen = found.std_deg < _KNOWN_DEG
     apart = found.axes.T @ so3.log(found.R_imu_lidar @ R_imu_lidar.T)
     angle = float(np.degrees(np.linalg.norm(apart[seen])))

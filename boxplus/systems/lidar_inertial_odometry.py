@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.degeneracy import PoseDirections, pose_directions, project_out_weak
 from boxplus.filtering.iterated_update import map_step, move_covariance
 from boxplus.filtering.nav_state import TANGENT, NavState, V, boxplus_into
+from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
@@ -26,7 +27,7 @@ from boxplus.systems.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.excitation import RotationExcitation
 from boxplus.systems.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lio_config import LioConfig
-from boxplus.systems.plane_measurement import PlaneMeasurement
+from boxplus.systems.plane_measurement import REASONS, PlaneMeasurement
 from boxplus.systems.standstill import Standstill
 from boxplus.systems.start import Start, align, deskew_first, find_start, joined_imu
 
@@ -270,7 +271,9 @@ class LidarInertialOdometry:
         if lost and information is not None and information.used:
             rejected["scan without an update"] = information.used
         used = information.used if information is not None and not lost else 0
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, used / max(len(points), 1))
+        # A point among map points of one scan line is not used, but it does lie on the map.
+        on_map = used + rejected.get(REASONS[ONE_LINE], 0)
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, on_map / max(len(points), 1))
         lost |= self._consistency.lost
         status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
         return self._estimate(

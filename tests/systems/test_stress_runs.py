@@ -1,0 +1,32 @@
+"""FAST-LIO2's stress runs on the simulator, and the ordinary ones: tracked without loss, with bounded error."""
+
+from __future__ import annotations
+
+import pytest
+from simulated_runs import run
+
+
+@pytest.mark.parametrize(("scenario", "duration_s", "metres", "degrees"), [
+    pytest.param("stress_flips", None, 0.06, 0.4, id="flips at 1000 deg/s"),
+    pytest.param("stress_fast", 15.0, 0.06, 0.4, id="7 m/s and 100 deg/s"),
+    pytest.param("stress_drone", 20.0, 0.6, 2.0, id="drone, LiDAR at its belly"),
+    pytest.param("walk_livox", 15.0, 0.15, 0.4, id="walk, 70 degrees of view"),
+    pytest.param("drive", 12.0, 0.35, 0.4, id="car"),
+    pytest.param("moving_start", 8.0, 0.20, 0.4, id="recording that begins at 11 m/s"),
+])  # fmt: skip
+def test_stress_run(scenario: str, duration_s: float | None, metres: float, degrees: float) -> None:
+    stress = run(scenario, duration_s)
+    assert len(stress.estimates) == stress.simulation.scan_count, "no scan is left out, those of the start included"
+    assert "lost" not in stress.status
+    assert not stress.odometry.counters
+    assert stress.warnings == []
+    assert stress.distance.max() < metres
+    assert stress.rotation_error_deg.max() < degrees
+
+
+def test_moving_start_says_how_fast() -> None:
+    stress = run("moving_start", 2.0)
+    assert stress.odometry.start is not None
+    assert stress.odometry.start.kind == "moving"
+    assert stress.odometry.start.text.startswith("moving at 1")
+    assert "batch over" in stress.odometry.start.text
