@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_box import disjoint, in_box
+from boxplus.maps.ikd_leaf import trailing_zeros
 from boxplus.maps.ikd_pool import (
     INDEX_MASK,
     LABEL_DEAD,
@@ -20,7 +21,6 @@ from boxplus.maps.ikd_pool import (
     Pool,
     all_bits,
     has_room,
-    lowest_bit,
 )
 from boxplus.maps.ikd_update import (
     DROP,
@@ -106,7 +106,7 @@ def search_cell(
             live = np.uint32(bits & (all_bits(np.uint32(leaf["count"])) if label == LABEL_LIVE else np.uint32(leaf["live"])))
             has_dead = has_dead or bits != live
             while live != ZERO:
-                i = lowest_bit(live)
+                i = trailing_zeros(live)
                 live &= live - ONE
                 found += 1
                 x, y, z = leaf["x"][i], leaf["y"][i], leaf["z"][i]

@@ -6,21 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_pool import BUCKET, ZERO, all_bits
+from boxplus.maps.ikd_leaf import lanes_in_box
+from boxplus.maps.ikd_pool import all_bits
 
 
-@kernel
+@kernel(inline=True)
 def in_box(leaf: NDArray[np.void], index: np.uint32, box: NDArray[np.float32]) -> np.uint32:
     """Which stored points of a leaf lie in a half-open box (as bits)."""
-    record = leaf[index]
-    x, y, z = record["x"], record["y"], record["z"]
-    x0, y0, z0, x1, y1, z1 = box[0], box[1], box[2], box[3], box[4], box[5]
-    count = np.uint32(record["count"])
-    bits = ZERO
-    for i in range((count + np.uint32(7)) & np.uint32(2 * BUCKET - 8)):
-        hit = np.uint32(x[i] >= x0) & np.uint32(x[i] < x1) & np.uint32(y[i] >= y0) & np.uint32(y[i] < y1)
-        bits |= (hit & np.uint32(z[i] >= z0) & np.uint32(z[i] < z1)) << np.uint32(i)
-    return np.uint32(bits & all_bits(count))
+    return np.uint32(lanes_in_box(leaf, np.uint32(index), box) & all_bits(np.uint32(leaf[index]["count"])))
 
 
 @kernel(inline=True)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_leaf import BUCKET
 from boxplus.maps.ikd_pool import (
-    BUCKET,
     FILL,
     LABEL_DEAD,
     LABEL_NONE,

@@ -8,7 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import BoxplusError
-from boxplus.maps.ikd_pool import BUCKET, INDEX_MASK, LABEL_DEAD, LABEL_LIVE, LEAF_BIT, LEFT, NIL, ROOT, Pool
+from boxplus.maps.ikd_leaf import BUCKET
+from boxplus.maps.ikd_pool import (
+    INDEX_MASK,
+    LABEL_DEAD,
+    LABEL_LIVE,
+    LEAF_BIT,
+    LEFT,
+    NIL,
+    ROOT,
+    Pool,
+)
 
 
 class InvariantError(BoxplusError):

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_box import disjoint, in_box
+from boxplus.maps.ikd_leaf import BUCKET, trailing_zeros
 from boxplus.maps.ikd_pool import (
-    BUCKET,
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -22,9 +22,8 @@ from boxplus.maps.ikd_pool import (
     RIGHT,
     ROOT,
     ZERO,
-    lowest_bit,
 )
-from boxplus.maps.ikd_search import IkdView, knn, point_sq
+from boxplus.maps.ikd_search import IkdView, five_nearest, knn, point_sq
 
 
 @kernel
@@ -60,7 +59,7 @@ def nearest_batch(
                 point = np.uint32(stack[first + np.uint32(i)]["ref"])
                 farthest = max(farthest, point_sq(leaf, np.uint32(point // width), np.uint32(point % width), x, y, z))
             bound = min(bound, farthest)
-        found = np.int64(knn(view, x, y, z, bound, sq, stack))
+        found = five_nearest(view, x, y, z, bound, sq, stack) if k == 5 else knn(view, x, y, z, bound, sq, stack)
         counts[row] = found
         for i in range(found):
             point = np.uint32(stack[first + np.uint32(i)]["ref"])
@@ -110,7 +109,7 @@ def collect(
             if label == LABEL_NONE:
                 bits &= np.uint32(leaf[index]["live"])
             while bits != ZERO:
-                i = lowest_bit(bits)
+                i = trailing_zeros(bits)
                 bits &= bits - ONE
                 if point_sq(leaf, index, i, x, y, z) <= max_sq:
                     if found < len(out):

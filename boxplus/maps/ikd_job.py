@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from boxplus.maps.ikd_batch import update_batch
 from boxplus.maps.ikd_build import BUILDER, BUILT, build_step, start_build
+from boxplus.maps.ikd_leaf import BUCKET
 from boxplus.maps.ikd_pool import (
-    BUCKET,
     FILL,
     LABEL_NONE,
     LEFT,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_leaf import LEAF, count_bits
 
-BUCKET = 32  # points in a leaf; the leaf scan is unrolled and vectorised for it
 FILL = 26  # points in a leaf after a rebuild: leaves room for inserts
 NIL = np.uint32(0xFFFFFFFF)
 LEAF_BIT = np.uint32(0x80000000)
@@ -46,17 +46,6 @@ INNER = np.dtype(
 COUNT = np.dtype(
     [("size", np.uint32), ("dead", np.uint32)], align=True
 )  # stored points below an inner node, and how many are deleted
-LEAF = np.dtype(
-    [
-        ("x", np.float32, BUCKET),
-        ("y", np.float32, BUCKET),
-        ("z", np.float32, BUCKET),
-        ("live", np.uint32),  # bit i: point i is not deleted
-        ("count", np.uint32),
-        ("stamp", np.uint32),  # number of the rebuild that has already copied this leaf
-    ],
-    align=True,
-)
 HEAD = np.dtype(
     [
         ("inner_used", np.uint32),
@@ -203,27 +192,6 @@ def take_leaf(pool: Pool) -> np.uint32:
 def all_bits(count: np.uint32) -> np.uint32:
     """A mask with the lowest `count` bits set."""
     return np.uint32((np.uint64(1) << np.uint64(count)) - np.uint64(1))
-
-
-@kernel(inline=True)
-def lowest_bit(bits: np.uint32) -> np.uint32:
-    """Index of the lowest bit set (LLVM turns the loop into one instruction)."""
-    bits = np.uint32(bits & (~bits + ONE)) >> ONE
-    index = ZERO
-    while bits != ZERO:
-        bits >>= ONE
-        index += ONE
-    return index
-
-
-@kernel(inline=True)
-def count_bits(bits: np.uint32) -> np.uint32:
-    """Number of bits set."""
-    number = ZERO
-    while bits != ZERO:
-        bits &= bits - ONE
-        number += ONE
-    return number
 
 
 @kernel(inline=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_leaf import BUCKET, lanes_within, trailing_zeros
 from boxplus.maps.ikd_pool import (
-    BUCKET,
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -29,13 +29,11 @@ from boxplus.maps.ikd_pool import (
     ROOT,
     ZERO,
     all_bits,
-    lowest_bit,
 )
 
 STACK = np.dtype([("ref", np.uint32), ("sq", np.float32), ("live", np.uint32)], align=True)
 STACK_DEPTH = 256  # the tree keeps its height below this
-_LANES = np.uint32(8)  # the leaf scan runs over a multiple of this many points
-_SCAN_MASK = np.uint32(2 * BUCKET - 8)
+_POINT_BITS = np.uint64(32)
 _ZERO_F = np.float32(0)
 
 
@@ -65,18 +63,10 @@ def box_sq(box: NDArray[np.float32], side: np.uint32, qx: np.float32, qy: np.flo
 def leaf_within(
     leaf: NDArray[np.void], index: np.uint32, qx: np.float32, qy: np.float32, qz: np.float32, max_sq: np.float32, live: np.uint32
 ) -> np.uint32:
-    """Which live points of a leaf lie within `max_sq` (as bits); `live` overrides the deletion marks.
-
-    The number of rounds is a multiple of eight known to be at most one bucket: LLVM turns that into straight vector code.
-    """
+    """Which live points of a leaf lie within `max_sq` (as bits); `live` overrides the deletion marks."""
     record = leaf[index]
-    x, y, z = record["x"], record["y"], record["z"]
-    count = np.uint32(record["count"])
-    bits = ZERO
-    for i in range((count + (_LANES - ONE)) & _SCAN_MASK):
-        dx, dy, dz = x[i] - qx, y[i] - qy, z[i] - qz
-        bits |= np.uint32(dx * dx + dy * dy + dz * dz <= max_sq) << np.uint32(i)
-    return np.uint32(bits & (all_bits(count) if live else np.uint32(record["live"])))
+    bits = lanes_within(leaf, np.uint32(index), qx, qy, qz, max_sq)
+    return np.uint32(bits & (all_bits(np.uint32(record["count"])) if live else np.uint32(record["live"])))
 
 
 @kernel(inline=True)
@@ -109,6 +99,77 @@ def comes_before(leaf: NDArray[np.void], sq: np.float32, point: np.uint32, other
     return bool(sq < other_sq or (sq == other_sq and precedes(leaf, point, other)))
 
 
+@kernel(inline=True)
+def enter(
+    inner: NDArray[np.void], qx: np.float32, qy: np.float32, qz: np.float32, max_sq: np.float32
+) -> tuple[np.uint32, np.uint32]:
+    """Descend from the root as long as the ball lies on one side of the split, where one comparison a level will do.
+
+    Returns the reference and whether all below is live; NIL if nothing is there, or the query is not finite.
+    """
+    ref, label = np.uint32(inner[ROOT]["child"][LEFT]), np.uint8(inner[ROOT]["label"][LEFT])
+    while ref < LEAF_BIT:
+        axis = inner[ref]["axis"]
+        offset = (qx if axis == 0 else (qy if axis == 1 else qz)) - inner[ref]["split"]
+        if not offset * offset > max_sq:
+            break
+        side = np.uint32(offset > 0)
+        label = label if label else np.uint8(inner[ref]["label"][side])
+        ref = np.uint32(inner[ref]["child"][side])
+    finite = math.isfinite(np.float64(qx) + np.float64(qy) + np.float64(qz))
+    return np.uint32(NIL if label == LABEL_DEAD or not finite else ref), np.uint32(label == LABEL_LIVE)
+
+
+@kernel(inline=True)
+def next_leaf(
+    inner: NDArray[np.void],
+    ref: np.uint32,
+    live: np.uint32,
+    top: np.uint32,
+    worst: np.float32,
+    qx: np.float32,
+    qy: np.float32,
+    qz: np.float32,
+    stack: NDArray[np.void],
+) -> tuple[np.uint32, np.uint32, np.uint32]:
+    """Go on from a reference, or from the stack if it is NIL, to the next leaf within `worst`, the nearer child first.
+
+    Returns the leaf (NIL if there is none), whether all in it is live, and the new `top`. The choice of the child has no
+    branch: in a scan it cannot be guessed.
+    """
+    while True:
+        while ref < LEAF_BIT:
+            node = inner[ref]
+            child, label = node["child"], node["label"]
+            sq_left = box_sq(node["box"], LEFT, qx, qy, qz)
+            sq_right = box_sq(node["box"], RIGHT, qx, qy, qz)
+            left, right = np.uint32(child[0]), np.uint32(child[1])
+            live_left = live_right = live
+            if label[0] | label[1] and not live:
+                left = NIL if label[0] == LABEL_DEAD else left
+                right = NIL if label[1] == LABEL_DEAD else right
+                live_left = np.uint32(label[0] == LABEL_LIVE)
+                live_right = np.uint32(label[1] == LABEL_LIVE)
+            swap = sq_right < sq_left
+            near, far = (right, left) if swap else (left, right)
+            sq_near, sq_far = (sq_right, sq_left) if swap else (sq_left, sq_right)
+            live, live_far = (live_right, live_left) if swap else (live_left, live_right)
+            stack[top]["ref"] = far
+            stack[top]["sq"] = sq_far
+            stack[top]["live"] = live_far
+            top += np.uint32((sq_far <= worst) & (far != NIL))
+            ref = near if sq_near <= worst else NIL
+        if ref != NIL:
+            return ref, live, top
+        while True:
+            if top == ZERO:
+                return NIL, live, top
+            top -= ONE
+            if stack[top]["sq"] <= worst:
+                break
+        ref, live = np.uint32(stack[top]["ref"]), np.uint32(stack[top]["live"])
+
+
 @kernel
 def knn(
     view: IkdView,
@@ -135,87 +196,102 @@ def knn(
     first = np.uint32(len(stack) - k)
     worst = max_sq
     found = 0
-    for i in range(k):
-        out_sq[i] = max_sq
-        stack[first + np.uint32(i)]["ref"] = NIL
+    for row in range(k):
+        out_sq[row] = max_sq
+        stack[first + np.uint32(row)]["ref"] = NIL
     width = np.uint32(BUCKET)
+    ref, live = enter(inner, qx, qy, qz, max_sq)
     top = ZERO
-    live = ZERO
-    ref, label = np.uint32(inner[ROOT]["child"][LEFT]), np.uint8(inner[ROOT]["label"][LEFT])
-    if not math.isfinite(np.float64(qx) + np.float64(qy) + np.float64(qz)):
-        return np.int64(0)
-    # As long as the ball lies on one side of the split, one comparison a level will do.
-    while ref < LEAF_BIT:
-        axis = inner[ref]["axis"]
-        offset = (qx if axis == 0 else (qy if axis == 1 else qz)) - inner[ref]["split"]
-        if not offset * offset > worst:
-            break
-        side = np.uint32(offset > 0)
-        label = label if label else np.uint8(inner[ref]["label"][side])
-        ref = np.uint32(inner[ref]["child"][side])
-    live = np.uint32(label == LABEL_LIVE)
-    ref = NIL if label == LABEL_DEAD else ref
     while True:
-        while ref < LEAF_BIT:
-            node = inner[ref]
-            box, child, label = node["box"], node["child"], node["label"]
-            sq_left = box_sq(box, LEFT, qx, qy, qz)
-            sq_right = box_sq(box, RIGHT, qx, qy, qz)
-            left, right = child[0], child[1]
-            live_left = live_right = live
-            if label[0] | label[1] and not live:
-                left = NIL if label[0] == LABEL_DEAD else left
-                right = NIL if label[1] == LABEL_DEAD else right
-                live_left = np.uint32(label[0] == LABEL_LIVE)
-                live_right = np.uint32(label[1] == LABEL_LIVE)
-            # Two branches rather than one exchange: near the last query the processor guesses the path and runs ahead.
-            if sq_left <= sq_right:
-                if sq_right <= worst and right != NIL:
-                    stack[top]["ref"] = right
-                    stack[top]["sq"] = sq_right
-                    stack[top]["live"] = live_right
-                    top += ONE
-                ref = left if sq_left <= worst else NIL
-                live = live_left
-            else:
-                if sq_left <= worst and left != NIL:
-                    stack[top]["ref"] = left
-                    stack[top]["sq"] = sq_left
-                    stack[top]["live"] = live_left
-                    top += ONE
-                ref = right if sq_right <= worst else NIL
-                live = live_right
-        if ref != NIL:
-            index = ref & INDEX_MASK
-            bits = leaf_within(leaf, index, qx, qy, qz, worst, live)
-            while bits != ZERO:
-                i = lowest_bit(bits)
-                bits &= bits - ONE
-                sq = point_sq(leaf, index, i, qx, qy, qz)
-                new = np.uint32(index * width + i)
-                place = last
-                if not comes_before(leaf, sq, new, worst, stack[first + last]["ref"]):
-                    continue
-                while place > ZERO and comes_before(leaf, sq, new, out_sq[place - ONE], stack[first + place - ONE]["ref"]):
-                    out_sq[place] = out_sq[place - ONE]
-                    stack[first + place]["ref"] = stack[first + place - ONE]["ref"]
-                    place -= ONE
-                out_sq[place] = sq
-                stack[first + place]["ref"] = new
-                worst = out_sq[last]
-                found += 1
-        while True:
-            if top == ZERO:
-                ref = NIL
-                break
-            top -= ONE
-            if stack[top]["sq"] <= worst:
-                ref = stack[top]["ref"]
-                live = stack[top]["live"]
-                break
+        ref, live, top = next_leaf(inner, ref, live, top, worst, qx, qy, qz, stack)
+        if ref == NIL:
+            return np.int64(min(found, k))
+        index = ref & INDEX_MASK
+        bits = leaf_within(leaf, index, qx, qy, qz, worst, live)
+        while bits != ZERO:
+            i = trailing_zeros(bits)
+            bits &= bits - ONE
+            sq = point_sq(leaf, index, i, qx, qy, qz)
+            new = np.uint32(index * width + i)
+            place = last
+            if not comes_before(leaf, sq, new, worst, stack[first + last]["ref"]):
+                continue
+            while place > ZERO and comes_before(leaf, sq, new, out_sq[place - ONE], stack[first + place - ONE]["ref"]):
+                out_sq[place] = out_sq[place - ONE]
+                stack[first + place]["ref"] = stack[first + place - ONE]["ref"]
+                place -= ONE
+            out_sq[place] = sq
+            stack[first + place]["ref"] = new
+            worst = out_sq[last]
+            found += 1
+        ref = NIL
+
+
+@kernel(inline=True)
+def pack(sq: np.float32, point: np.uint32) -> np.uint64:
+    """A squared distance and a point as one number, which is ordered like them."""
+    return np.uint64(np.uint64(np.float32(sq).view(np.uint32)) << _POINT_BITS | np.uint64(point))
+
+
+@kernel(inline=True)
+def packed_sq(packed: np.uint64) -> np.float32:
+    """The squared distance of a packed point."""
+    return np.float32(np.uint32(packed >> _POINT_BITS).view(np.float32))
+
+
+@kernel(inline=True)
+def tied(a: np.uint64, b: np.uint64) -> bool:
+    """Whether two packed points, the first not after the second, are equally far."""
+    return bool((a >> _POINT_BITS == b >> _POINT_BITS) & (np.uint32(b) != NIL))
+
+
+@kernel
+def five_nearest(
+    view: IkdView,
+    qx: np.float32,
+    qy: np.float32,
+    qz: np.float32,
+    max_sq: np.float32,
+    out_sq: NDArray[np.float32],
+    stack: NDArray[np.void],
+) -> np.int64:
+    """`knn` for k = 5, the search of an odometry, with the neighbours in registers and sorted without a branch.
+
+    A sixth neighbour is kept to recognise equal distances, which this order does not settle: then `knn` does.
+    """
+    inner, leaf = view
+    width = np.uint32(BUCKET)
+    a = b = c = d = e = f = pack(max_sq, NIL)
+    worst = max_sq
+    ref, live = enter(inner, qx, qy, qz, max_sq)
+    top = ZERO
+    while True:
+        ref, live, top = next_leaf(inner, ref, live, top, worst, qx, qy, qz, stack)
         if ref == NIL:
             break
-    return np.int64(min(found, k))
+        index = ref & INDEX_MASK
+        bits = leaf_within(leaf, index, qx, qy, qz, worst, live)
+        while bits != ZERO:
+            i = trailing_zeros(bits)
+            bits &= bits - ONE
+            new = pack(point_sq(leaf, index, i, qx, qy, qz), np.uint32(index * width + i))
+            f = min(f, max(e, new))
+            e = min(e, max(d, new))
+            d = min(d, max(c, new))
+            c = min(c, max(b, new))
+            b = min(b, max(a, new))
+            a = min(a, new)
+        worst = packed_sq(e)
+        ref = NIL
+    if tied(a, b) | tied(b, c) | tied(c, d) | tied(d, e) | tied(e, f):
+        return np.int64(knn(view, qx, qy, qz, max_sq, out_sq, stack))
+    first = np.uint32(len(stack) - 5)
+    found = np.int64(0)
+    for place, packed in enumerate((a, b, c, d, e)):
+        out_sq[place] = packed_sq(packed)
+        stack[first + np.uint32(place)]["ref"] = np.uint32(packed)
+        found += np.int64(np.uint32(packed) != NIL)
+    return found
 
 
 @kernel
@@ -239,8 +315,8 @@ def knn5(
         out_sq: (5,) float32, their squared distances; `max_sq` where there is none.
         stack: (STACK_DEPTH,) of STACK, scratch of the calling thread.
     """
-    found = knn(view, qx, qy, qz, max_sq, out_sq, stack)
-    first = len(stack) - len(out_sq)
+    found = five_nearest(view, qx, qy, qz, max_sq, out_sq, stack)
+    first = len(stack) - 5
     for i in range(found):
         point = np.uint32(stack[first + i]["ref"])
         record = view.leaf[point // np.uint32(BUCKET)]

@@ -14,7 +14,15 @@ from boxplus.maps.ikd_batch import update_batch
 from boxplus.maps.ikd_check import check_tree
 from boxplus.maps.ikd_collect import collect, nearest_batch
 from boxplus.maps.ikd_job import Rebuilder, build_pool, new_work
-from boxplus.maps.ikd_pool import BUCKET, LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
+from boxplus.maps.ikd_leaf import BUCKET
+from boxplus.maps.ikd_pool import (
+    LEFT,
+    ROOT,
+    new_pool,
+    pool_bytes,
+    reserve,
+    slot_counts,
+)
 from boxplus.maps.ikd_rebuild import settle
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH, IkdView
 from boxplus.maps.ikd_update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPTH, OPERATION, REVIVE

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_box import contained, disjoint, in_box
+from boxplus.maps.ikd_leaf import BUCKET, count_bits
 from boxplus.maps.ikd_pool import (
-    BUCKET,
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -29,7 +29,6 @@ from boxplus.maps.ikd_pool import (
     RIGHT,
     ZERO,
     Pool,
-    count_bits,
     free_subtree,
     live_bits,
     slot_counts,

@@ -67,11 +67,13 @@ def match_planes(
         yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1]
         yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2]
         near = neighbours[n]
+        # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
+        known = n if warm else n - 1
         bound = max_distance_sq
-        if warm and fate[n] != FEW_NEIGHBOURS:
+        if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
             farthest = 0.0
             for i in range(NEIGHBOURS):
-                dx, dy, dz = near[i, 0] - yx, near[i, 1] - yy, near[i, 2] - yz
+                dx, dy, dz = neighbours[known, i, 0] - yx, neighbours[known, i, 1] - yy, neighbours[known, i, 2] - yz
                 farthest = max(farthest, dx * dx + dy * dy + dz * dz)
             bound = min(bound, farthest * _SLACK)
         count = knn5(view, np.float32(yx), np.float32(yy), np.float32(yz), np.float32(bound), near, found_sq, stack)
