@@ -110,7 +110,7 @@ def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState)
     A displacement found by registration cannot decide: a narrow field of view leaves directions in which it slides.
     """
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-    voxel_filter = VoxelFilter(config.scan_voxel)
+    voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), config.max_points)
     for frame in frames[:_REST_SCANS]:
         p_imu = voxel_filter(frame.scan.p_lidar)[1] @ extrinsic.R_imu_lidar.T + extrinsic.p_imu_lidar
         tree.insert(p_imu, downsample=True)
@@ -190,7 +190,7 @@ class _LidarPath:
 
     def __init__(self, frames: Sequence[Frame], config: LioConfig, first: NavState) -> None:
         tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-        voxel_filter = VoxelFilter(config.scan_voxel)
+        voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), config.max_points)
         x = first.pack()
         self.rotations: list[NDArray[np.float64]] = []
         self.positions: list[NDArray[np.float64]] = []
