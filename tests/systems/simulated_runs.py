@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import Fault, ImuModel, Simulation, SpinningLidar, simulate
+from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.systems.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry import LidarInertialOdometry
 from boxplus.systems.lio_config import LioConfig
@@ -56,7 +56,7 @@ class Run:
 
 
 def run(
-    scenario: str,
+    scenario: str | Scenario,
     duration_s: float | None = None,
     fault: Fault | None = None,
     lidar: SpinningLidar | None = None,
