@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_box import disjoint, in_box
-from boxplus.maps.ikd_leaf import trailing_zeros
+from boxplus.maps.ikd_leaf import BUCKET, trailing_zeros
 from boxplus.maps.ikd_pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
+    LABEL_NONE,
     LEAF_BIT,
     NIL,
     ONE,
@@ -21,8 +22,10 @@ from boxplus.maps.ikd_pool import (
     Pool,
     all_bits,
     has_room,
+    live_bits,
 )
 from boxplus.maps.ikd_update import (
+    COPYING,
     DROP,
     IDLE,
     INSERT,
@@ -30,7 +33,9 @@ from boxplus.maps.ikd_update import (
     MAX_DEPTH,
     REVIVE,
     Work,
+    extend_box,
     insert_point,
+    save_leaf,
     update_box,
 )
 
@@ -48,19 +53,19 @@ def log_operation(work: Work, kind: np.int64, box: NDArray[np.float32]) -> None:
     job["logged"] += ONE
 
 
-@kernel
+@kernel(inline=True)
 def round_up(value: np.float64) -> np.float32:
     """The smallest float32 that is not less than `value`."""
     rounded = np.float32(value)
-    if np.float64(rounded) < value:
-        rounded = np.nextafter(rounded, np.float32(np.inf))
-    return rounded
+    step = np.int32(np.float64(rounded) < value)
+    bits = np.int32(rounded.view(np.int32))
+    return np.float32(np.int32(bits + (step if bits >= 0 else -step)).view(np.float32))
 
 
 @kernel
 def search_cell(
     pool: Pool, node: np.uint32, side: np.uint32, stack: NDArray[np.void], cell: NDArray[np.float32], best: NDArray[np.float32]
-) -> tuple[np.int64, bool]:
+) -> tuple[np.int64, bool, np.uint32]:
     """The live point of a cell nearest to its centre, below a slot.
 
     Args:
@@ -71,11 +76,12 @@ def search_cell(
         best: (4,) overwritten: x, y, z of the point and its squared distance to the centre (inf if there is none).
 
     Returns:
-        How many live points the cell holds, and whether it may hold deleted ones.
+        How many live points the cell holds, whether it may hold deleted ones, and the nearest as leaf · BUCKET + place.
     """
     inner = pool.inner
     best[3] = np.float32(np.inf)
     found = np.int64(0)
+    nearest = NIL
     has_dead = False
     ref = NIL if disjoint(inner[node]["box"], side, cell) else np.uint32(inner[node]["child"][side])
     label = np.uint8(inner[node]["label"][side])
@@ -115,8 +121,9 @@ def search_cell(
                 smaller = x < best[0] or (x == best[0] and (y < best[1] or (y == best[1] and z < best[2])))
                 if sq < best[3] or (sq == best[3] and smaller):
                     best[0], best[1], best[2], best[3] = x, y, z, sq
+                    nearest = np.uint32(index * np.uint32(BUCKET) + i)
         if top == ZERO:
-            return found, has_dead
+            return found, has_dead, nearest
         top -= ONE
         ref = np.uint32(stack[top]["ref"])
         label = np.uint8(stack[top]["label"])
@@ -147,6 +154,53 @@ def set_cell(
 
 
 @kernel
+def replace_point(
+    pool: Pool,
+    work: Work,
+    node: np.uint32,
+    side: np.uint32,
+    x: np.float32,
+    y: np.float32,
+    z: np.float32,
+    cell: NDArray[np.float32],
+    point: np.uint32,
+) -> bool:
+    """Put a point in the place of the only one of its cell, if it belongs in the same leaf; returns whether it does.
+
+    No count and no balance changes. The boxes passed are extended in either case: if not here, the point goes there next.
+    """
+    job = work.job[0]
+    label = LABEL_NONE
+    inside = False
+    while True:
+        extend_box(pool, node, side, x, y, z)
+        record = pool.inner[node]
+        label = label if label else np.uint8(record["label"][side])
+        inside = inside or (job["phase"] != IDLE and node == job["node"] and side == job["side"])
+        ref = np.uint32(record["child"][side])
+        if ref >= LEAF_BIT:
+            break
+        axis = pool.inner[ref]["axis"]
+        value = x if axis == 0 else (y if axis == 1 else z)
+        node = ref
+        side = np.uint32(value >= pool.inner[ref]["split"])
+    index, i = np.uint32(point // np.uint32(BUCKET)), np.uint32(point % np.uint32(BUCKET))
+    if ref != index | LEAF_BIT:
+        return False
+    if inside:
+        if job["phase"] == COPYING:
+            save_leaf(pool, work, index, live_bits(pool.leaf, index, label))
+        log_operation(work, DROP, cell)
+        cell[0], cell[1], cell[2] = x, y, z
+        log_operation(work, INSERT, cell)
+    leaf = pool.leaf[index]
+    leaf["x"][i] = x
+    leaf["y"][i] = y
+    leaf["z"][i] = z
+    return True
+
+
+@kernel
 def update_batch(
     pool: Pool,
     work: Work,
@@ -161,7 +215,8 @@ def update_batch(
     """Apply the operations `begin` to `end` below a slot, in order: to the tree, or to a new subtree from the log.
 
     Returns the number of the next operation: less than `end` if room ran out or the tree became too deep. `changed` of the
-    job is increased by the number of points deleted, revived and (of those given) stored.
+    job is increased by the number of points deleted, revived and (of those given) stored, `replaced` by those of the
+    latter that took the place of another one.
     """
     job = work.job[0]
     cell, best, box = work.scratch[:9], work.scratch[9:13], work.scratch[13:19]
@@ -182,7 +237,7 @@ def update_batch(
         stored = np.int64(kind != DROP)
         if kind == INSERT_DOWNSAMPLED:
             set_cell(x, y, z, origin, cell_size, cell)
-            found, has_dead = search_cell(pool, node, side, work.cell_stack, cell, best)
+            found, has_dead, nearest = search_cell(pool, node, side, work.cell_stack, cell, best)
             if found > 0:
                 dx, dy, dz = x - cell[6], y - cell[7], z - cell[8]
                 if best[3] <= dx * dx + dy * dy + dz * dz:
@@ -190,6 +245,10 @@ def update_batch(
                         continue
                     x, y, z = best[0], best[1], best[2]
                     stored = np.int64(0)
+                elif found == 1 and not has_dead and replace_point(pool, work, node, side, x, y, z, cell, nearest):
+                    job["changed"] += 1
+                    job["replaced"] += 1
+                    continue
             drop = found > 0 or has_dead
             for i in range(6):
                 box[i] = cell[i]

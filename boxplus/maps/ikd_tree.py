@@ -13,16 +13,10 @@ from boxplus.errors import InputError
 from boxplus.maps.ikd_batch import update_batch
 from boxplus.maps.ikd_check import check_tree
 from boxplus.maps.ikd_collect import collect, nearest_batch
+from boxplus.maps.ikd_input import as_corner, as_points, round_down, round_up
 from boxplus.maps.ikd_job import Rebuilder, build_pool, new_work
 from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import (
-    LEFT,
-    ROOT,
-    new_pool,
-    pool_bytes,
-    reserve,
-    slot_counts,
-)
+from boxplus.maps.ikd_pool import LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
 from boxplus.maps.ikd_rebuild import settle
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH, IkdView
 from boxplus.maps.ikd_update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPTH, OPERATION, REVIVE
@@ -33,7 +27,7 @@ IN_PLACE = 1500  # points; larger subtrees are rebuilt in slices
 _CHECK = 6 * BUCKET  # smaller subtrees are not checked for balance: a few leaves cannot always be halved
 _BATCH = 2048  # points inserted in one kernel call
 _BUDGET = 20_000  # point visits of a rebuild a call ...
-_BUDGET_PER_POINT = 300  # ... and for every point the call changed
+_BUDGET_PER_POINT = 800  # ... and for every point the call added or removed: large enough that a rebuild is over soon
 _ROOM = 128  # nodes made ready for a kernel call; it stops and asks again when they are used up
 _QUERY_CHUNK = 2048
 
@@ -127,7 +121,7 @@ class IkdTree:
         Raises:
             InputError: wrong shape.
         """
-        world = _as_points(points, "points")
+        world = as_points(points, "points")
         self._rebuilder.cancel(self._pool)
         self._placed = False
         relative, not_finite, too_far = self._to_relative(world)
@@ -148,7 +142,7 @@ class IkdTree:
         """
         if downsample and self.cell_size is None:
             raise InputError("a cell_size for a downsampled insert", "none", "give IkdTree a cell_size, or insert all points")
-        relative, not_finite, too_far = self._to_relative(_as_points(points, "points"))
+        relative, not_finite, too_far = self._to_relative(as_points(points, "points"))
         operations = np.empty(len(relative), OPERATION)
         operations["box"][:, :3] = relative
         operations["kind"] = INSERT_DOWNSAMPLED if downsample else INSERT
@@ -161,9 +155,9 @@ class IkdTree:
         Raises:
             InputError: wrong shape.
         """
-        relative, _, _ = self._to_relative(_as_points(points, "points"))
+        relative, _, _ = self._to_relative(as_points(points, "points"))
         centers = relative.astype(np.float64)
-        low, high = _round_up(centers - DELETE_TOLERANCE), _round_up(np.nextafter(centers + DELETE_TOLERANCE, np.inf))
+        low, high = round_up(centers - DELETE_TOLERANCE), round_up(np.nextafter(centers + DELETE_TOLERANCE, np.inf))
         return self._delete(np.concatenate([low, high], axis=1))
 
     def delete_box(self, lo: ArrayLike, hi: ArrayLike) -> int:
@@ -205,7 +199,7 @@ class IkdTree:
         Raises:
             InputError: wrong shape, k below 1, or a negative range.
         """
-        world = _as_points(queries, "queries")
+        world = as_points(queries, "queries")
         if k < 1:
             raise InputError("k of at least 1", str(k), "ask for one neighbour or more")
         if not max_distance >= 0:
@@ -213,7 +207,7 @@ class IkdTree:
         relative = (world - self.origin).astype(np.float32)
         size = len(relative)
         result = Neighbors(np.empty((size, k)), np.empty((size, k, 3)), np.empty(size, np.int64))
-        max_sq = _round_down(float(max_distance) ** 2)
+        max_sq = round_down(float(max_distance) ** 2)
         view = self.view()
 
         def work(_: int, begin: int, end: int) -> None:
@@ -231,11 +225,11 @@ class IkdTree:
         """
         if not radius >= 0:
             raise InputError("radius of at least 0 m", str(radius), "give a radius in metres")
-        x, y, z = (_as_corner(center, "center") - self.origin).astype(np.float32)
+        x, y, z = (as_corner(center, "center") - self.origin).astype(np.float32)
         margin = radius * (1.0 + 1e-6) + 1e-3
         middle = np.array([x, y, z], np.float64)
         box = np.concatenate([middle - margin, middle + margin]).astype(np.float32)
-        return self._collect(box, x, y, z, _round_down(radius**2))
+        return self._collect(box, x, y, z, round_down(radius**2))
 
     def box_search(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
         """The live points with `lo ≤ p < hi` on every axis, (3,) each [m]: (K, 3), ordered by x, y, z.
@@ -318,7 +312,7 @@ class IkdTree:
         changed = 0
         for begin in range(0, len(operations), _BATCH):
             row, end = begin, min(begin + _BATCH, len(operations))
-            self._job["changed"] = 0
+            self._job["changed"] = self._job["replaced"] = 0
             self._begin_update(2 * (end - begin) + 2)
             while row < end:
                 reserve(self._pool, _ROOM, _ROOM)
@@ -328,7 +322,7 @@ class IkdTree:
                 if self._job["depth"] > MAX_DEPTH:
                     self._rebuild_all()
             changed += int(self._job["changed"])
-            self._end_update(int(self._job["changed"]))
+            self._end_update(int(self._job["changed"] - self._job["replaced"]))
         return changed
 
     def _begin_update(self, operations: int) -> None:
@@ -390,8 +384,8 @@ class IkdTree:
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""
-        corners = np.concatenate([_as_corner(lo, "lo") - self.origin, _as_corner(hi, "hi") - self.origin])
-        return _round_up(corners)[None, :]
+        corners = np.concatenate([as_corner(lo, "lo") - self.origin, as_corner(hi, "hi") - self.origin])
+        return round_up(corners)[None, :]
 
     def _collect(
         self, box: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32, max_sq: np.float32
@@ -404,34 +398,3 @@ class IkdTree:
             collect(self.view(), box, x, y, z, max_sq, out, stack)
         out = out[:found]
         return out[np.lexsort(out.T[::-1])].astype(np.float64) + self.origin
-
-
-def _as_points(points: ArrayLike, name: str) -> NDArray[np.float64]:
-    array = np.asarray(points)
-    if array.size == 0 and array.ndim <= 2 and array.shape[-1:] in ((0,), (3,)):
-        return np.empty((0, 3))
-    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{name} as numbers of shape (N, 3)", f"{array.dtype} of shape {array.shape}", "give one row x, y, z per point"
-        )
-    return array.astype(np.float64, copy=False)
-
-
-def _as_corner(corner: ArrayLike, name: str) -> NDArray[np.float64]:
-    array = np.asarray(corner, dtype=np.float64)
-    if array.shape != (3,) or np.isnan(array).any():
-        raise InputError(f"{name} as three numbers x, y, z", f"{array.tolist()}", "give coordinates in metres")
-    return array
-
-
-def _round_up(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The smallest float32 not less than each value."""
-    rounded = values.astype(np.float32)
-    return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
-
-
-def _round_down(value: float) -> np.float32:
-    """The largest float32 not greater than a value."""
-    with np.errstate(over="ignore"):
-        rounded = np.float32(value)
-    return np.nextafter(rounded, np.float32(-np.inf)) if float(rounded) > value else rounded

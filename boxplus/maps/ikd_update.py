@@ -66,6 +66,7 @@ JOB = np.dtype(
         ("check", np.uint32),  # no balance check up to this size
         ("live", np.int64),  # live points of the tree
         ("changed", np.int64),  # points deleted, revived and stored by the last call
+        ("replaced", np.int64),  # of these, points stored in the place of another one
     ],
     align=True,
 )
@@ -165,12 +166,12 @@ def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
 def extend_box(pool: Pool, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> None:
     """Let the box of a slot cover a point."""
     box = pool.inner[node]["box"]
-    box[side, 0] = min(box[side, 0], x)
-    box[side, 1] = min(box[side, 1], y)
-    box[side, 2] = min(box[side, 2], z)
-    box[side, 3] = max(box[side, 3], x)
-    box[side, 4] = max(box[side, 4], y)
-    box[side, 5] = max(box[side, 5], z)
+    box[side, 0] = x if x < box[side, 0] else box[side, 0]
+    box[side, 1] = y if y < box[side, 1] else box[side, 1]
+    box[side, 2] = z if z < box[side, 2] else box[side, 2]
+    box[side, 3] = x if x > box[side, 3] else box[side, 3]
+    box[side, 4] = y if y > box[side, 4] else box[side, 4]
+    box[side, 5] = z if z > box[side, 5] else box[side, 5]
 
 
 @kernel
