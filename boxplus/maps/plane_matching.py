@@ -69,14 +69,15 @@ def match_planes(
         near = neighbours[n]
         # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
         known = n if warm else n - 1
+        qx, qy, qz = np.float32(yx), np.float32(yy), np.float32(yz)  # far from the origin, rounding exceeds the slack
         bound = max_distance_sq
         if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
             farthest = 0.0
             for i in range(NEIGHBOURS):
-                dx, dy, dz = neighbours[known, i, 0] - yx, neighbours[known, i, 1] - yy, neighbours[known, i, 2] - yz
-                farthest = max(farthest, dx * dx + dy * dy + dz * dz)
+                dx, dy, dz = neighbours[known, i, 0] - qx, neighbours[known, i, 1] - qy, neighbours[known, i, 2] - qz
+                farthest = max(farthest, np.float64(dx * dx + dy * dy + dz * dz))
             bound = min(bound, farthest * _SLACK)
-        count = knn5(view, np.float32(yx), np.float32(yy), np.float32(yz), np.float32(bound), near, found_sq, stack)
+        count = knn5(view, qx, qy, qz, np.float32(bound), near, found_sq, stack)
         if count < NEIGHBOURS:
             fate[n] = FEW_NEIGHBOURS
             continue
