@@ -139,3 +139,20 @@ def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float) -> N
 def test_an_empty_map_has_no_planes() -> None:
     points = np.ones((3, 3), np.float32)
     assert np.all(_match(IkdTree(), NavState.identity(), points).fate == FEW_NEIGHBOURS)
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_no_neighbour_is_lost_far_from_the_origin_of_the_map(seed: int) -> None:
+    _, world, x, points = _corner(seed)
+    far = np.array([4000.0, 3000.0, 0.0])
+    tree = IkdTree(np.zeros((1, 3)))  # puts the origin at zero
+    tree.insert(world + far)
+    x = NavState(x.R_world_imu, x.p_world_imu + far, *(np.zeros(3),) * 4, x.R_imu_lidar, x.p_imu_lidar)
+    first = _match(tree, x, points)
+    found = first.fate != FEW_NEIGHBOURS
+    again = _match(tree, x, points, Match(first.neighbours.copy(), first.planes.copy(), first.fate.copy()))
+    np.testing.assert_array_equal(again.fate, first.fate)
+    np.testing.assert_array_equal(again.neighbours[found], first.neighbours[found])
+    alone = np.concatenate([_match(tree, x, point[None]).fate for point in points])  # no point before bounds the search
+    np.testing.assert_array_equal(alone, first.fate)
