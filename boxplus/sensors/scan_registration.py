@@ -228,7 +228,9 @@ def _grid(points: NDArray[np.float64], size: float) -> tuple[NDArray[np.intp], N
 
 def _normals(points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Which of the points (N, 3) have neighbours that form a plane (N,), and the normals of those (M, 3)."""
-    _, index = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    if len(points) < _NEIGHBOURS:  # a covered sensor sees a single spot
+        return np.zeros(len(points), dtype=np.bool_), np.zeros((0, 3))
+    _, index = cKDTree(points).query(points, k=_NEIGHBOURS)
     neighbours = points[index]
     centred = neighbours - neighbours.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))

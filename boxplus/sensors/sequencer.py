@@ -13,6 +13,9 @@ import numpy as np
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
+_GYRO_LIMIT, _ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
+_LONGEST_SCAN_NS = 1_000_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -32,6 +35,11 @@ class Frame:
     covered: bool
     largest_gap_s: float
 
+    @property
+    def duration_s(self) -> float:
+        """Time from the end of the previous frame to the end of the scan [s]."""
+        return (self.scan.end_ns - self.begin_ns) * 1e-9
+
 
 class Sequencer:
     """Pairs scans with IMU samples.
@@ -44,7 +52,7 @@ class Sequencer:
 
     _MAX_JUMP_PROOF = 10
 
-    def __init__(self, max_wait_s: float = 0.5, max_jump_s: float = 10.0) -> None:
+    def __init__(self, max_wait_s: float = 0.5, max_jump_s: float = 1.0) -> None:
         self.rejected: Counter[str] = Counter()
         self._max_wait_ns = int(max_wait_s * 1e9)
         self._max_jump_ns = int(max_jump_s * 1e9)
@@ -62,6 +70,11 @@ class Sequencer:
             return
         finite = np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
         self.rejected["IMU sample not finite"] += int((~finite).sum())
+        # NaN compares false, so what is not finite is not counted twice.
+        beyond = (np.abs(samples.gyro) > _GYRO_LIMIT).any(axis=1) | (np.abs(samples.accel) > _ACCEL_LIMIT).any(axis=1)
+        if (beyond & finite).any():
+            self.rejected["IMU sample beyond any sensor"] += int((beyond & finite).sum())
+        finite &= ~beyond
         time = samples.time_ns
         keep = np.zeros(len(samples), dtype=bool)
         for i in np.flatnonzero(finite):
@@ -87,6 +100,8 @@ class Sequencer:
         if not len(scan):
             self.rejected["scan without a valid point"] += 1
             return
+        if scan.end_ns - scan.start_ns > _LONGEST_SCAN_NS:
+            scan = self._without_strays(scan)
         newest = self._newest_scan_end_ns
         if newest is not None:
             if scan.end_ns == newest:
@@ -95,13 +110,24 @@ class Sequencer:
             if scan.end_ns < newest:
                 self.rejected["scan going back in time"] += 1
                 return
-            if scan.end_ns - newest > self._max_jump_ns and self._scan_jumps < self._MAX_JUMP_PROOF:
+            # Where the IMU has gone as far, the time has really passed.
+            ahead = scan.end_ns - max(newest, self._last_imu_ns or newest)
+            if ahead > self._max_jump_ns and self._scan_jumps < self._MAX_JUMP_PROOF:
                 self._scan_jumps += 1
                 self.rejected["scan jumping ahead in time"] += 1
                 return
         self._scan_jumps = 0
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)
+
+    def _without_strays(self, scan: Scan) -> Scan:
+        """A scan that takes impossibly long: only its points within half a second of the median time; the others are counted."""
+        middle = int(np.partition(scan.time_ns, len(scan) // 2)[len(scan) // 2])
+        near = np.abs(scan.time_ns - middle) < _LONGEST_SCAN_NS // 2
+        self.rejected["point with a time far from its scan"] += int((~near).sum())
+        time = scan.time_ns[near]
+        intensity = None if scan.intensity is None else scan.intensity[near]
+        return Scan(scan.p_lidar[near], time, intensity, int(time.min()), int(time.max()), scan.rejected)
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
         """The frames that are complete by now; with `flush`, also those that never will be."""

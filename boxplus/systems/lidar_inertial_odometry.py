@@ -64,6 +64,7 @@ class LidarInertialOdometry:
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
+        self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._time_ns = 0
@@ -132,6 +133,7 @@ class LidarInertialOdometry:
             return []
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
+        self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         first, *rest = self._waiting
@@ -159,15 +161,14 @@ class LidarInertialOdometry:
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
-        x, cov, time_ns = self._x.copy(), self._cov.copy(), self._time_ns
-        seconds = (frame.scan.end_ns - time_ns) * 1e-9
-        motion_before = mean_motion(self._x_before, x, seconds)
+        x, cov = self._x.copy(), self._cov.copy()
+        seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
         for _ in range(_BLIND_PASSES):
-            points = self._voxel_filter(self._propagate(frame))[0]
+            points = self._voxel_filter(self._deskew(frame, self._density)[0])[0]
             fits = align(points, self.map, self._x, self.config)
             # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
-            motion = 0.5 * (motion_before + mean_motion(x, self._x, seconds))
-            self._x[:], self._cov[:], self._time_ns = x, cov, time_ns
+            motion = 0.5 * (self._motion + mean_motion(x, self._x, seconds))
+            self._x[:], self._cov[:] = x, cov
             if not fits:
                 break
             frame = replace(frame, imu=with_turn_rate(frame, motion[0], x))
@@ -176,16 +177,21 @@ class LidarInertialOdometry:
 
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
-        scan = frame.scan
         self._x_before = self._x.copy()
         self._warnings = self._saturation.update(frame.imu)
         density = np.maximum(self._density, _SATURATED_DENSITY) if self._warnings else self._density
+        p_lidar, nodes = self._deskew(frame, density)
+        self._time_ns = frame.scan.end_ns
+        self._excitation.add(nodes)
+        return p_lidar
+
+    def _deskew(self, frame: Frame, density: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """State and covariance move to the end of the scan; returns its points as seen from there, and the nodes."""
+        scan = frame.scan
         nodes = self._carry(self._x, self._cov, frame.imu, scan.end_ns, density)
         p_lidar = np.zeros_like(scan.p_lidar)
         deskew_into(scan.p_lidar, (scan.time_ns - self._time_ns) * 1e-9, nodes, len(nodes), self._x, p_lidar)
-        self._time_ns = scan.end_ns
-        self._excitation.add(nodes)
-        return p_lidar
+        return p_lidar, nodes
 
     def _carry(
         self,
@@ -258,23 +264,27 @@ class LidarInertialOdometry:
             last_but_one = iteration == config.max_iterations - 1
             rematch = converged or (last_but_one and not converged_before)
             converged_before |= converged
+        used = information.used if information is not None else 0
+        rejected = dict(measurement.rejected())
+        # A point among map points of one scan line is not used, but it does lie on the map.
+        on_map = (0 if lost else used + rejected.get(REASONS[ONE_LINE], 0)) / max(len(points), 1)
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, on_map)
+        # After a gap of the IMU nothing but the points says where the platform is: too few of them say nothing.
+        astray = frame.largest_gap_s > config.max_imu_gap and on_map < config.min_matched_share
+        lost |= astray or self._consistency.lost
         if lost:
             self._x[:] = x_prior
+            rejected["scan without an update"] = used
+            used = 0
         else:
             self._cov[:] = posterior
             move_covariance(self._cov, delta)
+        self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
         clock.lap("update")
-        if not lost or len(self.map) == 0:
+        # Where the map has been left for good, a new one begins at the predicted pose.
+        if not lost or len(self.map) == 0 or self._consistency.lost:
             self._insert(map_points)
         clock.lap("map insertion")
-        rejected = dict(measurement.rejected())
-        if lost and information is not None and information.used:
-            rejected["scan without an update"] = information.used
-        used = information.used if information is not None and not lost else 0
-        # A point among map points of one scan line is not used, but it does lie on the map.
-        on_map = used + rejected.get(REASONS[ONE_LINE], 0)
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, on_map / max(len(points), 1))
-        lost |= self._consistency.lost
         status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
         return self._estimate(
             frame,
