@@ -35,7 +35,7 @@ class _Commands(TyperGroup):
         """A stand-in with the help text, which is all a listing needs."""
         if cmd_name not in _COMMANDS:
             return None
-        stand_in = typer.Typer(add_completion=False)
+        stand_in = typer.Typer(add_completion=False, rich_markup_mode=None)
         stand_in.command(cmd_name, help=_COMMANDS[cmd_name][1])(lambda: None)
         return typer.main.get_command(stand_in)
 
@@ -46,7 +46,7 @@ class _Commands(TyperGroup):
         module, _, attribute = _COMMANDS[name][0].partition(":")
         found = getattr(importlib.import_module(module), attribute)
         if not isinstance(found, typer.Typer):
-            single = typer.Typer(add_completion=False)
+            single = typer.Typer(add_completion=False, rich_markup_mode=None)
             single.command(name)(found)
             found = single
         return name, typer.main.get_command(found), rest
@@ -68,6 +68,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # brackets in help texts are units and extras, not markup
     context_settings={"help_option_names": ["-h", "--help"]},
     help="boxplus: LiDAR-inertial odometry and its tools.",
 )

@@ -7,7 +7,13 @@ from typing import Annotated
 
 import typer
 
-map_app = typer.Typer(name="map", help="Look into a map folder, or merge its tiles into one file.", no_args_is_help=True)
+map_app = typer.Typer(
+    name="map",
+    help="Look into a map folder, or merge its tiles into one file.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
 
 _Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote.", metavar="FOLDER")]
 

@@ -26,6 +26,12 @@ def test_every_command_has_help_of_its_own(name: str) -> None:
     assert f" {name} " in result.stdout
 
 
+def test_help_keeps_what_stands_in_brackets() -> None:
+    result = CliRunner().invoke(app, ["lio", "--help"], env={"COLUMNS": "120"})
+    assert "boxplus[view]" in result.stdout
+    assert "[m]" in result.stdout
+
+
 def test_version() -> None:
     result = CliRunner().invoke(app, ["--version"])
     assert (result.exit_code, result.stdout) == (0, f"boxplus {boxplus.__version__}\n")
