@@ -100,7 +100,9 @@ class RunTerminal:
         table.add_row("path length", f"{summary.path_length_m:.2f} m in {summary.duration_s:.1f} s")
         if timing.scan_ms is not None:
             table.add_row("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms")
-        table.add_row("speed", f"{timing.real_time_factor:.1f} × real time, reading included; {timing.total_s:.1f} s in all")
+        compiled = " (with compilation)" if timing.compiled_kernels else ""
+        speed = f"{timing.real_time_factor:.1f} × real time{compiled}, reading included; {timing.total_s:.1f} s in all"
+        table.add_row("speed", speed)
         table.add_row("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept")
         console.print(table)
         for warning in summary.warnings[:_SHOWN_WARNINGS]:
