@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from boxplus.errors import InputError
+
 map_app = typer.Typer(
     name="map",
     help="Look into a map folder, or merge its tiles into one file.",
@@ -15,7 +17,13 @@ map_app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote.", metavar="FOLDER")]
+_Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote, or the output folder of the run.", metavar="FOLDER")]
+
+
+def _tiles(folder: Path) -> Path:
+    """The map folder: the one given, or the one inside the output folder of a run."""
+    inner = folder / "map"
+    return inner if (folder / "run.json").is_file() and inner.is_dir() else folder
 
 
 @map_app.command("info")
@@ -23,7 +31,7 @@ def info_command(folder: _Folder) -> None:
     """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
     from boxplus.maps.tile_store import TileStore
 
-    store = TileStore.open(folder)
+    store = TileStore.open(_tiles(folder))
     size = store.manifest.tile_size_m
     thinning = "every point" if store.manifest.voxel_m is None else f"one point per {store.manifest.voxel_m:g} m voxel"
     typer.echo(f"{folder}: {store.point_count:,} points in {len(store.counts)} tiles of {size:g} m, {thinning}")
@@ -42,13 +50,18 @@ def merge_command(
     ply: Annotated[Path | None, typer.Option(help="PLY file to write; default without --pcd: FOLDER.ply.")] = None,
     pcd: Annotated[Path | None, typer.Option(help="PCD file to write.")] = None,
     voxel: Annotated[float | None, typer.Option(help="Keep one point per voxel of this edge [m].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write all tiles of a map into one PLY and/or PCD file."""
     from boxplus.maps.tile_store import TileStore, merge
 
-    for sentence in TileStore.open(folder).report:
+    tiles = _tiles(folder)
+    for sentence in TileStore.open(tiles).report:
         typer.echo(f"warning: {sentence}", err=True)
     if ply is None and pcd is None:
-        ply = folder.resolve().with_suffix(".ply")
-    count = merge(folder, ply, pcd, voxel)
+        ply = tiles.resolve().parent / f"{tiles.resolve().name}.ply"
+    for path in (ply, pcd):
+        if path is not None and path.exists() and not overwrite:
+            raise InputError("a new file", f"{path}, which exists", "give another path, or --overwrite")
+    count = merge(tiles, ply, pcd, voxel)
     typer.echo(f"{count:,} points → {' and '.join(str(path) for path in (ply, pcd) if path is not None)}")

@@ -39,6 +39,27 @@ def test_merge(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").intensity, [3.0, 1.0])
 
 
+def test_merge_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.ply").write_text("mine")
+    result = CliRunner().invoke(map_app, ["merge", str(folder)])
+    assert isinstance(result.exception, InputError)
+    assert (tmp_path / "map.ply").read_text() == "mine"
+    assert CliRunner().invoke(map_app, ["merge", str(folder), "--overwrite"]).exit_code == 0
+    assert len(read_ply(tmp_path / "map.ply")) == 3
+
+
+def test_the_output_folder_of_a_run_will_do(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    assert "3 points in 2 tiles" in CliRunner().invoke(map_app, ["info", str(tmp_path)]).output
+
+
+def test_a_dot_in_the_folder_is_kept(tmp_path: Path) -> None:
+    with TileWriter(tmp_path / "map.v1") as writer:
+        writer.append([[1.0, 2.0, 3.0]])
+    assert CliRunner().invoke(map_app, ["merge", str(tmp_path / "map.v1")]).exit_code == 0
+    assert (tmp_path / "map.v1.ply").is_file()
+
+
 def test_merge_of_an_interrupted_run_warns(folder: Path) -> None:
     writer = TileWriter(folder)
     result = CliRunner().invoke(map_app, ["merge", str(folder)])
