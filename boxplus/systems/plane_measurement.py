@@ -16,7 +16,6 @@ from boxplus.filtering.plane_information import (
     MEASURED_DOF,
     NOT_A_PLANE,
     ONE_LINE,
-    USED,
     accumulate_planes,
 )
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH
@@ -109,11 +108,6 @@ class PlaneMeasurement:
         """Points that were not used, by reason."""
         counts = np.bincount(self._fate, minlength=5)
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
-
-    def used_mask(self) -> NDArray[np.bool_]:
-        """(n,) which points were used in the last iteration."""
-        mask: NDArray[np.bool_] = self._fate == USED
-        return mask
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config

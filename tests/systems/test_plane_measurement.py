@@ -54,7 +54,7 @@ def test_every_point_is_used_or_counted(seed: int) -> None:
     measurement = _measure(_look(world, x), tree, with_extrinsic=True)
     information = measurement.at(x.pack(), rematch=True)
     assert information.used + sum(measurement.rejected().values()) == len(world)
-    assert measurement.used_mask().sum() == information.used > 100
+    assert information.used > 100
     assert measurement.rejected()["fewer than five map points near"] >= 1
     assert np.array_equal(information.A, information.A.T)
     assert np.linalg.eigvalsh(information.A).min() > -1e-6 * np.trace(information.A)
