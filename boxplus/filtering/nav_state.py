@@ -91,6 +91,12 @@ class NavState:
             x[R:P].reshape(3, 3), x[P:V], x[V:BW], x[BW:BA], x[BA:G], x[G:RL], x[RL:PL].reshape(3, 3), x[PL:PACKED]
         )  # fmt: skip
 
+    def to_world(self, p_lidar: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Points (N, 3) of the LiDAR frame in the world."""
+        p_imu = p_lidar @ self.R_imu_lidar.T + self.p_imu_lidar
+        p_world: NDArray[np.float64] = p_imu @ self.R_world_imu.T + self.p_world_imu
+        return p_world
+
     def boxplus(self, delta: NDArray[np.float64]) -> NavState:
         """x ⊞ δ with δ (24,)."""
         x = self.pack()

@@ -302,9 +302,7 @@ class LidarInertialOdometry:
         )
 
     def _insert(self, points: NDArray[np.float32]) -> None:
-        state = NavState.unpack(self._x)
-        p_imu = points @ state.R_imu_lidar.T + state.p_imu_lidar
-        self.map.insert(p_imu @ state.R_world_imu.T + state.p_world_imu, downsample=True)
+        self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True)
 
     def _estimate(
         self,

@@ -112,8 +112,7 @@ def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState)
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), config.max_points)
     for frame in frames[:_REST_SCANS]:
-        p_imu = voxel_filter(frame.scan.p_lidar)[1] @ extrinsic.R_imu_lidar.T + extrinsic.p_imu_lidar
-        tree.insert(p_imu, downsample=True)
+        tree.insert(extrinsic.to_world(voxel_filter(frame.scan.p_lidar)[1]), downsample=True)
     unmoved, aligned = [], []
     for frame in frames[-_REST_SCANS:]:
         points = voxel_filter(frame.scan.p_lidar)[0]
@@ -205,8 +204,7 @@ class _LidarPath:
             now = NavState.unpack(x)
             self.rotations.append(now.R_world_imu)
             self.positions.append(now.p_world_imu)
-            p_imu = map_points @ now.R_imu_lidar.T + now.p_imu_lidar
-            tree.insert(p_imu @ now.R_world_imu.T + now.p_world_imu, downsample=True)
+            tree.insert(now.to_world(map_points), downsample=True)
 
     @property
     def first_velocity(self) -> NDArray[np.float64]:
