@@ -1,0 +1,1 @@
+"""Camera models: projection of points into pixels and its derivatives."""

@@ -1,0 +1,128 @@
+"""What every error term of the library is: a group of N residuals of one kind, held as arrays."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds.manifold import Manifold
+from boxplus.residuals.whitening import Whitening
+
+
+@dataclass(frozen=True, slots=True)
+class Linearization:
+    """Residuals and Jacobians of a group, before whitening.
+
+    Attributes:
+        residuals: (N, dim).
+        jacobians: for every connected variable (N, dim, dof): ∂r(x ⊞ δ)/∂δ at δ = 0.
+        valid: (N,) bool; False where the residual is singular (a point behind its camera): its rows are zero.
+    """
+
+    residuals: NDArray[np.float64]
+    jacobians: tuple[NDArray[np.float64], ...]
+    valid: NDArray[np.bool_]
+
+
+class Residual(ABC):
+    """A group of N residuals r(x₀, x₁, …) of one kind with their Jacobians.
+
+    A subclass calls `super().__init__` and gives the two `_into` methods, each one call of a kernel over rows
+    [begin, end): it gathers the variables itself, `x[s][index[s][n]]`, so that nothing is copied.
+
+    Attributes:
+        dim: rows of one residual.
+        count: residuals in the group, N.
+        manifolds: of the connected variables, on the side the Jacobians are derived for.
+        roles: a name for each connected variable, with frames, such as `T_camera_world`.
+        whitening: square root of the information of the residuals.
+    """
+
+    def __init__(
+        self,
+        *,
+        dim: int,
+        count: int,
+        manifolds: tuple[Manifold, ...],
+        roles: tuple[str, ...],
+        whitening: Whitening,
+    ) -> None:
+        self.dim, self.count, self.manifolds, self.roles, self.whitening = dim, count, manifolds, roles, whitening
+
+    @abstractmethod
+    def linearize_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """Residuals, Jacobians and validity of the rows [begin, end), before whitening.
+
+        Args:
+            x: for every connected variable the array (n_s, size_s) it lives in.
+            index: for every connected variable (N,) rows of that array.
+            r: (N, dim); jacobians: (N, dim, dof_s) each; valid: (N,). Rows [begin, end) are written, all of them: an
+                invalid residual writes zeros.
+        """
+
+    @abstractmethod
+    def evaluate_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """As `linearize_into`, residuals and validity only; they must be the same bits."""
+
+    def linearize(self, *x: ArrayLike) -> Linearization:
+        """Residuals and Jacobians with one value of every connected variable for each residual.
+
+        Args:
+            x: for every connected variable (N, size), or (size,) for all residuals alike.
+
+        Raises:
+            InputError: wrong number of variables or wrong shapes.
+        """
+        values, index = self._rows(x)
+        r = np.zeros((self.count, self.dim))
+        jacobians = tuple(np.zeros((self.count, self.dim, manifold.dof)) for manifold in self.manifolds)
+        valid = np.ones(self.count, dtype=np.bool_)
+        self.linearize_into(0, self.count, values, index, r, jacobians, valid)
+        return Linearization(r, jacobians, valid)
+
+    def evaluate(self, *x: ArrayLike) -> NDArray[np.float64]:
+        """Residuals (N, dim), before whitening; arguments as in `linearize`."""
+        values, index = self._rows(x)
+        r = np.zeros((self.count, self.dim))
+        self.evaluate_into(0, self.count, values, index, r, np.ones(self.count, dtype=np.bool_))
+        return r
+
+    def _rows(self, x: tuple[ArrayLike, ...]) -> tuple[tuple[NDArray[np.float64], ...], tuple[NDArray[np.uint32], ...]]:
+        if len(x) != len(self.manifolds):
+            raise InputError(
+                f"{len(self.manifolds)} variables ({', '.join(self.roles)})", f"{len(x)}", "give one array for each of them"
+            )
+        values, index = [], []
+        for role, manifold, given in zip(self.roles, self.manifolds, x, strict=True):
+            array = np.ascontiguousarray(np.atleast_2d(np.asarray(given, dtype=np.float64)))
+            if array.ndim != 2 or array.shape[1] != manifold.size or len(array) not in (1, self.count):
+                raise InputError(
+                    f"{role} of shape ({self.count}, {manifold.size}) or ({manifold.size},) on {manifold.name}",
+                    f"shape {np.shape(given)}",
+                    "give one row for each residual, or one for all",
+                )
+            values.append(array)
+            rows = np.arange(self.count) if len(array) == self.count else np.zeros(self.count)
+            index.append(rows.astype(np.uint32))
+        return tuple(values), tuple(index)

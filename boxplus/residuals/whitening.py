@@ -1,0 +1,128 @@
+"""The square root of a residual's information: r is whitened to W r with WᵀW = Ω = Σ⁻¹ (SPEC.md 2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+_SYMMETRY = 1e-6  # largest asymmetry, of the largest entry, that counts as rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Whitening:
+    """Square-root information of a group.
+
+    Attributes:
+        factors: W, (1, d, d) where all residuals share one, else (N, d, d).
+        is_diagonal: every W is diagonal.
+    """
+
+    factors: NDArray[np.float64]
+    is_diagonal: bool
+
+    @classmethod
+    def of(
+        cls,
+        dim: int,
+        count: int,
+        *,
+        sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+    ) -> Whitening:
+        """From exactly one description of the noise; none of them stands for σ = 1.
+
+        Args:
+            dim, count: d rows of a residual, N residuals.
+            sigma: standard deviation in the unit of the residual: a number, (d,), (N, 1) or (N, d).
+            covariance, information: (d, d) or (N, d, d), symmetric and positive definite.
+
+        Raises:
+            InputError: two descriptions, a wrong shape, a sigma that is not positive and finite, a matrix that is not
+                finite, symmetric and positive definite; the message names the first residual concerned.
+        """
+        given = [
+            name
+            for name, value in (("sigma", sigma), ("covariance", covariance), ("information", information))
+            if value is not None
+        ]
+        if len(given) > 1:
+            raise InputError(
+                "one of sigma, covariance, information", " and ".join(given), "they say the same thing: leave out the others"
+            )
+        if covariance is not None:
+            return cls(_from_matrix("covariance", covariance, dim, count, inverse=True), False)
+        if information is not None:
+            return cls(_from_matrix("information", information, dim, count, inverse=False), False)
+        return cls._from_sigma(1.0 if sigma is None else sigma, dim, count)
+
+    @classmethod
+    def _from_sigma(cls, sigma: ArrayLike, dim: int, count: int) -> Whitening:
+        array = np.asarray(sigma, dtype=np.float64)
+        if array.shape not in ((), (dim,), (count, 1), (count, dim)):
+            raise InputError(
+                f"sigma as a number, ({dim},), ({count}, 1) or ({count}, {dim})",
+                f"shape {array.shape}",
+                "give a standard deviation for each row of a residual",
+            )
+        bad = ~(np.isfinite(array) & (array > 0.0))
+        if bad.any():
+            where = tuple(int(i) for i in np.argwhere(bad)[0])
+            raise InputError(
+                "sigma positive and finite",
+                f"{array[where]} at {where}",
+                "remove the residual instead of giving it no or infinite weight",
+            )
+        if array.ndim < 2:
+            diagonal = np.broadcast_to(1.0 / array, (1, dim))
+        else:
+            diagonal = np.broadcast_to(1.0 / array, (count, dim))
+        factors = np.zeros((len(diagonal), dim, dim))
+        factors[:, np.arange(dim), np.arange(dim)] = diagonal
+        return cls(factors, True)
+
+    def rows(self, selected: NDArray[np.intp]) -> Whitening:
+        """The whitening of the residuals `selected` alone."""
+        return self if len(self.factors) == 1 else Whitening(self.factors[selected], self.is_diagonal)
+
+
+def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse: bool) -> NDArray[np.float64]:
+    """W (1 or N, d, d) of an information matrix, or of a covariance when `inverse`."""
+    array = np.asarray(matrix, dtype=np.float64)
+    if array.shape not in ((dim, dim), (count, dim, dim)):
+        raise InputError(
+            f"{name} of shape ({dim}, {dim}) or ({count}, {dim}, {dim})",
+            f"shape {array.shape}",
+            "one matrix for all residuals, or one for each",
+        )
+    array = array.reshape(-1, dim, dim)
+    finite = np.isfinite(array).all(axis=(1, 2))
+    if not finite.all():
+        raise InputError(
+            f"{name} finite", f"NaN or infinity in residual {int(np.argmin(finite))}", "remove the residual or repair its weight"
+        )
+    scale = np.abs(array).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(array - np.swapaxes(array, 1, 2)).max(axis=(1, 2), initial=0.0)
+    if (asymmetry > _SYMMETRY * scale).any():
+        n = int(np.argmax(asymmetry > _SYMMETRY * scale))
+        raise InputError(
+            f"{name} symmetric",
+            f"an asymmetry of {asymmetry[n]:.3g} in residual {n}",
+            "check the order in which its entries were read",
+        )
+    eigenvalues = np.linalg.eigvalsh(array)
+    positive = eigenvalues[:, 0] > 1e-14 * np.maximum(eigenvalues[:, -1], 0.0)
+    if not positive.all():
+        n = int(np.argmin(positive))
+        raise InputError(
+            f"{name} positive definite",
+            f"eigenvalues from {eigenvalues[n, 0]:.3g} to {eigenvalues[n, -1]:.3g} in residual {n}",
+            "a direction without information cannot be whitened: leave it out of the residual",
+        )
+    factor = np.linalg.cholesky(0.5 * (array + np.swapaxes(array, 1, 2)))
+    # Ω = L Lᵀ is whitened by Lᵀ; Σ = C Cᵀ by C⁻¹, which spares the inverse of Σ.
+    return np.ascontiguousarray(np.linalg.inv(factor) if inverse else np.swapaxes(factor, 1, 2))
