@@ -189,8 +189,8 @@ class LidarInertialOdometry:
         """State and covariance move to the end of the scan; returns its points as seen from there, and the nodes."""
         scan = frame.scan
         nodes = self._carry(self._x, self._cov, frame.imu, scan.end_ns, density)
-        p_lidar = np.zeros_like(scan.p_lidar)
-        deskew_into(scan.p_lidar, (scan.time_ns - self._time_ns) * 1e-9, nodes, len(nodes), self._x, p_lidar)
+        p_lidar = np.empty_like(scan.p_lidar)
+        deskew_into(scan.p_lidar, scan.time_ns, self._time_ns, nodes, len(nodes), self._x, p_lidar)
         return p_lidar, nodes
 
     def _carry(

@@ -252,7 +252,7 @@ def deskew_at_constant_velocity(frame: Frame, x: NDArray[np.float64], config: Li
         weightless, cov, time, frame.imu.gyro, np.zeros_like(frame.imu.accel), duration, ones, config.max_imu_gap, ones, nodes
     )
     points = np.zeros_like(frame.scan.p_lidar)
-    deskew_into(frame.scan.p_lidar, (frame.scan.time_ns - frame.begin_ns) * 1e-9, nodes, count, weightless, points)
+    deskew_into(frame.scan.p_lidar, frame.scan.time_ns, frame.begin_ns, nodes, count, weightless, points)
     x[:21] = weightless[:21]
     return points
 

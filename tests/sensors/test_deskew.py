@@ -31,8 +31,8 @@ def _reference(points: np.ndarray, time: np.ndarray, nodes: np.ndarray, x_end: N
 
 
 @settings(max_examples=30)
-@given(seeds, st.sampled_from([0.0, 1.0, 20.0]))
-def test_against_the_formula(seed: int, rate: float) -> None:
+@given(seeds, st.sampled_from([0.0, 1.0, 20.0]), st.booleans())
+def test_against_the_formula(seed: int, rate: float, in_order: bool) -> None:
     random = np.random.default_rng(seed)
     R, R_L = so3.exp(random.normal(size=(2, 3)))
     x = NavState(R, *random.normal(size=(5, 3)), R_L, random.normal(size=3))
@@ -41,10 +41,13 @@ def test_against_the_formula(seed: int, rate: float) -> None:
     packed, nodes = x.pack(), np.zeros((len(imu_time) + 2, NODE))
     count = propagate_interval(packed, np.eye(TANGENT), imu_time, gyro, accel, 0.1, np.ones(4), 1.0, np.ones(4), nodes)
     points = (10.0 * random.normal(size=(60, 3))).astype(np.float32)
-    time = random.uniform(-0.01, 0.11, 60)  # in any order, and a little outside of the scan
+    origin_ns = 1_700_000_000_123_456_789
+    time_ns = random.integers(-10_000_000, 110_000_000, 60)  # in any order, and a little outside of the scan
+    if in_order:
+        time_ns.sort()
     out = np.zeros_like(points)
-    deskew_into(points, time, nodes, count, packed, out)
-    assert np.allclose(out, _reference(points, time, nodes[:count], NavState.unpack(packed)), atol=5e-6)
+    deskew_into(points, origin_ns + time_ns, origin_ns, nodes, count, packed, out)
+    assert np.allclose(out, _reference(points, time_ns * 1e-9, nodes[:count], NavState.unpack(packed)), atol=5e-6)
 
 
 def test_points_at_the_end_of_the_scan_stay() -> None:
@@ -56,8 +59,32 @@ def test_points_at_the_end_of_the_scan_stay() -> None:
     )
     points = random.normal(size=(4, 3)).astype(np.float32)
     out = np.zeros_like(points)
-    deskew_into(points, np.full(4, 0.1), nodes, count, packed, out)
+    deskew_into(points, np.full(4, 100_000_000), 0, nodes, count, packed, out)
     assert np.allclose(out, points, atol=1e-6)
+
+
+def test_the_polynomials_turn_as_the_exponential_does() -> None:
+    # 1000 deg/s held for 0.1 s, which no sample interrupts: over 100 m, less than half the spacing of float32 (7.6e-6 m) is
+    # the bound of the series, the rest is rounding.
+    packed, nodes = NavState.identity().pack(), np.zeros((5, NODE))
+    gyro, accel = np.tile([10.0, -10.0, 10.2], (2, 1)), np.zeros((2, 3))
+    packed[21:24] = 0.0
+    count = propagate_interval(
+        packed, np.eye(TANGENT), np.array([0.0, 0.1]), gyro, accel, 0.1, np.ones(4), 1.0, np.ones(4), nodes
+    )
+    assert count == 1
+    time_ns = np.arange(0, 100_000_000, 100_000)
+    points = np.tile(np.array([[60.0, -80.0, 5.0]], np.float32), (len(time_ns), 1))
+    out = np.zeros_like(points)
+    deskew_into(points, time_ns, 0, nodes, count, packed, out)
+    exact = _reference(points, time_ns * 1e-9, nodes[:count], NavState.unpack(packed))
+    assert np.linalg.norm(out - exact, axis=1).max() < 100.0 * 3.4e-8 + 7e-6
+
+
+def test_without_points_nothing_happens() -> None:
+    deskew_into(
+        np.zeros((0, 3), np.float32), np.zeros(0, np.int64), 0, np.zeros((1, NODE)), 1, np.zeros(36), np.zeros((0, 3), np.float32)
+    )
 
 
 @pytest.mark.parametrize("scenario", ["walk", "stress_fast", "spin"])
@@ -82,7 +109,7 @@ def test_a_moving_scan_becomes_the_rigid_one(scenario: str) -> None:
         packed, np.eye(TANGENT), seconds, imu.gyro, imu.accel, duration, np.ones(4), 0.1, np.ones(4), nodes
     )
     out = np.zeros(points.shape, np.float32)
-    deskew_into(points.astype(np.float32), (time_ns - begin_ns) * 1e-9, nodes, count, packed, out)
+    deskew_into(points.astype(np.float32), time_ns, begin_ns, nodes, count, packed, out)
     world = np.einsum("nij,nj->ni", at_points.R_world_imu, points @ T[:3, :3].T + T[:3, 3]) + at_points.p_world_imu
     rigid = ((world - at_end.p_world_imu[0]) @ at_end.R_world_imu[0] - T[:3, 3]) @ T[:3, :3]
     assert np.linalg.norm(points - rigid, axis=1).max() > 0.05  # there is something to correct
