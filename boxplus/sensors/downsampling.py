@@ -14,90 +14,106 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.errors import InputError
 
-_EMPTY = np.int32(-1)
-# Large odd factors spread neighbouring voxels over the table.
-_HASH_X, _HASH_Y, _HASH_Z = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9)
+# What belongs to an occupied voxel lies together: sum or mean of its points, how many they are, which voxel it is, and the
+# point nearest to the mean (its squared distance, as bits, above its index: the least number is the nearest, then the first).
+_VOXEL = np.dtype(
+    [(name, np.float32) for name in ("x", "y", "z", "count")] + [("key", np.uint64), ("nearest", np.uint64)], align=True
+)
+_EMPTY = np.uint32(0xFFFFFFFF)
+_NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
+_INDEX = np.uint64(0xFFFFFFFF)
+_CELL = np.int64(0x1FFFFF)  # 21 bits an axis
+_ZERO, _ONE, _TWO, _THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+_Y_BITS, _Z_BITS, _DISTANCE_BITS = np.uint64(21), np.uint64(42), np.uint64(32)
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)  # an odd factor whose product's upper bits depend on all bits of a key
 
 
 @kernel
 def voxel_centroids(
     points: NDArray[np.float32],
     inverse_size: float,
-    table: NDArray[np.int32],
-    keys: NDArray[np.int64],
-    sums: NDArray[np.float32],
-    counts: NDArray[np.int32],
-    voxel_of: NDArray[np.int32],
-    nearest: NDArray[np.int32],
-    distances: NDArray[np.float32],
-) -> int:
+    keys: NDArray[np.uint64],
+    table: NDArray[np.uint32],
+    shift: np.uint64,
+    voxels: NDArray[np.void],
+    voxel_of: NDArray[np.uint32],
+) -> np.int64:
     """Centroids of the occupied voxels, in the order in which the voxels are first seen; returns their number.
 
     Returns −1 when the table would be more than half full; call again with a larger one.
 
     Args:
-        points: (n, 3); inverse_size: one over the voxel's side [1/m].
-        table: (a power of two,) filled with −1; keys: (n,), sums: (n, 3), counts: (n,) scratch.
-        sums: receives the centroids.
-        voxel_of: (n,) receives the voxel of each point; nearest: (n,) the point nearest to each centroid;
-            distances: (n,) scratch.
+        points: (3 n,), point by point; inverse_size: one over the voxel's side [1/m].
+        keys: (at least n,) scratch; voxel_of: (at least n,) receives the voxel of each point.
+        table: (2^(64 − shift),) scratch; voxels: (half of that,) `_VOXEL`, receives the voxels.
     """
-    mask = np.uint64(table.shape[0] - 1)
-    most = table.shape[0] // 2
-    used = 0
-    voxel: np.int32 | int = _EMPTY
-    last_key = np.int64(-1)
-    for n in range(points.shape[0]):
-        ix = np.int64(math.floor(points[n, 0] * inverse_size))
-        iy = np.int64(math.floor(points[n, 1] * inverse_size))
-        iz = np.int64(math.floor(points[n, 2] * inverse_size))
-        key = (ix & 0x1FFFFF) | ((iy & 0x1FFFFF) << 21) | ((iz & 0x1FFFFF) << 42)
-        if key == last_key:  # neighbours in a scan mostly share their voxel
-            sums[voxel, 0] += points[n, 0]
-            sums[voxel, 1] += points[n, 1]
-            sums[voxel, 2] += points[n, 2]
-            counts[voxel] += 1
-            voxel_of[n] = voxel
-            continue
-        last_key = key
-        mixed = np.uint64(ix) * _HASH_X ^ np.uint64(iy) * _HASH_Y ^ np.uint64(iz) * _HASH_Z
-        slot = (mixed ^ (mixed >> np.uint64(29))) & mask
-        while True:
-            voxel = table[slot]
-            if voxel == _EMPTY:
-                if used == most:
-                    return -1
-                voxel = np.int32(used)
-                table[slot] = voxel
-                keys[used] = key
-                sums[used, 0] = points[n, 0]
-                sums[used, 1] = points[n, 1]
-                sums[used, 2] = points[n, 2]
-                counts[used] = 1
-                used += 1
-                break
-            if keys[voxel] == key:
-                sums[voxel, 0] += points[n, 0]
-                sums[voxel, 1] += points[n, 1]
-                sums[voxel, 2] += points[n, 2]
-                counts[voxel] += 1
-                break
-            slot = (slot + np.uint64(1)) & mask
-        voxel_of[n] = voxel
-    for voxel in range(used):
-        share = np.float32(1.0) / np.float32(counts[voxel])
-        sums[voxel, 0] *= share
-        sums[voxel, 1] *= share
-        sums[voxel, 2] *= share
-        distances[voxel] = np.float32(np.inf)
-    for n in range(points.shape[0]):
-        voxel = voxel_of[n]
-        dx, dy, dz = points[n, 0] - sums[voxel, 0], points[n, 1] - sums[voxel, 1], points[n, 2] - sums[voxel, 2]
-        distance = dx * dx + dy * dy + dz * dz
-        if distance < distances[voxel]:
-            distances[voxel] = distance
-            nearest[voxel] = n
-    return used
+    total = np.uint64(points.shape[0]) // _THREE
+    for n in range(total):
+        i = _THREE * n
+        x = np.uint64(np.int64(math.floor(points[i] * inverse_size)) & _CELL)
+        y = np.uint64(np.int64(math.floor(points[i + _ONE] * inverse_size)) & _CELL)
+        z = np.uint64(np.int64(math.floor(points[i + _TWO] * inverse_size)) & _CELL)
+        keys[n] = x | (y << _Y_BITS) | (z << _Z_BITS)
+    table[:] = _EMPTY
+    mask = np.uint64(table.shape[0]) - _ONE
+    most = np.uint64(voxels.shape[0])
+    used = np.uint64(0)
+    end = np.uint64(0)
+    while end < total:
+        begin, i = end, _THREE * end
+        key, sum_x, sum_y, sum_z = keys[end], points[i], points[i + _ONE], points[i + _TWO]
+        end += _ONE
+        while end < total and keys[end] == key:  # neighbours in a scan often share their voxel
+            i = _THREE * end
+            sum_x += points[i]
+            sum_y += points[i + _ONE]
+            sum_z += points[i + _TWO]
+            end += _ONE
+        slot = (key * _SPREAD) >> shift
+        while table[slot] != _EMPTY and voxels[table[slot]]["key"] != key:
+            slot = (slot + _ONE) & mask
+        if table[slot] == _EMPTY:
+            if used == most:
+                return np.int64(-1)
+            table[slot] = np.uint32(used)
+            voxel = voxels[used]
+            voxel["key"] = key
+            voxel["x"], voxel["y"], voxel["z"], voxel["count"] = sum_x, sum_y, sum_z, np.float32(end - begin)
+            used += _ONE
+        else:
+            voxel = voxels[table[slot]]
+            sum_x, sum_y, sum_z = voxel["x"] + sum_x, voxel["y"] + sum_y, voxel["z"] + sum_z
+            count = voxel["count"] + np.float32(end - begin)
+            voxel["x"], voxel["y"], voxel["z"], voxel["count"] = sum_x, sum_y, sum_z, count
+        for k in range(begin, end):
+            voxel_of[k] = table[slot]
+    for k in range(used):
+        voxel = voxels[k]
+        share = np.float32(1.0) / voxel["count"]
+        voxel["x"] *= share
+        voxel["y"] *= share
+        voxel["z"] *= share
+        voxel["nearest"] = _NONE
+    for n in range(total):
+        i = _THREE * n
+        voxel = voxels[voxel_of[n]]
+        dx, dy, dz = points[i] - voxel["x"], points[i + _ONE] - voxel["y"], points[i + _TWO] - voxel["z"]
+        distance = np.float32(dx * dx + dy * dy + dz * dz)
+        voxel["nearest"] = min(voxel["nearest"], (np.uint64(distance.view(np.uint32)) << _DISTANCE_BITS) | n)
+    return np.int64(used)
+
+
+@kernel
+def _collect(
+    points: NDArray[np.float32], voxels: NDArray[np.void], centroids: NDArray[np.float32], representatives: NDArray[np.float32]
+) -> None:
+    """Centroids (m, 3) and representatives (m, 3) of the first m voxels, from the points (3 n,)."""
+    for k in range(np.uint64(centroids.shape[0])):
+        voxel = voxels[k]
+        centroids[k, _ZERO], centroids[k, _ONE], centroids[k, _TWO] = voxel["x"], voxel["y"], voxel["z"]
+        i = _THREE * (voxel["nearest"] & _INDEX)
+        for axis in range(_THREE):
+            representatives[k, axis] = points[i + axis]
 
 
 class VoxelFilter:
@@ -120,42 +136,36 @@ class VoxelFilter:
         self.voxel_size = voxel_size
         self._least = voxel_size
         self._max_points = max_points
-        self._table = np.full(8192, _EMPTY, dtype=np.int32)
+        self._set_table_bits(13)
         self._reserve(1024)
 
+    def _set_table_bits(self, bits: int) -> None:
+        self._table_bits = bits
+        self._table = np.zeros(1 << bits, dtype=np.uint32)
+        self._voxels = np.zeros(1 << (bits - 1), dtype=_VOXEL)
+
     def _reserve(self, points: int) -> None:
-        self._keys = np.zeros(points, dtype=np.int64)
-        self._sums = np.zeros((points, 3), dtype=np.float32)
-        self._counts = np.zeros(points, dtype=np.int32)
-        self._voxel_of = np.zeros(points, dtype=np.int32)
-        self._nearest = np.zeros(points, dtype=np.int32)
-        self._distances = np.zeros(points, dtype=np.float32)
+        self._keys = np.zeros(points, dtype=np.uint64)
+        self._voxel_of = np.zeros(points, dtype=np.uint32)
 
     def __call__(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Centroids and representatives, (m, 3) float32 each, of `points` (n, 3) float32.
 
         The points must be finite and within ±2^20 voxels of the origin.
         """
-        if len(points) > len(self._counts):
+        if len(points) > len(self._keys):
             self._reserve(2 * len(points))
-        used = -1
+        flat, used = points.reshape(-1), -1
         while used < 0:
-            self._table.fill(_EMPTY)
-            used = voxel_centroids(
-                points,
-                1.0 / self.voxel_size,
-                self._table,
-                self._keys,
-                self._sums,
-                self._counts,
-                self._voxel_of,
-                self._nearest,
-                self._distances,
-            )
+            shift = np.uint64(64 - self._table_bits)
+            inverse_size = 1.0 / self.voxel_size
+            used = int(voxel_centroids(flat, inverse_size, self._keys, self._table, shift, self._voxels, self._voxel_of))
             if used < 0:
-                self._table = np.full(2 * len(self._table), _EMPTY, dtype=np.int32)
+                self._set_table_bits(self._table_bits + 1)
         if self._max_points is not None:
             # Surfaces fill voxels with the square of their size.
             fitting = self.voxel_size * (used / self._max_points) ** 0.5
             self.voxel_size = max(self._least, 0.5 * (self.voxel_size + fitting))
-        return self._sums[:used].copy(), points[self._nearest[:used]]
+        centroids, representatives = np.empty((used, 3), np.float32), np.empty((used, 3), np.float32)
+        _collect(flat, self._voxels, centroids, representatives)
+        return centroids, representatives
