@@ -68,6 +68,22 @@ class Sequencer:
         """Take samples in; non-finite ones and those that do not move forward in time are counted and left out."""
         if not len(samples):
             return
+        if self._in_order(samples):
+            self._imu_jumps = 0
+            self._last_imu_ns = int(samples.time_ns[-1])
+            self._imu.append(samples)
+        else:
+            self._add_one_by_one(samples)
+
+    def _in_order(self, samples: ImuSamples) -> bool:
+        """Whether nothing is wrong with any sample: the usual case, which costs no loop. NaN compares false."""
+        last, time = self._last_imu_ns, samples.time_ns
+        if not (np.abs(samples.gyro).max() <= _GYRO_LIMIT and np.abs(samples.accel).max() <= _ACCEL_LIMIT):
+            return False
+        steps = np.diff(time, prepend=int(time[0]) - 1 if last is None else last)
+        return bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
+
+    def _add_one_by_one(self, samples: ImuSamples) -> None:
         finite = np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
         self.rejected["IMU sample not finite"] += int((~finite).sum())
         # NaN compares false, so what is not finite is not counted twice.
@@ -157,15 +173,9 @@ class Sequencer:
             self.rejected["scan without any IMU sample"] += 1
             return None
         self._last_end_ns = scan.end_ns
-        inside = imu.time_ns[(imu.time_ns > begin) & (imu.time_ns < scan.end_ns)]
-        edges = np.concatenate([[max(begin, int(imu.time_ns[0]))], inside, [min(scan.end_ns, max(int(imu.time_ns[-1]), begin))]])
-        spans = np.append(np.diff(edges), [scan.end_ns - edges[-1], edges[0] - begin])
-        if len(imu) > 1:  # a gap that began before the frame is a gap in all of it
-            between = np.diff(imu.time_ns)[(imu.time_ns[1:] > begin) & (imu.time_ns[:-1] < scan.end_ns)]
-            spans = np.append(spans, between)
-        if not covered:  # and one that has not ended yet
-            spans = np.append(spans, scan.end_ns - int(imu.time_ns[-1]))
-        return Frame(scan, imu, begin, covered, float(spans.max(initial=0)) * 1e-9)
+        # A gap that began before the frame, or has not ended yet, is a gap in all of it.
+        spans = [int(imu.time_ns[0]) - begin, scan.end_ns - int(imu.time_ns[-1]), int(np.diff(imu.time_ns).max(initial=0))]
+        return Frame(scan, imu, begin, covered, max(spans) * 1e-9)
 
     def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:
         """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""
