@@ -1,0 +1,1 @@
+"""Sparse least squares: block-sparse matrices, orderings and the Cholesky factorisation."""

@@ -1,0 +1,158 @@
+"""The pattern of a symmetric block-sparse matrix: the normal matrix of a least-squares problem over variables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
+
+@dataclass(frozen=True, slots=True)
+class PairIndex:
+    """Where pairs of variables lie in a pattern.
+
+    Attributes:
+        block: (m,) int64, block of each pair.
+        transposed: (m,) bool, true where the pair (i, j) has i < j, so that the block holds its transpose.
+    """
+
+    block: NDArray[np.int64]
+    transposed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class BlockPattern:
+    """Lower triangle of a symmetric block-sparse matrix, column by column.
+
+    The values of block k are `values[value_start[k]:value_start[k + 1]]`, row-major, `(sizes[row], sizes[column])`. Diagonal
+    blocks are full, but only their lower triangle is read.
+
+    Attributes:
+        sizes: (n,) int64, rows and columns of each diagonal block: the degrees of freedom of a variable.
+        col_start: (n + 1,) int64, first block of each column.
+        row: (m,) int64, block rows, at or below the diagonal, ascending in each column, the diagonal first.
+        start: (n + 1,) int64, first scalar row of each block row.
+        value_start: (m + 1,) int64, first value of each block.
+
+    Raises:
+        InputError: the arrays do not describe such a pattern.
+    """
+
+    sizes: NDArray[np.int64]
+    col_start: NDArray[np.int64]
+    row: NDArray[np.int64]
+    start: NDArray[np.int64] = field(init=False)
+    value_start: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        sizes, col_start, row = (np.ascontiguousarray(a, np.int64) for a in (self.sizes, self.col_start, self.row))
+        n = len(sizes)
+        if sizes.ndim != 1 or (n and sizes.min() < 1):
+            raise InputError(
+                "a size of at least 1 for every variable", f"sizes {self.sizes}", "leave out variables without freedom"
+            )
+        if col_start.shape != (n + 1,) or col_start[0] != 0 or col_start[-1] != len(row) or (n and np.diff(col_start).min() < 1):
+            raise InputError(
+                f"{n + 1} ascending column starts from 0 to {len(row)}, every column with its diagonal",
+                f"{col_start}",
+                "build the pattern with BlockPattern.from_pairs",
+            )
+        column = np.repeat(np.arange(n), np.diff(col_start))
+        first = np.zeros(len(row), np.bool_)
+        first[col_start[:-1]] = True
+        ascending = np.ones(len(row), np.bool_)
+        ascending[1:] = first[1:] | (row[1:] > row[:-1])
+        if not ((row[first] == column[first]).all() and ascending.all() and (n == 0 or row.max() < n)):
+            raise InputError(
+                "in each column the diagonal and then ascending block rows below it",
+                "another order",
+                "build the pattern with BlockPattern.from_pairs",
+            )
+        start, value_start = np.zeros(n + 1, np.int64), np.zeros(len(row) + 1, np.int64)
+        np.cumsum(sizes, out=start[1:])
+        np.cumsum(sizes[row] * sizes[column], out=value_start[1:])
+        for name, array in zip(self.__slots__, (sizes, col_start, row, start, value_start), strict=True):
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def from_pairs(cls, sizes: ArrayLike, i: ArrayLike, j: ArrayLike) -> tuple[BlockPattern, PairIndex]:
+        """The pattern with a block for each pair of variables, and where each pair lies in it.
+
+        Args:
+            sizes: (n,) degrees of freedom of the variables.
+            i: (m,) first variable of each pair, in any order, repeated pairs allowed.
+            j: (m,) second variable. Diagonal blocks are always there and need no pair.
+
+        Raises:
+            InputError: a variable out of range, or arrays of different lengths.
+        """
+        sizes, i, j = (np.atleast_1d(np.asarray(a, np.int64)) for a in (sizes, i, j))
+        n = len(sizes)
+        if i.shape != j.shape or i.ndim != 1:
+            raise InputError("as many first as second variables", f"{i.shape} and {j.shape}", "give the pairs as two flat arrays")
+        if len(i) and (min(i.min(), j.min()) < 0 or max(i.max(), j.max()) >= n):
+            raise InputError(
+                f"variables from 0 to {n - 1}", f"{min(i.min(), j.min())} to {max(i.max(), j.max())}", "check the indices"
+            )
+        diagonal = np.arange(n) * (n + 1)
+        keys, block = np.unique(np.concatenate([diagonal, np.minimum(i, j) * n + np.maximum(i, j)]), return_inverse=True)
+        col_start = np.zeros(n + 1, np.int64)
+        np.cumsum(np.bincount(keys // max(n, 1), minlength=n), out=col_start[1:])
+        return cls(sizes, col_start, keys % max(n, 1)), PairIndex(block[n:].astype(np.int64), i < j)
+
+    @classmethod
+    def from_scipy(cls, matrix: csc_matrix, sizes: ArrayLike | None = None) -> tuple[BlockPattern, NDArray[np.float64]]:
+        """Pattern and values of a symmetric scipy matrix, of which only the lower triangle is read.
+
+        Args:
+            matrix: (N, N), any sparse format.
+            sizes: degrees of freedom of the variables, N in sum; 1 each when None.
+
+        Raises:
+            InputError: the matrix is not square, or the sizes do not add up to its rows.
+        """
+        from scipy.sparse import tril
+
+        lower = tril(matrix).tocoo()
+        size = np.ones(lower.shape[0], np.int64) if sizes is None else np.asarray(sizes, np.int64)
+        if lower.shape[0] != lower.shape[1] or size.sum() != lower.shape[0]:
+            raise InputError(f"a square matrix of {size.sum()} rows", f"{lower.shape}", "check matrix and sizes")
+        variable, start = np.repeat(np.arange(len(size)), size), np.concatenate([[0], np.cumsum(size)])
+        i, j = variable[lower.row], variable[lower.col]
+        pattern, index = cls.from_pairs(size, i, j)
+        values = np.zeros(pattern.value_start[-1])
+        at = pattern.value_start[index.block] + (lower.row - start[i]) * size[j] + lower.col - start[j]
+        np.add.at(values, at, lower.data)
+        return pattern, values
+
+    @property
+    def column(self) -> NDArray[np.int64]:
+        """(m,) block column of each block."""
+        return np.repeat(np.arange(len(self.sizes)), np.diff(self.col_start))
+
+    def to_scipy(self, values: ArrayLike) -> csc_matrix:
+        """The whole symmetric matrix, both triangles, (N, N)."""
+        from scipy.sparse import coo_matrix
+
+        values = np.asarray(values, np.float64)
+        if values.shape != (self.value_start[-1],):
+            raise InputError(
+                f"{self.value_start[-1]} values", f"shape {values.shape}", "give the values of all blocks, one after another"
+            )
+        column = self.column
+        block = np.repeat(np.arange(len(self.row)), np.diff(self.value_start))
+        place = np.arange(len(values)) - self.value_start[block]
+        width = self.sizes[column[block]]
+        i, j = self.start[self.row[block]] + place // width, self.start[column[block]] + place % width
+        lower = i >= j
+        below = i > j
+        entries = np.concatenate([values[lower], values[below]])
+        rows, columns = np.concatenate([i[lower], j[below]]), np.concatenate([j[lower], i[below]])
+        return coo_matrix((entries, (rows, columns)), shape=(self.start[-1], self.start[-1])).tocsc()

@@ -1,0 +1,163 @@
+"""Sparse Cholesky factorisation of a block matrix: analyse once, factorise and solve many times."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import BoxplusError, InputError
+from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.multifrontal import factorize
+from boxplus.optimization.ordering import Method, order
+from boxplus.optimization.supernodes import ALIGNMENT, lay_out
+from boxplus.optimization.triangular_solve import solve_many, solve_one
+
+
+class NotPositiveDefinite(BoxplusError, ArithmeticError):
+    """A matrix has no Cholesky factor: a variable is not determined, or a weight has the wrong sign.
+
+    Attributes:
+        block: the variable (block row) at which the elimination failed.
+        component: its degree of freedom, from 0.
+        pivot: what was left on the diagonal there; not positive, or not finite.
+    """
+
+    def __init__(self, block: int, component: int, pivot: float) -> None:
+        super().__init__(
+            "expected a positive definite matrix – "
+            f"got the pivot {pivot:.3g} at degree of freedom {component} of variable {block} – "
+            "fix or measure what leaves this variable free, or add damping"
+        )
+        self.block = block
+        self.component = component
+        self.pivot = pivot
+
+
+def _aligned(size: int) -> NDArray[np.float64]:
+    """Zeros from the start of a cache line on, so that panels do not straddle lines."""
+    whole = np.zeros(size + 2 * ALIGNMENT)
+    return whole[(-whole.ctypes.data // 8) % ALIGNMENT :][:size]
+
+
+class SparseCholesky:
+    """L Lᵀ = P H Pᵀ for symmetric positive definite H with the given pattern.
+
+    The constructor orders and analyses; `factorize` takes new values any number of times and allocates nothing. One object
+    must not be used by two threads at once. Results are the same bits on every run.
+
+    Args:
+        pattern: of H.
+        ordering: name of the fill-reducing ordering, or (n,) integers: the variable at each position.
+
+    Raises:
+        InputError: an ordering that is no permutation of the variables.
+    """
+
+    def __init__(self, pattern: BlockPattern, *, ordering: Method | NDArray[np.int64] = "auto") -> None:
+        self.pattern = pattern
+        if isinstance(ordering, str):
+            first = order(pattern.col_start, pattern.row, pattern.sizes, ordering).permutation
+        else:
+            first = np.asarray(ordering, np.int64)
+            if not np.array_equal(np.sort(first), np.arange(len(pattern.sizes))):
+                raise InputError(
+                    f"a permutation of 0 … {len(pattern.sizes) - 1}", f"{first}", "give every variable its place once"
+                )
+        self._fronts = fronts = lay_out(pattern, first)
+        size = int(pattern.start[-1])
+        self._factor = _aligned(fronts.factor_size)
+        self._stack = _aligned(fronts.stack_size)
+        self._inverse, self._pivots, self._diagonal = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._work = np.zeros(size + int(fronts.table["below"].max()))
+        self._factorized = False
+
+    @property
+    def permutation(self) -> NDArray[np.int64]:
+        """(n,) variable at each position of the elimination order."""
+        return self._fronts.order
+
+    @property
+    def front_count(self) -> int:
+        """Number of supernodes."""
+        return len(self._fronts.table) - 1
+
+    @property
+    def nnz_factor(self) -> int:
+        """Stored elements of L: its nonzeros and the zeros that merging columns into supernodes brings."""
+        width, below = self._front_sizes
+        return int((width * (width + 1) // 2 + width * below).sum())
+
+    @property
+    def flops(self) -> float:
+        """Multiplications and additions of one factorisation."""
+        width, below = self._front_sizes.astype(np.float64)
+        return float((width**3 / 3 + width**2 * below + width * below**2).sum())
+
+    @property
+    def _front_sizes(self) -> NDArray[np.int64]:
+        table = self._fronts.table[:-1]
+        return np.stack([table["width"], table["below"]]).astype(np.int64)
+
+    def factorize(self, values: ArrayLike, *, diagonal: ArrayLike = 0.0) -> None:
+        """Factorise H + diag(diagonal).
+
+        Args:
+            values: values of the pattern's blocks, float64.
+            diagonal: a number or (N,) numbers that are added to the diagonal (damping); `values` stay as they are.
+
+        Raises:
+            InputError: another number of values.
+            NotPositiveDefinite: naming the variable whose pivot is not positive and finite.
+        """
+        values = np.ascontiguousarray(values, np.float64)
+        if values.shape != (self.pattern.value_start[-1],):
+            raise InputError(
+                f"{self.pattern.value_start[-1]} values",
+                f"shape {values.shape}",
+                "give the values of all blocks, one after another",
+            )
+        fronts = self._fronts
+        self._diagonal[:] = diagonal
+        self._factorized = False
+        failed = int(
+            factorize(
+                np.uint64(0), np.uint64(self.front_count), fronts.table, fronts.children, fronts.runs, fronts.entries,
+                fronts.scalar_order, values, self._diagonal, self._factor, self._stack, self._inverse, self._pivots,
+            )
+        )  # fmt: skip
+        if failed < len(self._pivots):
+            row = int(fronts.scalar_order[failed])
+            block = int(np.searchsorted(self.pattern.start, row, side="right")) - 1
+            raise NotPositiveDefinite(block, row - int(self.pattern.start[block]), float(self._pivots[failed]))
+        self._factorized = True
+
+    def solve(self, b: ArrayLike) -> NDArray[np.float64]:
+        """x with H x = b for one right-hand side (N,) or several (N, k).
+
+        Raises:
+            InputError: another number of rows, or nothing is factorised.
+        """
+        self._require_factor()
+        b = np.ascontiguousarray(b, np.float64)
+        if b.ndim not in (1, 2) or len(b) != len(self._pivots):
+            raise InputError(f"a right-hand side of {len(self._pivots)} rows", f"shape {b.shape}", "give (N,) or (N, k) numbers")
+        fronts = self._fronts
+        x = np.empty_like(b)
+        if b.ndim == 1:
+            solve_one(fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse, b, x, self._work)
+        else:
+            solve_many(fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse, b, x, np.empty_like(b))
+        return x
+
+    def log_determinant(self) -> float:
+        """Natural logarithm of the determinant of H.
+
+        Raises:
+            InputError: nothing is factorised.
+        """
+        self._require_factor()
+        return float(np.log(self._pivots).sum())
+
+    def _require_factor(self) -> None:
+        if not self._factorized:
+            raise InputError("a factorised matrix", "none, or one that is not positive definite", "call factorize first")

@@ -1,0 +1,165 @@
+"""Dense linear algebra of a front: factorise a panel, form an update matrix. Column-major, lower triangles.
+
+The matrices are parts of flat buffers: `_at` is the first element, `ld` the column stride.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.optimization.vector_tiles import (
+    LANES,
+    TILE_ROWS,
+    factor_1,
+    factor_1_short,
+    factor_3,
+    factor_3_short,
+    factor_6,
+    factor_6_short,
+    solve_1,
+    solve_1_short,
+    solve_3,
+    solve_3_short,
+    solve_6,
+    solve_6_short,
+    update_1,
+    update_1_short,
+    update_3,
+    update_3_short,
+    update_6,
+    update_6_short,
+)
+
+Buffer = NDArray[np.float64]
+
+_ONE, _THREE, _SIX = np.uint64(1), np.uint64(3), np.uint64(6)
+_SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
+_BLOCK = np.uint64(96)  # columns that are eliminated together: their panel stays in the cache
+
+
+@kernel
+def update_lower(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint64, lda: np.uint64, rows: np.uint64,
+                 columns: np.uint64, depth: np.uint64, accumulate: bool) -> None:  # fmt: skip
+    """C ← C - A Aᵀ (or -A Aᵀ) in the lower triangle of the first `columns` of `rows` columns; A is (rows, depth)."""
+    j = np.uint64(0)
+    while j < columns:
+        left = columns - j
+        i = j
+        if left >= _SIX:
+            while i < rows:
+                count, at = min(rows - i, _TALL), c_at + i + j * ldc
+                if count > _SHORT:
+                    update_6(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                else:
+                    update_6_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                i += count
+            j += _SIX
+        elif left >= _THREE:
+            while i < rows:
+                count, at = min(rows - i, _TALL), c_at + i + j * ldc
+                if count > _SHORT:
+                    update_3(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                else:
+                    update_3_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                i += count
+            j += _THREE
+        else:
+            while i < rows:
+                count, at = min(rows - i, _TALL), c_at + i + j * ldc
+                if count > _SHORT:
+                    update_1(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                else:
+                    update_1_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                i += count
+            j += _ONE
+
+
+@kernel
+def _factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
+                  inverse_at: np.uint64) -> np.uint64:  # fmt: skip
+    """Factorise the first `width` columns of a panel of `rows` rows, left-looking; returns the first failed column or width."""
+    j = np.uint64(0)
+    while j < width:
+        left = width - j
+        b_at, k, count = at + j, inverse_at + j, min(rows - j, _TALL)
+        here = b_at + j * ld
+        i = j + count
+        if left >= _SIX:
+            if count > _SHORT:
+                factor_6(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            else:
+                factor_6_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            while i < rows:
+                count, here = min(rows - i, _TALL), at + i + j * ld
+                if count > _SHORT:
+                    solve_6(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                else:
+                    solve_6_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                i += count
+            step = _SIX
+        elif left >= _THREE:
+            if count > _SHORT:
+                factor_3(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            else:
+                factor_3_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            while i < rows:
+                count, here = min(rows - i, _TALL), at + i + j * ld
+                if count > _SHORT:
+                    solve_3(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                else:
+                    solve_3_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                i += count
+            step = _THREE
+        else:
+            if count > _SHORT:
+                factor_1(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            else:
+                factor_1_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
+            while i < rows:
+                count, here = min(rows - i, _TALL), at + i + j * ld
+                if count > _SHORT:
+                    solve_1(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                else:
+                    solve_1_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
+                i += count
+            step = _ONE
+        for failed in range(j, j + step):
+            reciprocal = inverse[inverse_at + failed]
+            if not (0.0 < reciprocal < np.inf):
+                return np.uint64(failed)
+        j += step
+    return width
+
+
+@kernel
+def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
+                 column: np.uint64, update: Buffer, update_at: np.uint64, update_ld: np.uint64) -> np.uint64:  # fmt: skip
+    """Factorise a panel in place and form the update matrix of the rows below.
+
+    Args:
+        p: buffer with the panel, (rows, width).
+        inverse: written at `column`: reciprocals of the diagonal of L.
+        pivots: written at `column`: their inverse squares.
+        update: buffer that receives -L₂₁ L₂₁ᵀ, (rows - width) square, lower triangle.
+
+    Returns:
+        The first column whose pivot is not positive and finite, or `width`.
+    """
+    k = np.uint64(0)
+    while k < width:
+        depth = min(_BLOCK, width - k)
+        corner = at + k + k * ld
+        failed = _factor_block(p, corner, ld, rows - k, depth, inverse, pivots, column + k)
+        if failed < depth:
+            return np.uint64(k + failed)
+        behind = k + depth
+        if behind < width:
+            update_lower(p, at + behind + behind * ld, ld, p, corner + depth, ld, rows - behind, width - behind, depth, True)
+        if rows > width:
+            update_lower(
+                update, update_at, update_ld, p, at + width + k * ld, ld, rows - width, rows - width, depth, k > np.uint64(0)
+            )
+        k = behind
+    return width

@@ -1,0 +1,100 @@
+"""The numeric multifrontal factorisation over the fronts of `supernodes`.
+
+Duff and Reid, "The multifrontal solution of indefinite sparse symmetric linear equations" (1983); Liu, "The multifrontal
+method for sparse matrix solution" (1992).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.optimization.dense_kernels import Buffer, factor_panel
+from boxplus.optimization.supernodes import DIAGONAL, STORED
+
+Table = NDArray[np.void]
+Indices = NDArray[np.uint64]
+
+_ZERO = np.uint64(0)
+_STORED, _DIAGONAL = np.uint64(STORED), np.uint64(DIAGONAL)
+
+
+@kernel
+def _fill_panel(first: np.uint64, last: np.uint64, ld: np.uint64, entries: Table, values: Buffer, factor: Buffer) -> None:
+    """Write the blocks of the matrix that belong to a front."""
+    for e in range(first, last):
+        entry = entries[e]
+        source, target, rows, columns, kind = entry["source"], entry["target"], entry["rows"], entry["columns"], entry["kind"]
+        if kind == _STORED:
+            for i in range(rows):
+                for j in range(columns):
+                    factor[target + i + j * ld] = values[source + i * columns + j]
+        elif kind == _DIAGONAL:
+            for i in range(rows):
+                for j in range(i + np.uint64(1)):
+                    factor[target + i + j * ld] = values[source + i * columns + j]
+        else:
+            for i in range(rows):
+                for j in range(columns):
+                    factor[target + j + i * ld] = values[source + i * columns + j]
+
+
+@kernel
+def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, last: np.uint64, runs: Table, stack: Buffer,
+               target: Buffer, target_at: np.uint64, ld: np.uint64, shift: np.uint64) -> None:  # fmt: skip
+    """Add the columns `first … split` of runs of a child's update matrix, down to its last run, to a part of the front.
+
+    Row and column `shift` of the front is the first element of that part.
+    """
+    source_at, source_ld = child["update_at"], child["update_ld"]
+    for a in range(first, split):
+        column, there, length = runs[a]["child"], runs[a]["parent"], runs[a]["length"]
+        for j in range(length):
+            source = source_at + (column + j) * source_ld
+            to = target_at + (there + j - shift) * ld - shift
+            for i in range(j, length):
+                target[to + there + i] += stack[source + column + i]
+            for b in range(a + np.uint64(1), last):
+                row, below, count = runs[b]["child"], runs[b]["parent"], runs[b]["length"]
+                for i in range(count):
+                    target[to + below + i] += stack[source + row + i]
+
+
+@kernel
+def factorize(begin: np.uint64, end: np.uint64, table: Table, children: Indices, runs: Table, entries: Table,
+              scalar_order: Indices, values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, inverse: Buffer,
+              pivots: Buffer) -> np.uint64:  # fmt: skip
+    """Factorise the fronts `begin … end`, whose children are among them or done.
+
+    Args:
+        diagonal: (N,) added to the diagonal, in the order of the matrix.
+        factor: receives the panels of L.
+        inverse, pivots: (N,) receive the reciprocals of L's diagonal and the pivots, in elimination order.
+
+    Returns:
+        The scalar position whose pivot is not positive and finite, or N.
+    """
+    for g in range(begin, end):
+        front, following = table[g], table[g + np.uint64(1)]
+        column, width, below = front["column"], front["width"], front["below"]
+        at, ld = front["panel_at"], front["panel_ld"]
+        for k in range(at, at + width * ld):
+            factor[k] = 0.0
+        _fill_panel(front["entry_start"], following["entry_start"], ld, entries, values, factor)
+        for k in range(width):
+            factor[at + k + k * ld] += diagonal[scalar_order[column + k]]
+        for c in range(front["child_start"], following["child_start"]):
+            child, behind = table[children[c]], table[children[c] + np.uint64(1)]
+            _add_child(
+                front, child, child["run_start"], child["run_split"], behind["run_start"], runs, stack, factor, at, ld, _ZERO
+            )
+        update_at, update_ld = front["update_at"], front["update_ld"]
+        failed = factor_panel(factor, at, ld, width + below, width, inverse, pivots, column, stack, update_at, update_ld)
+        if failed < width:
+            return np.uint64(column + failed)
+        for c in range(front["child_start"], following["child_start"]):
+            child, behind = table[children[c]], table[children[c] + np.uint64(1)]
+            split, last = child["run_split"], behind["run_start"]
+            _add_child(front, child, split, last, last, runs, stack, stack, update_at, update_ld, width)
+    return np.uint64(len(inverse))

@@ -1,0 +1,259 @@
+"""Fronts: the dense matrices that a multifrontal factorisation works on, laid out in memory once for many factorisations.
+
+A front eliminates the columns of one supernode. Its panel, `width + below` rows by `width` columns, becomes part of the factor
+L; its update matrix, `below` by `below`, is what the elimination adds to the later rows, and is added to the parent front.
+Both are column-major. Update matrices live in two stacks that grow towards each other, one for the even and one for the odd
+levels of the tree, so that a front's own update matrix can be formed while those of its children are still there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.symbolic import (
+    Indices,
+    below_counts,
+    elimination_tree,
+    group_rows,
+    merge_columns,
+    order_groups,
+    rows_before,
+)
+
+FRONT = np.dtype(
+    [
+        (name, np.uint64)
+        for name in (
+            "column",  # first scalar column
+            "width",  # scalar columns
+            "below",  # scalar rows below the columns
+            "panel_at",  # first element of the panel in the factor
+            "panel_ld",  # its column stride
+            "update_at",  # first element of the update matrix in the stack
+            "update_ld",
+            "child_start",  # first entry in `children`
+            "run_start",  # first entry in `runs`
+            "run_split",  # first run that lies below the parent's columns
+            "entry_start",  # first entry in `entries`
+            "row_start",  # first entry in `rows`
+            "parent",  # index of the parent front, their number for a root
+        )
+    ]
+)
+"""A front; the table has one more record at its end, so that a range is that of a record and the next one."""
+
+RUN = np.dtype([("child", np.uint64), ("parent", np.uint64), ("length", np.uint64)])
+"""Rows of an update matrix that follow one another in the parent front too: first row here, first row there."""
+
+ENTRY = np.dtype([("source", np.uint64), ("target", np.uint64), ("rows", np.uint64), ("columns", np.uint64), ("kind", np.uint64)])
+"""A block of the matrix: first value, first element in the factor, size as stored; kind as below."""
+STORED, TRANSPOSED, DIAGONAL = 0, 1, 2
+
+ALIGNMENT = 8  # elements, a cache line
+
+
+@dataclass(frozen=True, slots=True)
+class Fronts:
+    """The result of the symbolic analysis.
+
+    Attributes:
+        order: (n,) int64, variable at each position of the elimination order.
+        scalar_order: (N,) uint64, scalar row of the matrix at each position.
+        table: (fronts + 1,) FRONT, children before parents.
+        children: (fronts,) uint64.
+        runs: RUN records.
+        entries: ENTRY records, by front.
+        rows: uint64, scalar rows below each front, in elimination order.
+        factor_size: elements of the factor's panels.
+        stack_size: elements of the stacks of update matrices.
+    """
+
+    order: NDArray[np.int64]
+    scalar_order: NDArray[np.uint64]
+    table: NDArray[np.void]
+    children: NDArray[np.uint64]
+    runs: NDArray[np.void]
+    entries: NDArray[np.void]
+    rows: NDArray[np.uint64]
+    factor_size: int
+    stack_size: int
+
+
+@kernel
+def stride(rows: int) -> int:
+    """Column stride of a matrix: whole cache lines where it is worth it, never a large power of two."""
+    if rows < 4 * ALIGNMENT:
+        return rows
+    padded = (rows + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
+    return padded + ALIGNMENT if padded % 64 == 0 else padded
+
+
+@kernel
+def _stack_offsets(parent: Indices, below: Indices, strides: Indices) -> tuple[Indices, int]:
+    """Place of each update matrix, and the size of both stacks together."""
+    groups = len(parent)
+    level, offset = np.zeros(groups + 1, np.int64), np.zeros(groups, np.int64)
+    for g in range(groups - 1, -1, -1):
+        level[g] = level[parent[g]] + 1 if parent[g] < groups else 0
+    lowest_child = np.full(groups + 1, groups)
+    top = np.zeros(2, np.int64)
+    peak = 0
+    for g in range(groups):
+        side = level[g] % 2
+        offset[g] = top[side]
+        size = (below[g] * strides[g] + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
+        top[side] += size
+        peak = max(peak, top[0] + top[1])
+        if lowest_child[g] < groups:
+            top[1 - side] = offset[lowest_child[g]]
+        if parent[g] < groups:
+            lowest_child[parent[g]] = min(lowest_child[parent[g]], g)
+        else:
+            top[side] = offset[g]
+    for g in range(groups):
+        if level[g] % 2:
+            offset[g] = peak - offset[g] - (below[g] * strides[g] + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
+    return offset, peak
+
+
+@kernel
+def _runs(first: Indices, parent: Indices, row_start: Indices, rows: Indices, group_of: Indices, start: Indices,
+          table: NDArray[np.void], runs: NDArray[np.uint64]) -> int:  # fmt: skip
+    """Where the rows of each front lie in its parent; returns the number of runs."""
+    groups, count = len(parent), 0
+    for g in range(groups):
+        table[g]["run_start"] = count
+        table[g]["run_split"] = count
+        p = parent[g]
+        if p == groups:
+            continue
+        base, width = start[first[p]], start[first[p + 1]] - start[first[p]]
+        here, behind, q = 0, width, row_start[p]
+        begun, expected = False, 0
+        for k in range(row_start[g], row_start[g + 1]):
+            i = rows[k]
+            size = start[i + 1] - start[i]
+            if group_of[i] == p:
+                there = start[i] - base
+            else:
+                while rows[q] != i:
+                    behind += start[rows[q] + 1] - start[rows[q]]
+                    q += 1
+                there = behind
+            if begun and there == expected and (there != width):
+                runs[count - 1, 2] += size
+            else:
+                runs[count, 0], runs[count, 1], runs[count, 2] = here, there, size
+                count += 1
+                begun = True
+            if there < width:
+                table[g]["run_split"] = count
+            expected = there + size
+            here += size
+    table[groups]["run_start"] = count
+    return count
+
+
+@kernel
+def _entries(col_start: Indices, row: Indices, value_start: Indices, position: Indices, group_of: Indices, first: Indices,
+             row_start: Indices, rows: Indices, start: Indices, table: NDArray[np.void],
+             entries: NDArray[np.uint64]) -> None:  # fmt: skip
+    """Where each block of the matrix goes in the factor."""
+    groups, n = len(first) - 1, len(position)
+    count = np.zeros(groups + 1, np.int64)
+    for column in range(n):
+        for k in range(col_start[column], col_start[column + 1]):
+            count[group_of[min(position[row[k]], position[column])] + 1] += 1
+    for g in range(groups):
+        count[g + 1] += count[g]
+    for g in range(groups + 1):
+        table[g]["entry_start"] = count[g]
+    fill, block, column_of = count[:groups].copy(), np.empty(len(row), np.int64), np.empty(len(row), np.int64)
+    for column in range(n):
+        for k in range(col_start[column], col_start[column + 1]):
+            g = group_of[min(position[row[k]], position[column])]
+            block[fill[g]], column_of[fill[g]] = k, column
+            fill[g] += 1
+    local = np.zeros(n, np.int64)
+    for g in range(groups):
+        base = start[first[g]]
+        for i in range(first[g], first[g + 1]):
+            local[i] = start[i] - base
+        behind = start[first[g + 1]] - base
+        for k in range(row_start[g], row_start[g + 1]):
+            local[rows[k]] = behind
+            behind += start[rows[k] + 1] - start[rows[k]]
+        at, ld = np.int64(table[g]["panel_at"]), np.int64(table[g]["panel_ld"])
+        for e in range(count[g], count[g + 1]):
+            k = block[e]
+            a, b = position[row[k]], position[column_of[e]]
+            entries[e, 0] = value_start[k]
+            entries[e, 1] = at + local[max(a, b)] + ld * local[min(a, b)]
+            entries[e, 2] = start[a + 1] - start[a]
+            entries[e, 3] = start[b + 1] - start[b]
+            entries[e, 4] = DIAGONAL if a == b else (STORED if a > b else TRANSPOSED)
+
+
+def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
+    """Analyse a pattern in the given elimination order (variable at each position)."""
+    n = len(pattern.sizes)
+    position = np.empty(n, np.int64)
+    position[order] = np.arange(n)
+    begin, before = rows_before(pattern.col_start, pattern.row, position)
+    sizes = pattern.sizes[order]
+    parent = elimination_tree(begin, before)
+    group = merge_columns(parent, sizes, below_counts(begin, before, parent, sizes))
+    again, first, group_parent = order_groups(parent, group)
+    order, sizes = order[again], sizes[again]
+    position[order] = np.arange(n)
+    begin, before = rows_before(pattern.col_start, pattern.row, position)
+    groups = len(group_parent)
+    group_of = np.repeat(np.arange(groups), np.diff(first))
+    row_start, rows = group_rows(begin, before, group_of, group_parent)
+
+    start = np.zeros(n + 1, np.int64)
+    np.cumsum(sizes, out=start[1:])
+    width = np.diff(start[first])
+    scalar_rows = np.zeros(len(rows) + 1, np.int64)
+    np.cumsum(sizes[rows], out=scalar_rows[1:])
+    below = np.diff(scalar_rows[row_start])
+    table = np.zeros(groups + 1, FRONT)
+    table["column"] = start[first]
+    table["width"][:groups], table["below"][:groups] = width, below
+    table["panel_ld"][:groups] = [stride(int(rows)) for rows in width + below]
+    panel_sizes = (table["panel_ld"][:groups].astype(np.int64) * width + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
+    table["panel_at"][1:] = np.cumsum(panel_sizes)
+    update_strides = np.array([stride(int(rows)) for rows in below], np.int64)
+    table["update_ld"][:groups] = update_strides
+    table["update_at"][:groups], stack_size = _stack_offsets(group_parent, below, update_strides)
+    table["parent"][:groups] = group_parent
+    table["row_start"] = scalar_rows[row_start]
+    table["child_start"][1:] = np.cumsum(np.bincount(group_parent, minlength=groups + 1)[:groups])
+    runs = np.empty((len(rows), 3), np.uint64)
+    run_count = _runs(first, group_parent, row_start, rows, group_of, start, table, runs)
+    entries = np.empty((len(pattern.row), 5), np.uint64)
+    _entries(
+        pattern.col_start, pattern.row, pattern.value_start, position, group_of, first, row_start, rows, start, table, entries
+    )
+    return Fronts(
+        order=order,
+        scalar_order=_expand(pattern.start[order], sizes),
+        table=table,
+        children=np.argsort(group_parent, kind="stable").astype(np.uint64),
+        runs=runs[:run_count].copy().view(RUN)[:, 0],
+        entries=entries.view(ENTRY)[:, 0],
+        rows=_expand(start[rows], sizes[rows]),
+        factor_size=int(table["panel_at"][-1]),
+        stack_size=stack_size,
+    )
+
+
+def _expand(first: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """The ranges `first[k] … first[k] + sizes[k]`, one after another."""
+    ends = np.cumsum(sizes)
+    return (np.repeat(first - ends + sizes, sizes) + np.arange(ends[-1] if len(ends) else 0)).astype(np.uint64)

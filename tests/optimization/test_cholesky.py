@@ -1,0 +1,136 @@
+"""The sparse Cholesky factorisation against dense linear algebra and scipy."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
+
+
+def random_matrix(seed: int, sizes: list[int], pairs: int) -> tuple[BlockPattern, NDArray[np.float64], NDArray[np.float64]]:
+    """A positive definite matrix with random blocks: pattern, values, dense."""
+    rng = np.random.default_rng(seed)
+    n = len(sizes)
+    i, j = (rng.integers(0, n, pairs), rng.integers(0, n, pairs)) if n else (np.zeros(0, int), np.zeros(0, int))
+    pattern, _ = BlockPattern.from_pairs(sizes, i, j)
+    return (pattern, *positive_definite(pattern, rng))
+
+
+def positive_definite(pattern: BlockPattern, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Random values that make a pattern's matrix diagonally dominant, and the dense matrix."""
+    values = rng.normal(size=pattern.value_start[-1])
+    dense = pattern.to_scipy(values).toarray()
+    diagonal = np.abs(dense).sum(axis=1) + rng.uniform(0.1, 1.0, len(dense))
+    for k, size in enumerate(pattern.sizes):
+        block = values[pattern.value_start[pattern.col_start[k]] :][: size * size].reshape(size, size)
+        block[np.triu_indices(size, 1)] = np.nan  # never read
+        np.fill_diagonal(block, diagonal[pattern.start[k] : pattern.start[k + 1]])
+    return values, pattern.to_scipy(values).toarray()
+
+
+def check(pattern: BlockPattern, values: NDArray[np.float64], dense: NDArray[np.float64], **options: object) -> SparseCholesky:
+    cholesky = SparseCholesky(pattern, **options)  # type: ignore[arg-type]
+    cholesky.factorize(values)
+    rng = np.random.default_rng(1)
+    for shape in ((len(dense),), (len(dense), 1), (len(dense), 5)):
+        b = rng.normal(size=shape)
+        np.testing.assert_allclose(dense @ cholesky.solve(b), b, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(cholesky.log_determinant(), np.linalg.slogdet(dense)[1], rtol=1e-12, atol=1e-12)
+    return cholesky
+
+
+@given(seed=st.integers(0, 10**6), sizes=st.lists(st.integers(1, 9), max_size=30), density=st.floats(0.0, 4.0))
+def test_solves_any_block_matrix(seed: int, sizes: list[int], density: float) -> None:
+    check(*random_matrix(seed, sizes, int(density * len(sizes))))
+
+
+@pytest.mark.parametrize("ordering", ["auto", "nested_dissection", "minimum_degree", "natural"])
+def test_every_ordering_solves(ordering: str) -> None:
+    check(*random_matrix(3, [6] * 80, 160), ordering=ordering)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_any_permutation_solves(seed: int) -> None:
+    check(*random_matrix(seed, [3] * 20, 40), ordering=np.random.default_rng(seed).permutation(20))
+
+
+SHAPES = {
+    "empty": ([], [], []),
+    "single block": ([7], [], []),
+    "diagonal": ([2, 3, 6, 1], [], []),
+    "dense": ([6] * 40, *np.tril_indices(40)),
+    "one dense block of 300": ([300], [], []),
+    "arrow to the first": ([6] * 60, range(60), [0] * 60),
+    "arrow to the last": ([3] * 60, range(60), [59] * 60),
+    "chain": ([6] * 200, range(199), range(1, 200)),
+    "two components": ([5] * 20, [*range(9), *range(10, 19)], [*range(1, 10), *range(11, 20)]),
+    "grid": (
+        [6] * 400,
+        [k for k in range(400) if k % 20 < 19] + list(range(380)),
+        [k + 1 for k in range(400) if k % 20 < 19] + list(range(20, 400)),
+    ),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_solves_special_structures(shape: str) -> None:
+    pattern, _ = BlockPattern.from_pairs(*SHAPES[shape])
+    check(pattern, *positive_definite(pattern, np.random.default_rng(0)))
+
+
+def test_many_factorisations_with_one_analysis_are_the_same_bits() -> None:
+    pattern, values, dense = random_matrix(5, [6, 3] * 60, 300)
+    cholesky, b = SparseCholesky(pattern), np.ones(len(dense))
+    cholesky.factorize(values)
+    first = cholesky.solve(b)
+    cholesky.factorize(4.0 * values)
+    np.testing.assert_array_equal(cholesky.solve(b), first / 4.0)
+    cholesky.factorize(values)
+    np.testing.assert_array_equal(cholesky.solve(b), first)
+
+
+@pytest.mark.parametrize("diagonal", [2.5, np.linspace(0.0, 3.0, 90)])
+def test_adds_damping_to_the_diagonal(diagonal: float | NDArray[np.float64]) -> None:
+    pattern, values, dense = random_matrix(6, [3] * 30, 60)
+    cholesky = SparseCholesky(pattern)
+    kept = values.copy()
+    cholesky.factorize(values, diagonal=diagonal)
+    damped = dense + np.diag(np.broadcast_to(diagonal, 90))
+    b = np.ones(90)
+    np.testing.assert_allclose(damped @ cholesky.solve(b), b, rtol=1e-10)
+    np.testing.assert_array_equal(values, kept)
+
+
+@pytest.mark.parametrize("bad", [-1.0, 0.0, np.nan, np.inf])
+@pytest.mark.parametrize("block", [0, 7, 29])
+def test_names_the_variable_that_is_not_determined(bad: float, block: int) -> None:
+    pattern, _ = BlockPattern.from_pairs([3] * 30, [], [])
+    values = np.tile(np.eye(3).ravel(), 30)
+    values[9 * block + 4] = bad
+    cholesky = SparseCholesky(pattern)
+    with pytest.raises(NotPositiveDefinite, match=f"degree of freedom 1 of variable {block} – ") as caught:
+        cholesky.factorize(values)
+    assert (caught.value.block, caught.value.component) == (block, 1)
+    np.testing.assert_equal(caught.value.pivot, bad)
+    with pytest.raises(InputError, match="call factorize first"):
+        cholesky.solve(np.ones(90))
+    cholesky.factorize(np.tile(np.eye(3).ravel(), 30))
+    np.testing.assert_array_equal(cholesky.solve(np.ones(90)), 1.0)
+
+
+def test_refuses_what_does_not_fit() -> None:
+    pattern, values, _ = random_matrix(7, [2] * 5, 5)
+    with pytest.raises(InputError, match="permutation of 0 … 4"):
+        SparseCholesky(pattern, ordering=np.array([0, 1, 2, 3, 3]))
+    cholesky = SparseCholesky(pattern)
+    with pytest.raises(InputError, match="call factorize first"):
+        cholesky.log_determinant()
+    with pytest.raises(InputError, match=f"expected {len(values)} values"):
+        cholesky.factorize(values[1:])
+    cholesky.factorize(values)
+    with pytest.raises(InputError, match="right-hand side of 10 rows"):
+        cholesky.solve(np.ones(9))
