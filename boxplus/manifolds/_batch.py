@@ -36,3 +36,45 @@ def map_batch(
     out = np.zeros((len(batch), *tail_out))
     kernel(batch, out)
     return out.reshape(lead + tail_out)
+
+
+def pair_rows(
+    name_a: str, a: ArrayLike, tail_a: int, name_b: str, b: ArrayLike, tail_b: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, ...]]:
+    """Both arrays as rows (N, tail) over their common leading shape, and that shape.
+
+    Raises:
+        InputError: wrong trailing axes, or leading axes that do not broadcast.
+    """
+    rows_a, lead_a = as_batch(name_a, a, (tail_a,))
+    rows_b, lead_b = as_batch(name_b, b, (tail_b,))
+    if lead_a == lead_b:
+        return rows_a, rows_b, lead_a
+    try:
+        lead = np.broadcast_shapes(lead_a, lead_b)
+    except ValueError:
+        raise InputError(
+            f"{name_a} and {name_b} with leading axes that broadcast",
+            f"{lead_a} and {lead_b}",
+            "give one row of each, or the same number of rows",
+        ) from None
+    rows_a = np.ascontiguousarray(np.broadcast_to(rows_a.reshape(*lead_a, tail_a), (*lead, tail_a))).reshape(-1, tail_a)
+    rows_b = np.ascontiguousarray(np.broadcast_to(rows_b.reshape(*lead_b, tail_b), (*lead, tail_b))).reshape(-1, tail_b)
+    return rows_a, rows_b, lead
+
+
+def map_pairs(
+    kernel: Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None],
+    name_a: str,
+    a: ArrayLike,
+    size_a: int,
+    name_b: str,
+    b: ArrayLike,
+    size_b: int,
+    size_out: int,
+) -> NDArray[np.float64]:
+    """Run `kernel(a, b, out)` over rows (..., size_a) and (..., size_b), broadcast against each other."""
+    rows_a, rows_b, lead = pair_rows(name_a, a, size_a, name_b, b, size_b)
+    out = np.empty((len(rows_a), size_out))
+    kernel(rows_a, rows_b, out)
+    return out.reshape((*lead, size_out))

@@ -1,6 +1,11 @@
-"""Unit quaternions, Hamilton, stored wxyz (SPEC.md 1.3). q and −q are the same rotation."""
+"""Unit quaternions, Hamilton, stored wxyz (SPEC.md 1.3). q and −q are the same rotation.
+
+The kernels take and return scalars, for the inner loops of residuals; the functions below them are batch-first.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,6 +13,65 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import kernel
 from boxplus.manifolds._batch import map_batch
 from boxplus.manifolds.so3 import quaternion_into
+
+
+@kernel(inline=True)
+def multiply_scalars(
+    pw: float, px: float, py: float, pz: float, qw: float, qx: float, qy: float, qz: float
+) -> tuple[float, float, float, float]:
+    """p ⊗ q as (w, x, y, z)."""
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+@kernel(inline=True)
+def rotate(w: float, x: float, y: float, z: float, px: float, py: float, pz: float) -> tuple[float, float, float]:
+    """R(q) p of a unit quaternion (w, x, y, z) as (x, y, z); with (w, −x, −y, −z) it is Rᵀ p."""
+    cx = 2.0 * (y * pz - z * py)
+    cy = 2.0 * (z * px - x * pz)
+    cz = 2.0 * (x * py - y * px)
+    return px + w * cx + y * cz - z * cy, py + w * cy + z * cx - x * cz, pz + w * cz + x * cy - y * cx
+
+
+@kernel(inline=True)
+def rotation_entries(
+    w: float, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """The nine entries of R(q), row by row, of a unit quaternion (w, x, y, z)."""
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz = x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    return (
+        1.0 - 2.0 * (yy + zz),
+        2.0 * (xy - wz),
+        2.0 * (xz + wy),
+        2.0 * (xy + wz),
+        1.0 - 2.0 * (xx + zz),
+        2.0 * (yz - wx),
+        2.0 * (xz - wy),
+        2.0 * (yz + wx),
+        1.0 - 2.0 * (xx + yy),
+    )
+
+
+@kernel(inline=True)
+def exp_scalars(wx: float, wy: float, wz: float) -> tuple[float, float, float, float]:
+    """Exp_q of a rotation vector as (w, x, y, z): [cos θ/2, sin(θ/2) axis] (SPEC.md 1.3)."""
+    half_sq = 0.25 * (wx * wx + wy * wy + wz * wz)
+    half = math.sqrt(half_sq)
+    factor = 0.5 * (1.0 - half_sq / 6.0) if half_sq < 1e-10 else 0.5 * math.sin(half) / half
+    return math.cos(half), factor * wx, factor * wy, factor * wz
+
+
+@kernel(inline=True)
+def normalized_scalars(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """(w, x, y, z) brought to unit length, for a product that is stored."""
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return scale * w, scale * x, scale * y, scale * z
 
 
 @kernel
