@@ -28,5 +28,13 @@ class AmbiguityError(RecordingError):
     """The data fits two readings (of a unit, a time base, a topic); the message says which option decides."""
 
 
+class NotFiniteError(InputError):
+    """A residual or a Jacobian is NaN or infinite; the message names the group, the residual and its variables."""
+
+
+class SingularProblemError(BoxplusError):
+    """A least-squares problem does not determine its variables; the message says which, along which directions, and why."""
+
+
 class OutputError(BoxplusError, OSError):
     """A result could not be written: full disk, unwritable folder."""

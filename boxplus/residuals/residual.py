@@ -40,7 +40,11 @@ class Residual(ABC):
         manifolds: of the connected variables, on the side the Jacobians are derived for.
         roles: a name for each connected variable, with frames, such as `T_camera_world`.
         whitening: square root of the information of the residuals.
+        fixes_gauge: whether moving all connected variables together, as one rigid body, changes the residual. One that
+            connects a single variable does; a relative measurement does not.
     """
+
+    fixes_gauge: bool
 
     def __init__(
         self,
@@ -50,8 +54,10 @@ class Residual(ABC):
         manifolds: tuple[Manifold, ...],
         roles: tuple[str, ...],
         whitening: Whitening,
+        fixes_gauge: bool | None = None,
     ) -> None:
         self.dim, self.count, self.manifolds, self.roles, self.whitening = dim, count, manifolds, roles, whitening
+        self.fixes_gauge = len(manifolds) == 1 if fixes_gauge is None else fixes_gauge
 
     @abstractmethod
     def linearize_into(

@@ -1,0 +1,41 @@
+"""Gauss-Newton: H δ = −g (SPEC.md 2.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.strategy import Step, Strategy
+
+_HALVINGS = 20
+
+
+class GaussNewton(Strategy):
+    """Takes every full step; one that makes a residual invalid is halved."""
+
+    name = "Gauss-Newton"
+
+    def __init__(self) -> None:
+        self.parameter = 1.0
+        self._full: NDArray[np.float64] | None = None
+
+    def propose(self, problem: LeastSquares) -> Step | None:
+        """See `Strategy.propose`."""
+        if self._full is None:
+            self._full = problem.solve(None)
+            self.parameter = 1.0
+        if self.parameter < 0.5**_HALVINGS:
+            return None
+        a = self.parameter
+        # The model falls by −a gᵀδ − a²/2 δᵀHδ, and Hδ = −g.
+        slope = float(problem.system.gradient @ self._full)
+        return Step(a * self._full, -slope * (a - 0.5 * a * a))
+
+    def judge(self, ratio: float | None) -> bool:
+        """See `Strategy.judge`."""
+        if ratio is None:
+            self.parameter *= 0.5
+            return False
+        self._full = None
+        return True

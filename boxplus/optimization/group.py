@@ -1,0 +1,141 @@
+"""A residual group in a problem: its variables, its loss, and its current whitened linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import run_chunks
+from boxplus.errors import InputError
+from boxplus.manifolds.tangent_change import tangent_change
+from boxplus.optimization.losses import SQUARED, Loss
+from boxplus.optimization.variables import VariableRows
+from boxplus.optimization.weighting import (
+    first_not_finite,
+    weigh_jacobian,
+    weigh_residuals,
+    whiten_jacobian,
+    whiten_residuals,
+)
+from boxplus.residuals.residual import Residual
+
+# Residuals linearised, whitened and weighted in one go: few enough to stay in the second-level cache.
+_CHUNK = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class GroupCost:
+    """What a group costs at a point.
+
+    Attributes:
+        cost: ½ Σ ρ over the valid residuals.
+        common: the same over those that were valid where the step started.
+        lost: residuals that the step made invalid.
+        valid: valid residuals.
+    """
+
+    cost: float
+    common: float
+    lost: int
+    valid: int
+
+    def __add__(self, other: GroupCost) -> GroupCost:
+        return GroupCost(self.cost + other.cost, self.common + other.common, self.lost + other.lost, self.valid + other.valid)
+
+
+class Group:
+    """N residuals of one kind, connected to variables.
+
+    Attributes:
+        residual, loss, name: as given to `Problem.add_residuals`.
+        connections: one `VariableRows` of length N for each connected variable.
+        r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,).
+    """
+
+    def __init__(self, residual: Residual, connections: Sequence[VariableRows], loss: Loss, name: str) -> None:
+        self.residual, self.loss, self.name = residual, loss, name
+        self.connections = tuple(_broadcast(rows, residual.count) for rows in connections)
+        self.r = np.zeros((residual.count, residual.dim))
+        self.jacobians = tuple(np.zeros((residual.count, residual.dim, c.block.manifold.dof)) for c in self.connections)
+        self.valid = np.ones(residual.count, dtype=np.bool_)
+        self.counted = np.zeros(residual.count, dtype=np.bool_)
+        self._index = tuple(c.rows for c in self.connections)
+        self._change = [
+            tangent_change(native, c.block.manifold) for native, c in zip(residual.manifolds, self.connections, strict=True)
+        ]
+        whitening = residual.whitening
+        self._is_white = bool(len(whitening.factors) == 1 and np.array_equal(whitening.factors[0], np.eye(residual.dim)))
+        scaled = residual.count if loss.code != SQUARED else 0
+        self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
+        self._sums = np.zeros((-(-residual.count // _CHUNK), 4))
+
+    def __repr__(self) -> str:
+        return f"{self.name!r} ({self.residual.count} × {type(self.residual).__name__})"
+
+    def linearize(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
+        """Fill `r`, `jacobians` and `valid` at the point `values` (one array a block of the problem)."""
+        return self._visit(values, threads, with_jacobians=True)
+
+    def evaluate(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
+        """Cost at the point `values`; overwrites `r` and `valid`, not the Jacobians."""
+        return self._visit(values, threads, with_jacobians=False)
+
+    def accept(self) -> None:
+        """The next costs are compared over the residuals that are valid now."""
+        self.counted[:] = self.valid
+
+    def _visit(self, values: Sequence[NDArray[np.float64]], threads: int, *, with_jacobians: bool) -> GroupCost:
+        x = tuple(values[c.block.number] for c in self.connections)
+        residual, factors, diagonal = self.residual, self.residual.whitening.factors, self.residual.whitening.is_diagonal
+
+        def work(chunk: int, begin: int, end: int) -> None:
+            if with_jacobians:
+                residual.linearize_into(begin, end, x, self._index, self.r, self.jacobians, self.valid)
+            else:
+                residual.evaluate_into(begin, end, x, self._index, self.r, self.valid)
+            if not self._is_white:
+                whiten_residuals(begin, end, factors, diagonal, self.r)
+            weigh_residuals(
+                begin, end, self.loss.code, self.loss.scale, self.r, self.valid, self.counted,
+                self._factor, self._projection, self._sums[chunk],
+            )  # fmt: skip
+            if not with_jacobians:
+                return
+            for slot, J in enumerate(self.jacobians):
+                change = self._change[slot]
+                if change is not None:
+                    change(begin, end, x[slot], self._index[slot], J)
+                if not self._is_white:
+                    whiten_jacobian(begin, end, factors, diagonal, J)
+                if self.loss.code != SQUARED:
+                    weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
+
+        run_chunks(work, residual.count, _CHUNK, threads)
+        cost, common, lost, valid = self._sums.sum(axis=0) if len(self._sums) else (0.0, 0.0, 0, 0)
+        return GroupCost(float(cost), float(common), int(lost), int(valid))
+
+    def find_not_finite(self) -> tuple[int, str] | None:
+        """(residual, what) of the first NaN or infinity in the current linearisation."""
+        row = first_not_finite(self.r)
+        if row >= 0:
+            return int(row), "residual"
+        for connection, role, J in zip(self.connections, self.residual.roles, self.jacobians, strict=True):
+            row = first_not_finite(J.reshape(len(J), -1))
+            if row >= 0:
+                return int(row), f"Jacobian with respect to {role} ({connection.block.name!r})"
+        return None
+
+
+def _broadcast(rows: VariableRows, count: int) -> VariableRows:
+    if len(rows) == count:
+        return rows
+    if len(rows) == 1:
+        return VariableRows(rows.block, np.repeat(rows.rows, count))
+    raise InputError(
+        f"{count} rows of {rows.block.name!r}, one for each residual (or one for all)",
+        f"{len(rows)}",
+        "select a variable for every residual, as in cameras[camera_of]",
+    )

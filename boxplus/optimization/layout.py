@@ -1,0 +1,81 @@
+"""Where the free variables of a problem lie in its tangent vector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.group import Group
+from boxplus.optimization.variables import VariableRows, Variables
+
+
+class Layout:
+    """Numbers the free variables, block after block, and places each in the tangent vector of the problem.
+
+    Attributes:
+        blocks: the blocks of the problem.
+        number: for every block (n,) int64, the number of each of its variables, −1 where it is fixed.
+        sizes: (free variables,) int64 degrees of freedom of each.
+        start: (free variables + 1,) int64, where each begins in the tangent vector; the last is its length.
+    """
+
+    def __init__(self, blocks: Sequence[Variables]) -> None:
+        self.blocks = tuple(blocks)
+        self.number: list[NDArray[np.int64]] = []
+        count = 0
+        for block in self.blocks:
+            number = np.full(len(block), -1, dtype=np.int64)
+            free = ~block.is_fixed
+            number[free] = count + np.arange(int(free.sum()))
+            count += int(free.sum())
+            self.number.append(number)
+        parts = [np.full(int((~b.is_fixed).sum()), b.manifold.dof, dtype=np.int64) for b in self.blocks]
+        self.sizes = np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+        self.start = np.concatenate([[0], np.cumsum(self.sizes)])
+
+    @property
+    def dof(self) -> int:
+        """Length of the tangent vector."""
+        return int(self.start[-1])
+
+    def numbers(self, rows: VariableRows) -> NDArray[np.int64]:
+        """Numbers of the selected variables, −1 where fixed."""
+        return self.number[rows.block.number][rows.rows]
+
+    def starts(self, rows: VariableRows) -> NDArray[np.int64]:
+        """Where the selected variables begin in the tangent vector, −1 where fixed."""
+        number = self.numbers(rows)
+        return np.where(number >= 0, self.start[number], -1)
+
+    def boxplus(self, values: Sequence[NDArray[np.float64]], delta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """values ⊞ δ, block by block; fixed variables stay."""
+        moved = []
+        for block, number, x in zip(self.blocks, self.number, values, strict=True):
+            free = np.flatnonzero(number >= 0)
+            if not len(free):
+                moved.append(x)
+                continue
+            begin = int(self.start[number[free[0]]])
+            step = delta[begin : begin + len(free) * block.manifold.dof].reshape(len(free), block.manifold.dof)
+            if len(free) == len(x):
+                moved.append(block.manifold.boxplus(x, step))
+            else:
+                y = x.copy()
+                y[free] = block.manifold.boxplus(x[free], step)
+                moved.append(y)
+        return moved
+
+    def describe(self, number: int) -> str:
+        """Name of a free variable, such as `poses[12]`."""
+        for block, numbers in zip(self.blocks, self.number, strict=True):
+            row = np.flatnonzero(numbers == number)
+            if len(row):
+                return f"{block.name}[{int(row[0])}]"
+        return f"variable {number}"
+
+
+def connected_numbers(layout: Layout, group: Group) -> list[NDArray[np.int64]]:
+    """For every connection of a group, the numbers of its variables, −1 where fixed."""
+    return [layout.numbers(connection) for connection in group.connections]

@@ -1,0 +1,116 @@
+"""The problem as the solvers see it: values, groups and one linear system, at one point at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import NotFiniteError
+from boxplus.optimization.group import Group, GroupCost
+from boxplus.optimization.layout import Layout
+from boxplus.optimization.linear_system import LinearSystem
+from boxplus.optimization.weighting import add_product_with_jacobian
+
+Values = Sequence[NDArray[np.float64]]
+
+
+class LeastSquares:
+    """Cost, linearisation and linear system of residual groups over a layout.
+
+    Attributes:
+        values: of every block, at the accepted point.
+        cost: at the accepted point.
+        timing_s: seconds spent by stage.
+    """
+
+    def __init__(self, layout: Layout, groups: Sequence[Group], system: LinearSystem, threads: int) -> None:
+        self.layout, self.groups, self.system = layout, tuple(groups), system
+        self.values: Values = [block.values for block in layout.blocks]
+        self.cost = GroupCost(0.0, 0.0, 0, 0)
+        self.timing_s = {"residuals and Jacobians": 0.0, "normal equations": 0.0, "linear solve": 0.0}
+        self._threads = threads
+
+    def start(self, values: Values) -> None:
+        """Linearise at `values` and accept them.
+
+        Raises:
+            NotFiniteError: a residual or a Jacobian is NaN or infinite there.
+        """
+        for group in self.groups:
+            group.counted[:] = False
+        cost = self.linearize(values)
+        if not np.isfinite(cost.cost):
+            self._explain_not_finite(values)
+        self.accept(values, cost)
+        if not (np.isfinite(self.system.gradient).all() and np.isfinite(self.system.diagonal).all()):
+            self._explain_not_finite(values)
+
+    def linearize(self, values: Values) -> GroupCost:
+        """Linearise every group at `values`, without accepting them: the linear system keeps the accepted point."""
+        begin = time.perf_counter()
+        total = GroupCost(0.0, 0.0, 0, 0)
+        for group in self.groups:
+            total = total + group.linearize(values, self._threads)
+        self.timing_s["residuals and Jacobians"] += time.perf_counter() - begin
+        return total
+
+    def accept(self, values: Values, cost: GroupCost) -> None:
+        """Take the point just linearised: assemble the linear system there."""
+        begin = time.perf_counter()
+        for group in self.groups:
+            group.accept()
+        self.values, self.cost = values, cost
+        self.system.assemble()
+        self.timing_s["normal equations"] += time.perf_counter() - begin
+
+    def solve(self, damping: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """δ (dof,) with (H + diag(damping)) δ = −g.
+
+        Raises:
+            NotPositiveDefinite: see `LinearSystem.factorize`.
+        """
+        begin = time.perf_counter()
+        try:
+            self.system.factorize(damping)
+            return self.system.solve(-self.system.gradient)
+        finally:
+            self.timing_s["linear solve"] += time.perf_counter() - begin
+
+    def moved(self, delta: NDArray[np.float64]) -> Values:
+        """The accepted point moved by δ."""
+        return self.layout.boxplus(self.values, delta)
+
+    def product(self, delta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Jδ, all groups one after the other; only while the accepted point is the one linearised last."""
+        parts = []
+        for group in self.groups:
+            product = np.zeros_like(group.r)
+            for connection, J in zip(group.connections, group.jacobians, strict=True):
+                add_product_with_jacobian(J, self.layout.starts(connection), delta, product)
+            parts.append(product.reshape(-1))
+        return np.concatenate(parts)
+
+    def curvature(self, delta: NDArray[np.float64]) -> float:
+        """δᵀHδ = ‖Jδ‖²; see `product`."""
+        product = self.product(delta)
+        return float(product @ product)
+
+    def _explain_not_finite(self, values: Values) -> None:
+        for group in self.groups:
+            found = group.find_not_finite()
+            if found is None:
+                continue
+            row, what = found
+            inputs = ", ".join(
+                f"{role} = {c.block.name}[{c.rows[row]}] = {np.array2string(values[c.block.number][c.rows[row]], precision=6)}"
+                for role, c in zip(group.residual.roles, group.connections, strict=True)
+            )
+            raise NotFiniteError(
+                "finite residuals and Jacobians at the start",
+                f"NaN or infinity in the {what} of residual {row} of group {group!r}, at {inputs}",
+                "repair that measurement, or start from values where it can be evaluated",
+            )
+        raise NotFiniteError("a finite cost", "an overflow in the sum", "scale the residuals by their standard deviations")

@@ -1,0 +1,61 @@
+"""Levenberg-Marquardt with Nielsen's damping (SPEC.md 2.2; Madsen, Nielsen, Tingleff 2004, section 3.2)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.cholesky import NotPositiveDefinite
+from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.strategy import Step, Strategy
+
+# Entries of diag(H) beyond these do not scale the damping: a direction without information is damped all the same.
+_LEAST_DIAGONAL, _LARGEST_DIAGONAL = 1e-6, 1e32
+_LARGEST_DAMPING = 1e16
+
+
+class LevenbergMarquardt(Strategy):
+    """(H + λ D) δ = −g with D = diag(H) or I; the accepted cost never rises."""
+
+    name = "Levenberg-Marquardt"
+
+    def __init__(self, damping: Literal["diagonal", "identity"], initial: float) -> None:
+        self._damping, self._initial = damping, initial
+        self.parameter = 0.0
+        self._growth = 2.0
+
+    def propose(self, problem: LeastSquares) -> Step | None:
+        """See `Strategy.propose`."""
+        diagonal = problem.system.diagonal
+        if self.parameter == 0.0:
+            largest = float(diagonal.max(initial=0.0))
+            self.parameter = self._initial * (1.0 if self._damping == "diagonal" else max(largest, _LEAST_DIAGONAL))
+        while self.parameter <= _LARGEST_DAMPING * max(1.0, float(diagonal.max(initial=0.0))):
+            D = self.parameter * self._scale(diagonal)
+            try:
+                delta = problem.solve(D)
+            except NotPositiveDefinite:
+                self._grow()
+                continue
+            return Step(delta, 0.5 * float(delta @ (D * delta - problem.system.gradient)))
+        return None
+
+    def _scale(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._damping == "diagonal":
+            return np.clip(diagonal, _LEAST_DIAGONAL, _LARGEST_DIAGONAL)
+        return np.ones_like(diagonal)
+
+    def _grow(self) -> None:
+        self.parameter *= self._growth
+        self._growth *= 2.0
+
+    def judge(self, ratio: float | None) -> bool:
+        """See `Strategy.judge`."""
+        if ratio is None or not ratio > 0.0:
+            self._grow()
+            return False
+        self.parameter *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        self._growth = 2.0
+        return True

@@ -1,0 +1,117 @@
+"""The linear system of a step, H + D, dense or block-sparse; Schur elimination stands in its own file."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.optimization.group import Group
+from boxplus.optimization.layout import Layout
+from boxplus.optimization.normal_equations import NormalEquations
+
+
+class LinearSystem(ABC):
+    """The linearised problem: analysed once, assembled for every linearisation, solved for every damping.
+
+    Attributes:
+        description: which elimination and factorisation, and why, in a sentence.
+        gradient: g = Jᵀr (dof,).
+        diagonal: of H (dof,).
+    """
+
+    description: str
+    gradient: NDArray[np.float64]
+    diagonal: NDArray[np.float64]
+
+    @abstractmethod
+    def assemble(self) -> None:
+        """Take H and g from the current linearisation of the groups."""
+
+    @abstractmethod
+    def factorize(self, damping: NDArray[np.float64] | None) -> None:
+        """Factorise H + diag(damping).
+
+        Raises:
+            NotPositiveDefinite: the matrix is singular or indefinite; `block` is the number of a free variable.
+        """
+
+    @abstractmethod
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x (dof,) with (H + diag(damping)) x = right, for the matrix factorised last."""
+
+    @abstractmethod
+    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of free variables, after `factorize(None)`."""
+
+
+class DenseSystem(LinearSystem):
+    """All of H as one dense matrix, for problems of few degrees of freedom."""
+
+    def __init__(self, layout: Layout, groups: Sequence[Group], threads: int) -> None:
+        self._equations = NormalEquations(layout, groups)
+        self._layout, self._threads = layout, threads
+        self._factor: NDArray[np.float64] = np.zeros((0, 0))
+        self.description = f"dense Cholesky of {layout.dof} degrees of freedom"
+
+    def assemble(self) -> None:
+        """See `LinearSystem.assemble`."""
+        self._equations.assemble(self._threads)
+        self.gradient, self.diagonal = self._equations.gradient, self._equations.diagonal
+        self._dense = self._equations.pattern.to_scipy(self._equations.values).toarray()
+
+    def factorize(self, damping: NDArray[np.float64] | None) -> None:
+        """See `LinearSystem.factorize`."""
+        from scipy.linalg.lapack import dpotrf
+
+        matrix = self._dense if damping is None else self._dense + np.diag(damping)
+        self._factor, info = dpotrf(matrix, lower=1, clean=1)
+        if info > 0:
+            block = int(np.searchsorted(self._layout.start, info - 1, side="right")) - 1
+            raise NotPositiveDefinite(block, info - 1 - int(self._layout.start[block]), float(self._factor[info - 1, info - 1]))
+
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `LinearSystem.solve`."""
+        from scipy.linalg import cho_solve
+
+        return np.asarray(cho_solve((self._factor, True), right))
+
+    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """See `LinearSystem.inverse_blocks`."""
+        from scipy.linalg import cho_solve
+
+        inverse = cho_solve((self._factor, True), np.eye(self._layout.dof))
+        start = self._layout.start
+        return [inverse[start[i] : start[i + 1], start[j] : start[j + 1]] for i, j in zip(first, second, strict=True)]
+
+
+class SparseSystem(LinearSystem):
+    """Block-sparse H, factorised by the supernodal Cholesky."""
+
+    def __init__(self, layout: Layout, groups: Sequence[Group], threads: int) -> None:
+        self._equations = NormalEquations(layout, groups)
+        self._threads = threads
+        self._cholesky = SparseCholesky(self._equations.pattern)
+        self.description = (
+            f"sparse Cholesky of {layout.dof} degrees of freedom, {self._cholesky.nnz_factor:,} non-zeros in the factor"
+        )
+
+    def assemble(self) -> None:
+        """See `LinearSystem.assemble`."""
+        self._equations.assemble(self._threads)
+        self.gradient, self.diagonal = self._equations.gradient, self._equations.diagonal
+
+    def factorize(self, damping: NDArray[np.float64] | None) -> None:
+        """See `LinearSystem.factorize`."""
+        self._cholesky.factorize(self._equations.values, diagonal=0.0 if damping is None else damping)
+
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `LinearSystem.solve`."""
+        return self._cholesky.solve(right)
+
+    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """See `LinearSystem.inverse_blocks`."""
+        return list(self._cholesky.inverse_blocks(first, second))

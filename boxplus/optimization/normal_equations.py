@@ -1,0 +1,194 @@
+"""H = JᵀJ and g = Jᵀr of whitened residual groups, as the blocks of a sparse symmetric matrix (SPEC.md 2.1).
+
+Every block of H gathers the residuals that touch it, in the order of the residuals, so that threads never share a block and
+the bits do not depend on their number.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel, run_chunks
+from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.group import Group
+from boxplus.optimization.layout import Layout, connected_numbers
+
+_CHUNK = 512  # blocks of H that a thread gathers in one go
+
+
+@dataclass(frozen=True, slots=True)
+class Gather:
+    """Which residuals of a group add Jₐᵀ J_b to which places.
+
+    Attributes:
+        group, a, b: Jacobians `group.jacobians[a]` and `[b]`.
+        target: (m,) places, ascending.
+        begin: (m + 1,) where the residuals of each place begin in `residual`.
+        residual: rows of the group, ascending within a place.
+    """
+
+    group: Group
+    a: int
+    b: int
+    target: NDArray[np.int64]
+    begin: NDArray[np.int64]
+    residual: NDArray[np.uint32]
+
+    @classmethod
+    def sorted_by(cls, group: Group, a: int, b: int, place: NDArray[np.int64], residual: NDArray[np.intp]) -> Gather:
+        """From the place that each of the residuals adds to."""
+        order = np.argsort(place, kind="stable")
+        target, begin = np.unique(place[order], return_index=True)
+        return cls(group, a, b, target, np.append(begin, len(place)), residual[order].astype(np.uint32))
+
+
+@functools.cache
+def product_kernel(dim: int, width_a: int, width_b: int) -> Callable[..., None]:
+    """A kernel values[target[k]:] += Σ Jₐᵀ J_b over the residuals of each place k, for Jacobians of these sizes."""
+
+    @kernel(fastmath=True)
+    def accumulate_products(
+        first: int,
+        last: int,
+        target: NDArray[np.int64],
+        begin: NDArray[np.int64],
+        residual: NDArray[np.uint32],
+        Ja: NDArray[np.float64],
+        Jb: NDArray[np.float64],
+        values: NDArray[np.float64],
+    ) -> None:
+        for k in range(first, last):
+            at = np.uint64(target[k])
+            for e in range(begin[k], begin[k + 1]):
+                n = np.uint64(residual[e])
+                A, B = Ja[n], Jb[n]
+                for p in range(width_a):
+                    row = values[at + np.uint64(p * width_b) : at + np.uint64((p + 1) * width_b)]
+                    for i in range(dim):
+                        factor = A[i, p]
+                        for q in range(width_b):
+                            row[q] += factor * B[i, q]
+
+    return accumulate_products  # type: ignore[no-any-return]
+
+
+@functools.cache
+def gradient_kernel(dim: int, width: int) -> Callable[..., None]:
+    """A kernel gradient[target[k]:] += Σ Jᵀ r over the residuals of each place k, for Jacobians of this size."""
+
+    @kernel(fastmath=True)
+    def accumulate_gradient(
+        first: int,
+        last: int,
+        target: NDArray[np.int64],
+        begin: NDArray[np.int64],
+        residual: NDArray[np.uint32],
+        J: NDArray[np.float64],
+        r: NDArray[np.float64],
+        gradient: NDArray[np.float64],
+    ) -> None:
+        for k in range(first, last):
+            at = np.uint64(target[k])
+            part = gradient[at : at + np.uint64(width)]
+            for e in range(begin[k], begin[k + 1]):
+                n = np.uint64(residual[e])
+                for i in range(dim):
+                    factor = r[n, i]
+                    for q in range(width):
+                        part[q] += J[n, i, q] * factor
+
+    return accumulate_gradient  # type: ignore[no-any-return]
+
+
+def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> None:
+    """values[place:] += Σ Jₐᵀ J_b, row-major, for every place of `gather`."""
+    group = gather.group
+    Ja, Jb = group.jacobians[gather.a], group.jacobians[gather.b]
+    run = product_kernel(group.residual.dim, Ja.shape[2], Jb.shape[2])
+
+    def work(_: int, first: int, last: int) -> None:
+        run(first, last, gather.target, gather.begin, gather.residual, Ja, Jb, values)
+
+    run_chunks(work, len(gather.target), _CHUNK, threads)
+
+
+def add_gradient(gather: Gather, gradient: NDArray[np.float64], threads: int) -> None:
+    """gradient[place:] += Σ Jₐᵀ r for every place of `gather`."""
+    group = gather.group
+    J = group.jacobians[gather.a]
+    run = gradient_kernel(group.residual.dim, J.shape[2])
+
+    def work(_: int, first: int, last: int) -> None:
+        run(first, last, gather.target, gather.begin, gather.residual, J, group.r, gradient)
+
+    run_chunks(work, len(gather.target), _CHUNK, threads)
+
+
+class NormalEquations:
+    """H and g of `groups` over the free variables of `layout`.
+
+    Attributes:
+        pattern: of the lower triangle of H, a block for each variable.
+        values: of H's blocks, in the order of `pattern`.
+        gradient: g (dof,).
+    """
+
+    def __init__(self, layout: Layout, groups: Sequence[Group]) -> None:
+        rows: list[NDArray[np.int64]] = []
+        columns: list[NDArray[np.int64]] = []
+        parts: list[tuple[Group, int, int, NDArray[np.intp]]] = []
+        self._gradients: list[Gather] = []
+        for group in groups:
+            numbers = connected_numbers(layout, group)
+            for a, number_a in enumerate(numbers):
+                free = np.flatnonzero(number_a >= 0)
+                if len(free):
+                    self._gradients.append(Gather.sorted_by(group, a, a, layout.start[number_a[free]], free))
+                for b, number_b in enumerate(numbers):
+                    # The lower triangle; a residual connected to the same variable twice adds both its cross products.
+                    lower = (number_a > number_b) | (number_a == number_b)
+                    selected = np.flatnonzero((number_a >= 0) & (number_b >= 0) & lower)
+                    if len(selected):
+                        rows.append(number_a[selected])
+                        columns.append(number_b[selected])
+                        parts.append((group, a, b, selected))
+        none = [np.zeros(0, dtype=np.int64)]
+        self.pattern, pairs = BlockPattern.from_pairs(layout.sizes, np.concatenate(rows or none), np.concatenate(columns or none))
+        place = self.pattern.value_start[pairs.block]
+        ends = np.cumsum([len(selected) for *_, selected in parts])
+        self._products = [
+            Gather.sorted_by(group, a, b, place[end - len(selected) : end], selected)
+            for (group, a, b, selected), end in zip(parts, ends, strict=True)
+        ]
+        self.values = np.zeros(int(self.pattern.value_start[-1]))
+        self.gradient = np.zeros(layout.dof)
+        self._diagonal = _diagonal_places(self.pattern)
+
+    def assemble(self, threads: int) -> None:
+        """Take `values` and `gradient` from the current linearisation of the groups."""
+        self.values[:] = 0.0
+        self.gradient[:] = 0.0
+        for gather in self._products:
+            add_products(gather, self.values, threads)
+        for gather in self._gradients:
+            add_gradient(gather, self.gradient, threads)
+
+    @property
+    def diagonal(self) -> NDArray[np.float64]:
+        """Diagonal of H (dof,)."""
+        return self.values[self._diagonal]
+
+
+def _diagonal_places(pattern: BlockPattern) -> NDArray[np.int64]:
+    """Where the diagonal entries of the matrix lie among its values (dof,)."""
+    first = pattern.value_start[pattern.col_start[:-1]]
+    variable = np.repeat(np.arange(len(pattern.sizes)), pattern.sizes)
+    within = np.arange(int(pattern.start[-1])) - pattern.start[variable]
+    places: NDArray[Any] = first[variable] + within * (pattern.sizes[variable] + 1)
+    return places.astype(np.int64)

@@ -1,0 +1,189 @@
+"""A least-squares problem: blocks of variables, groups of residuals, and their minimum."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError, SingularProblemError
+from boxplus.manifolds.manifold import Manifold
+from boxplus.optimization.cholesky import NotPositiveDefinite
+from boxplus.optimization.elimination import choose_system
+from boxplus.optimization.group import Group
+from boxplus.optimization.layout import Layout
+from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.losses import Loss, Squared
+from boxplus.optimization.minimize import Callback, minimize, strategy_of
+from boxplus.optimization.singularity import explain_singularity, structural_defects
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.residuals.residual import Residual
+
+
+class Problem:
+    """Minimises ½ Σ ρ(‖W r(x)‖²) over variables on manifolds.
+
+    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: list[Variables] = []
+        self.groups: list[Group] = []
+        self._analysed: tuple[tuple[Any, ...], LeastSquares, float] | None = None
+
+    def add_variables(self, manifold: Manifold, values: ArrayLike, *, name: str | None = None) -> Variables:
+        """A block of n variables.
+
+        Args:
+            manifold: such as `boxplus.SE3` or `boxplus.Euclidean(3)`.
+            values: (n, size) where the search starts; (size,) for a single variable.
+            name: for messages; the manifold's name and a number otherwise.
+
+        Raises:
+            InputError: wrong shape, not finite, off the manifold; a name that is taken.
+        """
+        label = name if name is not None else f"{manifold.name}_{len(self.blocks)}"
+        if any(block.name == label for block in self.blocks):
+            raise InputError("a new name", f"{label!r}, which another block has", "choose another name")
+        self.blocks.append(Variables(len(self.blocks), label, manifold, manifold.check(label, values)))
+        self._analysed = None
+        return self.blocks[-1]
+
+    def add_residuals(
+        self, residual: Residual, *connections: VariableRows | Variables, loss: Loss | None = None, name: str | None = None
+    ) -> Group:
+        """A group of N residuals, each connected to one variable of every connection.
+
+        Args:
+            residual: of `boxplus.residuals`, or one's own.
+            connections: for every variable of the residual, in the order of `residual.roles`, N rows of a block (or one for
+                all N, or a block of N variables).
+            loss: of `boxplus.losses`; least squares if left out.
+            name: for messages.
+
+        Raises:
+            InputError: wrong number of connections, wrong length, a manifold the residual is not defined for.
+        """
+        if len(connections) != len(residual.manifolds):
+            raise InputError(
+                f"{len(residual.manifolds)} connections ({', '.join(residual.roles)})",
+                f"{len(connections)}",
+                f"connect every variable of {type(residual).__name__}",
+            )
+        rows = [c[:] if isinstance(c, Variables) else c for c in connections]
+        for connection in rows:
+            if not any(connection.block is block for block in self.blocks):
+                raise InputError(
+                    "variables of this problem", f"{connection.block!r} of another one", "add them with `add_variables` first"
+                )
+        label = name if name is not None else f"{type(residual).__name__}_{len(self.groups)}"
+        self.groups.append(Group(residual, rows, loss if loss is not None else Squared(), label))
+        self._analysed = None
+        return self.groups[-1]
+
+    def fix(self, selected: VariableRows | Variables) -> None:
+        """Hold variables at their values: known quantities, or the gauge."""
+        self._set_fixed(selected, True)
+
+    def free(self, selected: VariableRows | Variables) -> None:
+        """Let fixed variables move again."""
+        self._set_fixed(selected, False)
+
+    def _set_fixed(self, selected: VariableRows | Variables, fixed: bool) -> None:
+        rows = selected[:] if isinstance(selected, Variables) else selected
+        rows.block.is_fixed[rows.rows] = fixed
+        self._analysed = None
+
+    def cost(self, values: Solution | Sequence[NDArray[np.float64]] | None = None) -> float:
+        """½ Σ ρ(‖W r‖²) at `values`, by default the variables' own."""
+        at = self._values(values)
+        return float(sum(group.evaluate(at, 1).cost for group in self.groups))
+
+    def defects(self) -> list[str]:
+        """What is wrong with the structure, a sentence each: variables without residuals, components without gauge."""
+        return structural_defects(self.blocks, self.groups)
+
+    def solve(
+        self,
+        options: SolverOptions | None = None,
+        *,
+        start: Solution | Sequence[NDArray[np.float64]] | None = None,
+        callback: Callback | None = None,
+        **settings: Any,
+    ) -> Solution:
+        """Minimise.
+
+        Args:
+            options: see `SolverOptions`; single settings may be given as keywords instead: `solve(max_iterations=20)`.
+            start: where to start, another solution or the values of every block; the variables' own values otherwise.
+            callback: called with every `Iteration`; returns True to stop.
+
+        Raises:
+            InputError: no free variables or no residuals; unknown settings.
+            NotFiniteError: a residual is NaN or infinite at the start.
+            SingularProblemError: Gauss-Newton met a problem that does not determine its variables.
+        """
+        begin = time.perf_counter()
+        if options is not None and settings:
+            raise InputError("options or single settings", "both", "put the settings into the options")
+        options = options if options is not None else SolverOptions(**settings)
+        model, analysis = self._analyse(options)
+        for stage in model.timing_s:
+            model.timing_s[stage] = 0.0
+        model.start(self._values(start))
+        cost_initial = model.cost.cost
+        strategy = strategy_of(options)
+        try:
+            status, reason, history = minimize(model, strategy, options, callback, begin)
+        except NotPositiveDefinite as error:
+            raise SingularProblemError(explain_singularity(model, error)) from error
+        return Solution(
+            status=status,
+            reason=reason,
+            values=tuple(model.values),
+            cost_initial=cost_initial,
+            cost=model.cost.cost,
+            history=tuple(history),
+            method=strategy.name,
+            linear_solver=model.system.description,
+            invalid={group.name: int((~group.counted).sum()) for group in self.groups},
+            notes=tuple(self.defects()),
+            timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
+            _problem=model,
+        )
+
+    def _values(self, given: Solution | Sequence[NDArray[np.float64]] | None) -> list[NDArray[np.float64]]:
+        if given is None:
+            return [block.values for block in self.blocks]
+        values = given.values if isinstance(given, Solution) else given
+        if len(values) != len(self.blocks):
+            raise InputError(f"values of {len(self.blocks)} blocks", f"{len(values)}", "give one array for each block")
+        checked = []
+        for block, array in zip(self.blocks, values, strict=True):
+            if np.shape(array) != block.values.shape:
+                raise InputError(
+                    f"{block.name} of shape {block.values.shape}", f"shape {np.shape(array)}", "keep the block's shape"
+                )
+            checked.append(np.where(block.is_fixed[:, None], block.values, block.manifold.check(block.name, array)))
+        return checked
+
+    def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, float]:
+        key = (options.linear_solver, options.threads)
+        if self._analysed is not None and self._analysed[0] == key:
+            return self._analysed[1], 0.0
+        begin = time.perf_counter()
+        if not self.groups:
+            raise InputError("at least one group of residuals", "none", "call `add_residuals` first")
+        layout = Layout(self.blocks)
+        if layout.dof == 0:
+            raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
+        system = choose_system(layout, self.groups, options)
+        model = LeastSquares(layout, self.groups, system, options.threads)
+        elapsed = time.perf_counter() - begin
+        self._analysed = (key, model, elapsed)
+        return model, elapsed

@@ -1,0 +1,105 @@
+"""What `Problem.solve` returns: the values, why it stopped, and how it got there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.covariance import covariance_blocks
+from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.variables import VariableRows, Variables
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One step that was tried.
+
+    Attributes:
+        number: from 1; 0 is the start.
+        cost: at the accepted point after it.
+        tried_cost: at the point it led to; infinite where that could not be evaluated.
+        gradient: largest entry of the gradient at the accepted point.
+        step: largest entry of the step.
+        parameter: λ, radius or step length of the method when the step was chosen.
+        accepted: whether the step was taken.
+        time_s: since `solve` began.
+    """
+
+    number: int
+    cost: float
+    tried_cost: float
+    gradient: float
+    step: float
+    parameter: float
+    accepted: bool
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Result of a minimisation.
+
+    Attributes:
+        status: `converged`; `stopped` by a limit or the callback; `stalled` where no step lowers the cost any more.
+        reason: why it stopped, in a sentence with numbers.
+        values: (n, size) of every block; also `solution[block]` and `solution[block[rows]]`.
+        cost_initial, cost: ½ Σ ρ(‖r‖²) at the start and at the end, whitened.
+        history: every step tried.
+        method, linear_solver: what was used, and why.
+        invalid: for every group the number of residuals that could not be evaluated at the end, such as points behind a camera.
+        notes: what a user should know (assumptions, fixed gauge).
+        timing_s: seconds by stage: analysis, residuals and Jacobians, normal equations, linear solve, total.
+    """
+
+    status: Literal["converged", "stopped", "stalled"]
+    reason: str
+    values: tuple[NDArray[np.float64], ...]
+    cost_initial: float
+    cost: float
+    history: tuple[Iteration, ...]
+    method: str
+    linear_solver: str
+    invalid: dict[str, int]
+    notes: tuple[str, ...]
+    timing_s: dict[str, float]
+    _problem: LeastSquares = field(repr=False)
+
+    def __getitem__(self, selected: Variables | VariableRows) -> NDArray[np.float64]:
+        """Values (n, size) of a block, or (k, size) of rows of it."""
+        if isinstance(selected, Variables):
+            return self.values[selected.number]
+        return self.values[selected.block.number][selected.rows]
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried."""
+        return self.history[-1].number
+
+    def covariance(self, first: VariableRows, second: VariableRows | None = None) -> NDArray[np.float64]:
+        """Covariance of variables in their tangents at the solution, in the units of the tangents.
+
+        Args:
+            first: k variables.
+            second: k variables, for the cross-covariances of first[n] and second[n]; None for `first` itself.
+
+        Returns:
+            (k, dof, dof) blocks of H⁻¹. A fixed variable has covariance zero: it is known.
+
+        Raises:
+            SingularProblemError: a direction of the problem is unobservable.
+        """
+        return covariance_blocks(self._problem, self.values, first, first if second is None else second)
+
+    def summary(self) -> str:
+        """A few lines for a terminal or a log."""
+        lines = [
+            f"{self.method}, {self.linear_solver}",
+            f"cost {self.cost_initial:.6e} → {self.cost:.6e} in {self.iterations} iterations "
+            f"({sum(not step.accepted for step in self.history[1:])} rejected), {self.timing_s['total']:.3f} s",
+            f"{self.status}: {self.reason}",
+        ]
+        lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
+        return "\n".join([*lines, *self.notes])

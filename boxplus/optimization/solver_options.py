@@ -1,0 +1,30 @@
+"""How `Problem.solve` minimises: method, limits, tolerances."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Method = Literal["levenberg_marquardt", "gauss_newton", "dogleg"]
+Elimination = Literal["auto", "dense", "sparse", "schur"]
+
+
+class SolverOptions(BaseModel):
+    """Options of `Problem.solve`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    method: Method = Field("levenberg_marquardt", description="how a step is chosen")
+    linear_solver: Elimination = Field("auto", description="how a step is computed; auto says what it chose and why")
+    max_iterations: int = Field(100, ge=0, description="steps tried at most, rejected ones included")
+    time_limit_s: float | None = Field(None, gt=0, description="[s] no further step is begun after this time")
+    cost_tolerance: float = Field(1e-9, ge=0, description="converged when a step changes the cost by less than this share of it")
+    step_tolerance: float = Field(1e-10, ge=0, description="converged when no tangent moves by more than this")
+    gradient_tolerance: float = Field(1e-10, ge=0, description="converged when no entry of the gradient exceeds this")
+    initial_damping: float = Field(1e-4, gt=0, description="λ at the start of Levenberg-Marquardt, relative to the diagonal of H")
+    damping: Literal["diagonal", "identity"] = Field(
+        "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start as in SPEC 2.2"
+    )
+    initial_radius: float = Field(1e4, gt=0, description="trust region of the dogleg at the start, in tangents scaled by diag(H)")
+    threads: int = Field(1, ge=1, description="results are the same for any number")

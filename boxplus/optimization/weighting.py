@@ -1,0 +1,157 @@
+"""Whitening and robust weighting of linearised residuals, in place, a chunk at a time while it lies in the cache."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.optimization.losses import SQUARED, triggs
+
+
+@kernel
+def whiten_residuals(begin: int, end: int, W: NDArray[np.float64], is_diagonal: bool, r: NDArray[np.float64]) -> None:
+    """r ← W r for the rows [begin, end); W is (1 or N, d, d)."""
+    dim = r.shape[1]
+    shared = W.shape[0] == 1
+    row = np.empty(dim)
+    for n in range(begin, end):
+        w = W[0] if shared else W[n]
+        if is_diagonal:
+            for i in range(dim):
+                r[n, i] *= w[i, i]
+            continue
+        for i in range(dim):
+            total = 0.0
+            for j in range(dim):
+                total += w[i, j] * r[n, j]
+            row[i] = total
+        for i in range(dim):
+            r[n, i] = row[i]
+
+
+@kernel
+def whiten_jacobian(begin: int, end: int, W: NDArray[np.float64], is_diagonal: bool, J: NDArray[np.float64]) -> None:
+    """J ← W J for the rows [begin, end); J is (N, d, k)."""
+    dim, width = J.shape[1], J.shape[2]
+    shared = W.shape[0] == 1
+    product = np.empty((dim, width))
+    for n in range(begin, end):
+        w = W[0] if shared else W[n]
+        if is_diagonal:
+            for i in range(dim):
+                for c in range(width):
+                    J[n, i, c] *= w[i, i]
+            continue
+        product[:] = 0.0
+        for i in range(dim):
+            for j in range(dim):
+                factor = w[i, j]
+                if factor != 0.0:
+                    for c in range(width):
+                        product[i, c] += factor * J[n, j, c]
+        for i in range(dim):
+            for c in range(width):
+                J[n, i, c] = product[i, c]
+
+
+@kernel
+def weigh_residuals(
+    begin: int,
+    end: int,
+    code: int,
+    scale: float,
+    r: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    counted: NDArray[np.bool_],
+    factor: NDArray[np.float64],
+    projection: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Cost of the rows [begin, end), and Triggs' scaling of their whitened residuals.
+
+    Args:
+        code, scale: of the loss.
+        r: (N, d), whitened; becomes √ρ′/(1 − α) r.
+        valid: (N,) of this linearisation; an invalid residual costs nothing.
+        counted: (N,) residuals that were valid at the point the step started from.
+        factor, projection: (N,) receive √ρ′ and α/‖r̃‖² for `weigh_jacobian`; untouched for least squares.
+        sums: receives ½ Σ ρ over the valid rows, the same over those of them that are `counted`, the number of rows
+            counted but no longer valid, and the number of valid rows.
+    """
+    dim = r.shape[1]
+    cost, common, lost, alive = 0.0, 0.0, 0.0, 0.0
+    for n in range(begin, end):
+        if not valid[n]:
+            if counted[n]:
+                lost += 1.0
+            if code != SQUARED:
+                factor[n], projection[n] = 0.0, 0.0
+            continue
+        s = 0.0
+        for i in range(dim):
+            s += r[n, i] * r[n, i]
+        rho = s
+        if code != SQUARED:
+            rho, root, alpha = triggs(code, scale, s)
+            grow = root / (1.0 - alpha)
+            for i in range(dim):
+                r[n, i] *= grow
+            factor[n] = root
+            scaled = s * grow * grow
+            projection[n] = alpha / scaled if scaled > 0.0 else 0.0
+        cost += rho
+        alive += 1.0
+        if counted[n]:
+            common += rho
+    sums[0], sums[1], sums[2], sums[3] = 0.5 * cost, 0.5 * common, lost, alive
+
+
+@kernel
+def weigh_jacobian(
+    begin: int,
+    end: int,
+    r: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    projection: NDArray[np.float64],
+    J: NDArray[np.float64],
+) -> None:
+    """J ← √ρ′ (I − α r rᵀ/‖r‖²) J for the rows [begin, end), with the weighed r of `weigh_residuals`."""
+    dim, width = J.shape[1], J.shape[2]
+    for n in range(begin, end):
+        root, share = factor[n], projection[n]
+        for c in range(width):
+            along = 0.0
+            for i in range(dim):
+                along += r[n, i] * J[n, i, c]
+            along *= share
+            for i in range(dim):
+                J[n, i, c] = root * (J[n, i, c] - along * r[n, i])
+
+
+@kernel
+def first_not_finite(values: NDArray[np.float64]) -> int:
+    """Row of the first NaN or infinity of (N, m) values, or −1."""
+    for n in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            if not math.isfinite(values[n, i]):
+                return n
+    return -1
+
+
+@kernel
+def add_product_with_jacobian(
+    J: NDArray[np.float64], start: NDArray[np.int64], delta: NDArray[np.float64], product: NDArray[np.float64]
+) -> None:
+    """product (N, d) += J δ; the tangent of row n starts at start[n] of δ, or is fixed at −1."""
+    for n in range(J.shape[0]):
+        at = start[n]
+        if at < 0:
+            continue
+        for i in range(J.shape[1]):
+            total = 0.0
+            for c in range(J.shape[2]):
+                total += J[n, i, c] * delta[at + c]
+            product[n, i] += total
