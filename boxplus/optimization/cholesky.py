@@ -7,10 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import BoxplusError, InputError
 from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.inverse_blocks import SelectedInverse, locate_blocks
 from boxplus.optimization.multifrontal import factorize
 from boxplus.optimization.ordering import Method, order
 from boxplus.optimization.supernodes import ALIGNMENT, lay_out
 from boxplus.optimization.triangular_solve import solve_many, solve_one
+
+SOLVED_VARIABLES = 8
+"""Covariances with up to so many variables are solved for, those with more come from a selected inversion."""
 
 
 class NotPositiveDefinite(BoxplusError, ArithmeticError):
@@ -70,6 +74,7 @@ class SparseCholesky:
         self._inverse, self._pivots, self._diagonal = np.zeros(size), np.zeros(size), np.zeros(size)
         self._work = np.zeros(size + int(fronts.table["below"].max()))
         self._factorized = False
+        self._selected: SelectedInverse | None = None
 
     @property
     def permutation(self) -> NDArray[np.int64]:
@@ -118,7 +123,7 @@ class SparseCholesky:
             )
         fronts = self._fronts
         self._diagonal[:] = diagonal
-        self._factorized = False
+        self._factorized, self._selected = False, None
         failed = int(
             factorize(
                 np.uint64(0), np.uint64(self.front_count), fronts.table, fronts.children, fronts.runs, fronts.entries,
@@ -148,6 +153,47 @@ class SparseCholesky:
         else:
             solve_many(fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse, b, x, np.empty_like(b))
         return x
+
+    def inverse_blocks(self, i: ArrayLike, j: ArrayLike) -> list[NDArray[np.float64]]:
+        """Blocks of the inverse of H: the covariances of pairs of variables when H is an information matrix.
+
+        A few variables are solved for; many are taken from one selected inversion, which is kept until the next
+        factorisation. Pairs outside the factor's pattern are always solved for, once for each of the second variables.
+
+        Args:
+            i: (m,) variables, rows of the blocks.
+            j: (m,) variables, columns.
+
+        Returns:
+            m arrays, `(sizes[i], sizes[j])`.
+
+        Raises:
+            InputError: a variable out of range, arrays of different lengths, or nothing is factorised.
+        """
+        self._require_factor()
+        i, j = (np.atleast_1d(np.asarray(a, np.int64)) for a in (i, j))
+        n = len(self.pattern.sizes)
+        if i.shape != j.shape or i.ndim != 1 or (len(i) and (min(i.min(), j.min()) < 0 or max(i.max(), j.max()) >= n)):
+            raise InputError(f"pairs of variables from 0 to {n - 1}", f"{i} and {j}", "give two flat arrays of the same length")
+        blocks: list[NDArray[np.float64]] = [np.empty(0)] * len(i)
+        place = np.full(len(i), -1)
+        if self._selected is not None or len(np.unique(j)) > SOLVED_VARIABLES:
+            place = locate_blocks(self._fronts, i, j)
+        known = np.flatnonzero(place >= 0)
+        if len(known):
+            if self._selected is None:
+                self._selected = SelectedInverse(self._fronts, self._factor, self._inverse, self._stack)
+            for k in known:
+                blocks[k] = self._selected.block(int(place[k]), int(i[k]), int(j[k]))
+        solved = np.flatnonzero(place < 0)
+        start, sizes = self.pattern.start, self.pattern.sizes
+        for column in np.unique(j[solved]):
+            unit = np.zeros((len(self._pivots), sizes[column]))
+            unit[start[column] : start[column + 1]] = np.eye(sizes[column])
+            x = self.solve(unit)
+            for k in solved[j[solved] == column]:
+                blocks[k] = x[start[i[k]] : start[i[k] + 1]].copy()
+        return blocks
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of H.

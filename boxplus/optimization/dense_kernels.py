@@ -40,38 +40,42 @@ _BLOCK = np.uint64(96)  # columns that are eliminated together: their panel stay
 
 
 @kernel
-def update_lower(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint64, lda: np.uint64, rows: np.uint64,
-                 columns: np.uint64, depth: np.uint64, accumulate: bool) -> None:  # fmt: skip
-    """C ← C - A Aᵀ (or -A Aᵀ) in the lower triangle of the first `columns` of `rows` columns; A is (rows, depth)."""
+def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint64, lda: np.uint64, b: Buffer, b_at: np.uint64,
+           ldb: np.uint64, rows: np.uint64, columns: np.uint64, depth: np.uint64, lower: bool,
+           accumulate: bool) -> None:  # fmt: skip
+    """C ← C - A Bᵀ, or -A Bᵀ without `accumulate`; C is (rows, columns), A (rows, depth), B (columns, depth).
+
+    With `lower` only what lies at or below the diagonal of C is meaningful (part of what is above is overwritten too).
+    """
     j = np.uint64(0)
     while j < columns:
         left = columns - j
-        i = j
+        i = j if lower else np.uint64(0)
         if left >= _SIX:
             while i < rows:
                 count, at = min(rows - i, _TALL), c_at + i + j * ldc
                 if count > _SHORT:
-                    update_6(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_6(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 else:
-                    update_6_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_6_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 i += count
             j += _SIX
         elif left >= _THREE:
             while i < rows:
                 count, at = min(rows - i, _TALL), c_at + i + j * ldc
                 if count > _SHORT:
-                    update_3(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_3(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 else:
-                    update_3_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_3_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 i += count
             j += _THREE
         else:
             while i < rows:
                 count, at = min(rows - i, _TALL), c_at + i + j * ldc
                 if count > _SHORT:
-                    update_1(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_1(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 else:
-                    update_1_short(c, at, ldc, a, a_at + i, lda, a, a_at + j, lda, depth, count, accumulate)
+                    update_1_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                 i += count
             j += _ONE
 
@@ -135,14 +139,14 @@ def _factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, widt
 
 @kernel
 def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
-                 column: np.uint64, update: Buffer, update_at: np.uint64, update_ld: np.uint64) -> np.uint64:  # fmt: skip
+                 column: np.uint64, c: Buffer, c_at: np.uint64, ldc: np.uint64) -> np.uint64:  # fmt: skip
     """Factorise a panel in place and form the update matrix of the rows below.
 
     Args:
         p: buffer with the panel, (rows, width).
         inverse: written at `column`: reciprocals of the diagonal of L.
         pivots: written at `column`: their inverse squares.
-        update: buffer that receives -L₂₁ L₂₁ᵀ, (rows - width) square, lower triangle.
+        c: buffer that receives the update matrix -L₂₁ L₂₁ᵀ, (rows - width) square, lower triangle.
 
     Returns:
         The first column whose pivot is not positive and finite, or `width`.
@@ -155,11 +159,13 @@ def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
         if failed < depth:
             return np.uint64(k + failed)
         behind = k + depth
+        rest = rows - behind
         if behind < width:
-            update_lower(p, at + behind + behind * ld, ld, p, corner + depth, ld, rows - behind, width - behind, depth, True)
+            here, a_at = at + behind + behind * ld, corner + depth
+            update(p, here, ld, p, a_at, ld, p, a_at, ld, rest, width - behind, depth, True, True)
         if rows > width:
-            update_lower(
-                update, update_at, update_ld, p, at + width + k * ld, ld, rows - width, rows - width, depth, k > np.uint64(0)
-            )
+            below, a_at = rows - width, at + width + k * ld
+            first = k == np.uint64(0)
+            update(c, c_at, ldc, p, a_at, ld, p, a_at, ld, below, below, depth, True, not first)
         k = behind
     return width

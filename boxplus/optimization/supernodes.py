@@ -62,8 +62,11 @@ class Fronts:
     """The result of the symbolic analysis.
 
     Attributes:
+        sizes: (n,) int64, degrees of freedom of the variables.
         order: (n,) int64, variable at each position of the elimination order.
         scalar_order: (N,) uint64, scalar row of the matrix at each position.
+        scalar_of: (n,) uint64, scalar position of each variable in the elimination order.
+        front_of: (n,) uint64, front that eliminates each variable.
         table: (fronts + 1,) FRONT, children before parents.
         children: (fronts,) uint64.
         runs: RUN records.
@@ -73,8 +76,11 @@ class Fronts:
         stack_size: elements of the stacks of update matrices.
     """
 
+    sizes: NDArray[np.int64]
     order: NDArray[np.int64]
     scalar_order: NDArray[np.uint64]
+    scalar_of: NDArray[np.uint64]
+    front_of: NDArray[np.uint64]
     table: NDArray[np.void]
     children: NDArray[np.uint64]
     runs: NDArray[np.void]
@@ -241,8 +247,11 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
         pattern.col_start, pattern.row, pattern.value_start, position, group_of, first, row_start, rows, start, table, entries
     )
     return Fronts(
+        sizes=pattern.sizes,
         order=order,
         scalar_order=_expand(pattern.start[order], sizes),
+        scalar_of=start[position].astype(np.uint64),
+        front_of=group_of[position].astype(np.uint64),
         table=table,
         children=np.argsort(group_parent, kind="stable").astype(np.uint64),
         runs=runs[:run_count].copy().view(RUN)[:, 0],

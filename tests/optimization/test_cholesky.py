@@ -134,3 +134,41 @@ def test_refuses_what_does_not_fit() -> None:
     cholesky.factorize(values)
     with pytest.raises(InputError, match="right-hand side of 10 rows"):
         cholesky.solve(np.ones(9))
+
+
+@given(seed=st.integers(0, 10**6), sizes=st.lists(st.integers(1, 7), min_size=1, max_size=25), density=st.floats(0.0, 3.0))
+def test_blocks_of_the_inverse(seed: int, sizes: list[int], density: float) -> None:
+    pattern, values, dense = random_matrix(seed, sizes, int(density * len(sizes)))
+    cholesky = SparseCholesky(pattern)
+    cholesky.factorize(values)
+    inverse, start = np.linalg.inv(dense), pattern.start
+    rng = np.random.default_rng(seed)
+    every = np.arange(len(sizes))
+    for i, j in [(every, every), tuple(rng.integers(0, len(sizes), (2, 40))), (every[:3], every[:1].repeat(len(every[:3])))]:
+        for a, b, block in zip(i, j, cholesky.inverse_blocks(i, j), strict=True):
+            expected = inverse[start[a] : start[a + 1], start[b] : start[b + 1]]
+            np.testing.assert_allclose(block, expected, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("shape", ["grid", "dense", "arrow to the first", "chain", "one dense block of 300"])
+def test_selected_inverse_of_large_structures(shape: str) -> None:
+    pattern, _ = BlockPattern.from_pairs(*SHAPES[shape])
+    values, dense = positive_definite(pattern, np.random.default_rng(0))
+    cholesky = SparseCholesky(pattern)
+    cholesky.factorize(values)
+    i, j = pattern.row, pattern.column
+    inverse, start = np.linalg.inv(dense), pattern.start
+    for a, b, block in zip(i, j, cholesky.inverse_blocks(i, j), strict=True):
+        np.testing.assert_allclose(block, inverse[start[a] : start[a + 1], start[b] : start[b + 1]], rtol=1e-9, atol=1e-12)
+
+
+def test_blocks_of_the_inverse_follow_the_latest_factorisation() -> None:
+    pattern, values, _ = random_matrix(8, [6] * 30, 60)
+    cholesky, every = SparseCholesky(pattern), np.arange(30)
+    cholesky.factorize(values)
+    first = cholesky.inverse_blocks(every, every)
+    cholesky.factorize(4.0 * values)
+    for one, quarter in zip(first, cholesky.inverse_blocks(every, every), strict=True):
+        np.testing.assert_array_equal(one / 4.0, quarter)
+    with pytest.raises(InputError, match="pairs of variables from 0 to 29"):
+        cholesky.inverse_blocks([0], [30])

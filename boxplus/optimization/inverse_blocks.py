@@ -1,0 +1,162 @@
+"""Blocks of the inverse from the factor L, on the pattern of L: selected inversion, front by front from the root down.
+
+With the front's rows split into its columns (1) and the rows below (2), and Z the inverse,
+
+    Z₂₁ = -Z₂₂ W,   Z₁₁ = L₁₁⁻ᵀ L₁₁⁻¹ - Wᵀ Z₂₁,   W = L₂₁ L₁₁⁻¹,
+
+where Z₂₂ is a part of the parent front's Z. Takahashi, Fagan, Chin, "Formation of a sparse bus impedance matrix and its
+application to short circuit study" (1973); Erisman and Tinney, "On computing certain elements of the inverse of a sparse
+matrix" (1975).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.optimization.dense_kernels import Buffer, update
+from boxplus.optimization.multifrontal import Indices, Table
+from boxplus.optimization.supernodes import Fronts
+
+_ZERO, _ONE = np.uint64(0), np.uint64(1)
+
+
+@kernel
+def _invert_triangle(factor: Buffer, at: np.uint64, ld: np.uint64, inverse: Buffer, column: np.uint64, width: np.uint64,
+                     m: Buffer, negative: Buffer) -> None:  # fmt: skip
+    """M = L₁₁⁻¹, transposed, (width, width), and its negative."""
+    for k in range(width * width):
+        m[k] = 0.0
+    for k in range(width):
+        row = k * width
+        for j in range(k):
+            weight = factor[at + k + j * ld]
+            for i in range(j + _ONE):
+                m[row + i] -= weight * m[j * width + i]
+        m[row + k] = 1.0
+        for i in range(k + _ONE):
+            m[row + i] *= inverse[column + k]
+    for k in range(width * width):
+        negative[k] = -m[k]
+
+
+@kernel
+def _hand_to_child(child: Table, last: np.uint64, runs: Table, z: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64,
+                   stack: Buffer, below_at: np.uint64, below_ld: np.uint64) -> None:  # fmt: skip
+    """Copy a child's part of a front's Z to the place of its update matrix, lower triangle."""
+    target_at, target_ld = child["update_at"], child["update_ld"]
+    for a in range(child["run_start"], last):
+        column, there, length = runs[a]["child"], runs[a]["parent"], runs[a]["length"]
+        for j in range(length):
+            target = target_at + (column + j) * target_ld
+            for b in range(a, last):
+                row, below, count = runs[b]["child"], runs[b]["parent"], runs[b]["length"]
+                if there < width:
+                    source = at + (there + j) * ld + below
+                    for i in range(count):
+                        stack[target + row + i] = z[source + i]
+                else:
+                    source = below_at + (there + j - width) * below_ld + below - width
+                    for i in range(count):
+                        stack[target + row + i] = stack[source + i]
+
+
+@kernel
+def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffer, inverse: Buffer, stack: Buffer, z: Buffer,
+                     m: Buffer, negative: Buffer, w: Buffer, z_transposed: Buffer) -> None:  # fmt: skip
+    """The inverse on the pattern of the factor, in panels like those of the factor.
+
+    Args:
+        stack: scratch, that of the factorisation.
+        z: receives the panels; lower triangles.
+        m, negative: scratch, (largest width squared,).
+        w, z_transposed: scratch, (largest width times rows below,).
+    """
+    fronts = np.uint64(len(table) - 1)
+    for back in range(fronts):
+        g = fronts - _ONE - back
+        front, following = table[g], table[g + _ONE]
+        width, below, at, ld = front["width"], front["below"], front["panel_at"], front["panel_ld"]
+        below_at, below_ld = front["update_at"], front["update_ld"]
+        _invert_triangle(factor, at, ld, inverse, front["column"], width, m, negative)
+        update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, True, False)
+        if below > _ZERO:
+            for j in range(below):
+                for i in range(j):
+                    stack[below_at + i + j * below_ld] = stack[below_at + j + i * below_ld]
+            update(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, False, False)
+            update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, False, False)
+            for j in range(width):
+                for i in range(below):
+                    z_transposed[j + i * width] = z[at + width + i + j * ld]
+            update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, True, True)
+        for c in range(front["child_start"], following["child_start"]):
+            child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+            _hand_to_child(child, last, runs, z, at, ld, width, stack, below_at, below_ld)
+
+
+@kernel
+def _locate(first: Indices, second: Indices, scalar_of: Indices, front_of: Indices, table: Table, rows: Indices,
+            place: NDArray[np.int64]) -> None:  # fmt: skip
+    """First element of the blocks of pairs of variables among the panels, -1 outside the pattern of the factor."""
+    for k in range(np.uint64(len(first))):
+        a, b = scalar_of[first[k]], scalar_of[second[k]]
+        front = table[front_of[first[k] if a < b else second[k]]]
+        low, high = min(a, b) - front["column"], max(a, b)
+        place[k] = -1
+        if high < front["column"] + front["width"]:
+            row = high - front["column"]
+        else:
+            end = front["row_start"] + front["below"]
+            lower, upper = front["row_start"], end
+            while lower < upper:
+                middle = (lower + upper) // np.uint64(2)
+                if rows[middle] < high:
+                    lower = middle + _ONE
+                else:
+                    upper = middle
+            if lower == end or rows[lower] != high:
+                continue
+            row = front["width"] + lower - front["row_start"]
+        place[k] = np.int64(front["panel_at"] + row + low * front["panel_ld"])
+
+
+class SelectedInverse:
+    """All blocks of the inverse of a factorised matrix that lie on the pattern of its factor.
+
+    Args:
+        fronts: the analysis.
+        factor, inverse: panels and reciprocals of the diagonal of L.
+        stack: scratch, that of the factorisation.
+    """
+
+    def __init__(self, fronts: Fronts, factor: Buffer, inverse: Buffer, stack: Buffer) -> None:
+        self._fronts = fronts
+        self._panels = np.empty_like(factor)
+        width, below = (fronts.table[name][:-1].astype(np.int64) for name in ("width", "below"))
+        triangle, rectangle = (int(a.max(initial=0)) for a in (width * width, width * below))
+        selected_inverse(
+            fronts.table, fronts.children, fronts.runs, factor, inverse, stack, self._panels,
+            np.empty(triangle), np.empty(triangle), np.empty(rectangle), np.empty(rectangle),
+        )  # fmt: skip
+
+    def block(self, place: int, i: int, j: int) -> NDArray[np.float64]:
+        """The block of the variables i and j at a place that `locate_blocks` found."""
+        fronts = self._fronts
+        swapped = fronts.scalar_of[i] < fronts.scalar_of[j]
+        low, high = (i, j) if swapped else (j, i)
+        columns, rows = (np.arange(fronts.sizes[variable]) for variable in (low, high))
+        if i == j:
+            rows, columns = np.maximum(rows[:, None], columns), np.minimum(rows[:, None], columns)
+        else:
+            rows = rows[:, None]
+        found: NDArray[np.float64] = self._panels[place + rows + columns * int(fronts.table[fronts.front_of[low]]["panel_ld"])]
+        return found.T if swapped else found
+
+
+def locate_blocks(fronts: Fronts, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(m,) places of the blocks of pairs of variables, -1 outside the pattern of the factor."""
+    place = np.empty(len(i), np.int64)
+    _locate(i.astype(np.uint64), j.astype(np.uint64), fronts.scalar_of, fronts.front_of, fronts.table, fronts.rows, place)
+    return place
