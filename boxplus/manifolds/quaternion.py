@@ -6,13 +6,16 @@ The kernels take and return scalars, for the inner loops of residuals; the funct
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus.manifolds._batch import map_batch
-from boxplus.manifolds.so3 import quaternion_into
+from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
+from boxplus.manifolds.manifold import Manifold
+from boxplus.manifolds.so3 import log_quaternion, quaternion_into, right_jacobian_into, right_jacobian_inverse_into
 
 
 @kernel(inline=True)
@@ -112,7 +115,68 @@ def multiply(p_wxyz: ArrayLike, q_wxyz: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def conjugate(q_wxyz: ArrayLike) -> NDArray[np.float64]:
-    """Conjugate (..., 4): the inverse of a unit quaternion."""
-    conjugated: NDArray[np.float64] = np.asarray(q_wxyz, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
-    return conjugated
+@kernel
+def _boxplus_batch(x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    for i in range(x.shape[0]):
+        w, a, b, c = exp_scalars(delta[i, 0], delta[i, 1], delta[i, 2])
+        w, a, b, c = multiply_scalars(x[i, 0], x[i, 1], x[i, 2], x[i, 3], w, a, b, c)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = normalized_scalars(w, a, b, c)
+
+
+@kernel
+def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    for i in range(x.shape[0]):
+        w, a, b, c = multiply_scalars(base[i, 0], -base[i, 1], -base[i, 2], -base[i, 3], x[i, 0], x[i, 1], x[i, 2], x[i, 3])
+        out[i, 0], out[i, 1], out[i, 2] = log_quaternion(w, a, b, c)
+
+
+@kernel
+def _boxplus_jacobian_batch(delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    for i in range(delta.shape[0]):
+        right_jacobian_into(delta[i, 0], delta[i, 1], delta[i, 2], J[i])
+
+
+@kernel
+def _boxminus_jacobian_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    for i in range(w.shape[0]):
+        right_jacobian_inverse_into(w[i, 0], w[i, 1], w[i, 2], J[i])
+
+
+@dataclass(frozen=True, repr=False)
+class _UnitQuaternion(KernelManifold):
+    """Rotations stored wxyz (4,), moved by rotation vectors (3,) on the right: q ⊗ Exp_q(w)."""
+
+    name = "UnitQuaternion"
+    size = 4
+    dof = 3
+    tangent_names = ("rotation x [rad]", "rotation y [rad]", "rotation z [rad]")
+
+    def boxplus_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        _boxplus_batch(x, delta, out)
+
+    def boxminus_into(self, x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        _boxminus_batch(x, base, out)
+
+    def boxplus_jacobian_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+        _boxplus_jacobian_batch(delta, J)
+
+    def boxminus_jacobian_into(self, x: NDArray[np.float64], base: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+        difference = np.empty((len(x), 3))
+        _boxminus_batch(x, base, difference)
+        _boxminus_jacobian_batch(difference, J)
+
+    def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
+        rows = super().check(name, x)
+        normalize_quaternions(name, rows)
+        return rows
+
+    def identity(self) -> NDArray[np.float64]:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+
+    def random(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        q = rng.normal(size=(count, 4))
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        return q
+
+
+UnitQuaternion: Manifold = _UnitQuaternion()

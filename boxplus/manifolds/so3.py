@@ -1,21 +1,27 @@
 """Rotations SO(3): Exp, Log and their Jacobians (SPEC.md 1.1, 1.2, 1.4).
 
 Kernels take scalars or write into arrays of their caller; the functions without underscore are batch-first NumPy fronts.
-A rotation vector `w` is axis times angle [rad].
+A rotation vector `w` is axis times angle [rad]. Matrices compose by `@`, invert by transposing and are their own adjoint:
+R Exp(w) Rᵀ = Exp(R w). `SO3` is the manifold of rotation matrices as variables.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus.errors import InputError
 from boxplus.manifolds._batch import as_batch, map_batch
+from boxplus.manifolds._kernel_manifold import KernelManifold, checked_rows
+from boxplus.manifolds.manifold import Manifold
 
 SERIES_SWITCH = 1.0  # angle [rad] below which A, B, C come from their series (SPEC.md 1.1)
 D_SERIES_SWITCH = 0.5
+_ROTATION_TOLERANCE = 1e-3  # matrices this far from orthonormal come from rounded files, not from a mistake
 
 
 @kernel(inline=True)
@@ -177,13 +183,23 @@ def log(R: ArrayLike) -> NDArray[np.float64]:
 
 
 def right_jacobian(w: ArrayLike) -> NDArray[np.float64]:
-    """J_r (..., 3, 3) at w (..., 3): Exp(w + d) ≈ Exp(w) Exp(J_r(w) d). J_l(w) = right_jacobian(−w)."""
+    """J_r (..., 3, 3) at w (..., 3): Exp(w + d) ≈ Exp(w) Exp(J_r(w) d)."""
     return map_batch(_right_jacobian_batch, "w", w, (3,), (3, 3))
+
+
+def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
+    """J_l (..., 3, 3) at w (..., 3): Exp(w + d) ≈ Exp(J_l(w) d) Exp(w); J_l(w) = J_r(−w)."""
+    return right_jacobian(-np.asarray(w, dtype=np.float64))
 
 
 def right_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
     """J_r⁻¹ (..., 3, 3) at w (..., 3): Log(Exp(w) Exp(d)) ≈ w + J_r⁻¹(w) d."""
     return map_batch(_right_jacobian_inverse_batch, "w", w, (3,), (3, 3))
+
+
+def left_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
+    """J_l⁻¹ (..., 3, 3) at w (..., 3): Log(Exp(d) Exp(w)) ≈ w + J_l⁻¹(w) d."""
+    return right_jacobian_inverse(-np.asarray(w, dtype=np.float64))
 
 
 def hat(w: ArrayLike) -> NDArray[np.float64]:
@@ -210,3 +226,81 @@ def is_rotation(R: ArrayLike, tolerance: float = 1e-6) -> bool:
     matrices, _ = as_batch("R", R, (3, 3))
     orthonormal = np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(initial=0.0) <= tolerance
     return bool(np.isfinite(matrices).all() and orthonormal and (np.linalg.det(matrices) > 0).all())
+
+
+@kernel
+def _boxplus_batch(x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    step = np.empty((3, 3))
+    for i in range(x.shape[0]):
+        exp_into(delta[i, 0], delta[i, 1], delta[i, 2], step)
+        for row in range(3):
+            a, b, c = x[i, 3 * row], x[i, 3 * row + 1], x[i, 3 * row + 2]
+            for column in range(3):
+                out[i, 3 * row + column] = a * step[0, column] + b * step[1, column] + c * step[2, column]
+
+
+@kernel
+def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    difference = np.empty((3, 3))
+    for i in range(x.shape[0]):
+        for row in range(3):
+            for column in range(3):
+                difference[row, column] = (
+                    base[i, row] * x[i, column] + base[i, 3 + row] * x[i, 3 + column] + base[i, 6 + row] * x[i, 6 + column]
+                )
+        log_into(difference, out[i])
+
+
+@dataclass(frozen=True, repr=False)
+class _SO3(KernelManifold):
+    """Rotation matrices stored row by row (9,), moved by rotation vectors (3,) on the right: R Exp(w)."""
+
+    name = "SO3"
+    size = 9
+    dof = 3
+    tangent_names = ("rotation x [rad]", "rotation y [rad]", "rotation z [rad]")
+
+    def boxplus_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        _boxplus_batch(x, delta, out)
+
+    def boxminus_into(self, x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        _boxminus_batch(x, base, out)
+
+    def boxplus_jacobian_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+        _right_jacobian_batch(delta, J)
+
+    def boxminus_jacobian_into(self, x: NDArray[np.float64], base: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+        difference = np.empty((len(x), 3))
+        _boxminus_batch(x, base, difference)
+        _right_jacobian_inverse_batch(difference, J)
+
+    def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
+        """As `Manifold.check`; takes (n, 3, 3) and (3, 3) as well."""
+        shape = np.shape(x)
+        if shape[-2:] == (3, 3) and len(shape) in (2, 3):
+            x = np.reshape(np.asarray(x, dtype=np.float64), (-1, 9))
+        rows = checked_rows(name, x, 9, self.name)
+        matrices = rows.reshape(-1, 3, 3)
+        # U Vᵀ of the singular value decomposition is the nearest orthonormal matrix.
+        left, stretch, right = np.linalg.svd(matrices)
+        off = (np.abs(stretch - 1.0).max(axis=1) > _ROTATION_TOLERANCE) | (np.linalg.det(matrices) < 0.0)
+        if off.any():
+            row = int(np.argmax(off))
+            raise InputError(
+                f"{name} as rotation matrices",
+                f"singular values {stretch[row].round(6)}, determinant {np.linalg.det(matrices[row]):.6g} in row {row}",
+                "orthonormalise it, or check whether rows and columns are exchanged or mirrored",
+            )
+        rows[:] = (left @ right).reshape(-1, 9)
+        return rows
+
+    def identity(self) -> NDArray[np.float64]:
+        return np.eye(3).ravel()
+
+    def random(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        q = rng.normal(size=(count, 4))
+        w = 2.0 * np.arctan2(np.linalg.norm(q[:, 1:], axis=1), q[:, 0])
+        return exp(q[:, 1:] * (w / np.linalg.norm(q[:, 1:], axis=1))[:, None]).reshape(count, 9)
+
+
+SO3: Manifold = _SO3()
