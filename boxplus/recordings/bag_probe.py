@@ -21,7 +21,7 @@ from boxplus.recordings.messages import (
     parse_point_cloud,
     parse_transforms,
 )
-from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.options import RecordingOptions, check_start
 from boxplus.recordings.transforms import Transform, chain
 
 CLOUD_PARSERS = {
@@ -82,6 +82,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
     evidence = [Evidence("file", "damaged", "warning", text) for text in container.damage]
     imu = _choose_imu(channels, options)
     clouds = _cloud_candidates(channels, options)
+    check_start(options, (container.end_ns - container.start_ns) * 1e-9)
     cloud_probes, imu_probe, transforms = _probe(container, clouds, imu, options)
     lidar = _choose_lidar(clouds, cloud_probes, options)
     probe = cloud_probes[lidar.topic]

@@ -6,6 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from boxplus.errors import RecordingError
+
 TimeUnit = Literal["s", "ms", "us", "ns"]
 TimeReference = Literal["scan_start", "scan_end", "absolute"]
 GyroUnit = Literal["rad/s", "deg/s"]
@@ -37,3 +39,13 @@ class RecordingOptions(BaseModel):
     max_range: float = Field(default=1000.0, gt=0.0, description="points farther than this are dropped [m]")
     start_s: float = Field(default=0.0, ge=0.0, description="skip this much at the beginning of the recording [s]")
     duration_s: float | None = Field(default=None, gt=0.0, description="read at most this much [s]")
+
+
+def check_start(options: RecordingOptions, duration_s: float) -> None:
+    """Raise RecordingError when the options skip a whole recording of this duration."""
+    if options.start_s >= duration_s > 0.0:
+        raise RecordingError(
+            f"a start within the recording, which ends after {duration_s:.3f} s",
+            f"--start {options.start_s:g}",
+            "skip less of it",
+        )

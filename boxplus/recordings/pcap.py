@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from boxplus.errors import RecordingError
 from boxplus.recordings.containers import READ_ERRORS
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
-from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.options import RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -107,6 +107,7 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
         raise RecordingError(
             "an Ouster capture with its metadata", f"{path.name}: {error}", f"check that {metadata.name} belongs to it"
         ) from error
+    check_start(options, (last_ns - first_ns) * 1e-9)
     T_sensor_imu = np.array(sensor.imu_to_sensor_transform, dtype=np.float64)
     T_imu_lidar = np.eye(4)
     T_imu_lidar[:3, :3] = T_sensor_imu[:3, :3].T
@@ -193,6 +194,7 @@ def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
             f"neither with {path.name}",
             "put the sensor's metadata beside an Ouster capture, under a name the capture's begins with; convert others to a bag",
         )
+    check_start(options, stamps[1] - stamps[0])
     evidence = [
         Evidence("imu_topic", "none", "error", "a Velodyne capture holds no IMU: for odometry, record both in one bag"),
         Evidence(

@@ -66,6 +66,15 @@ def test_start_and_duration_cut_the_stream(tmp_path: Path) -> None:
     assert all(START_NS + 500_000_000 <= block.time_ns[0] <= START_NS + 1_500_000_000 for block in imu)
 
 
+@pytest.mark.parametrize("container", ["ros1", "sqlite3"])
+def test_a_start_beyond_the_end(tmp_path: Path, container: str) -> None:
+    path = write_bag(tmp_path, container)
+    with open_recording(path) as recording:
+        duration_s = recording.info.duration_s
+    with pytest.raises(RecordingError, match=rf"which ends after {duration_s:.3f} s – got --start 60 – skip less of it"):
+        open_recording(path, RecordingOptions(start_s=60.0))
+
+
 @pytest.mark.parametrize("container", ["mcap", "sqlite3"])
 def test_ros2_files_without_metadata(tmp_path: Path, container: str) -> None:
     folder = write_bag(tmp_path, container)
