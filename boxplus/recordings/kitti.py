@@ -1,6 +1,7 @@
 """KITTI raw drives as recordings (Geiger et al., IJRR 2013; layout of the raw data development kit).
 
-velodyne_points/data/*.bin (float32 x, y, z, reflectance), velodyne_points/timestamps{,_start,_end}.txt
+velodyne_points/data/*.bin (float32 x, y, z, reflectance), velodyne_points/timestamps{,_start,_end}.txt: the laser facing
+forward, and at both ends of its turn, which begins at the rear and goes clockwise
 oxts/data/*.txt (30 columns), oxts/timestamps.txt
 calib_imu_to_velo.txt beside the drive, above it, or inside: p_velodyne = R p_imu + T
 """
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, Verdict
-from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions
+from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -50,8 +51,9 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
     imu = _sensor_files(path / "oxts", ".txt")
     first = int(min(scans.start_ns.min(), imu.time_ns.min()))
     last = int(max(scans.end_ns.max(), imu.time_ns.max()))
+    check_start(options, (last - first) * 1e-9)
     T_imu_lidar, source = _calibration(path)
-    evidence = [_point_time_evidence(scans, options)]
+    evidence = [_point_time_evidence(scans, options, path / "velodyne_points")]
     for name, files in (("velodyne_points", scans), ("oxts", imu)):
         if files.missing:
             text = f"{files.missing} of the {files.missing + len(files.paths)} times in {name} have no data file: these are gaps"
@@ -120,12 +122,8 @@ def _sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") 
 def _scan_files(folder: Path, options: RecordingOptions) -> _Files:
     if options.point_time_field == NO_POINT_TIME:
         return _sensor_files(folder, ".bin")
-    if not (folder / "timestamps_start.txt").is_file() or not (folder / "timestamps_end.txt").is_file():
-        raise RecordingError(
-            "timestamps_start.txt and timestamps_end.txt, from which every point gets its time by its azimuth",
-            f"not both of them in {folder}",
-            "unpack the whole drive, or accept distorted scans with --point-time-field none",
-        )
+    if not _has_turn_times(folder):
+        return _turns_around(_sensor_files(folder, ".bin"), folder)
     starts = _sensor_files(folder, ".bin", "timestamps_start.txt")
     ends = _sensor_files(folder, ".bin", "timestamps_end.txt")
     if len(starts.time_ns) != len(ends.time_ns):
@@ -137,13 +135,46 @@ def _scan_files(folder: Path, options: RecordingOptions) -> _Files:
     return _Files(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing)
 
 
-def _point_time_evidence(scans: _Files, options: RecordingOptions) -> Evidence:
+def _has_turn_times(folder: Path) -> bool:
+    return all((folder / f"timestamps_{end}.txt").is_file() for end in ("start", "end"))
+
+
+def _turns_around(forward: _Files, folder: Path) -> _Files:
+    """Both ends of every turn, from the times at which the laser faced forward: halfway to its neighbours.
+
+    Across a gap the turn takes as long as the median one.
+    """
+    steps = np.diff(forward.time_ns)
+    if not (steps > 0).any():
+        raise RecordingError(
+            "two times one after the other in timestamps.txt, which show how long a turn takes, or the times of its ends",
+            f"{len(forward.time_ns)} times that do not go on in {folder}",
+            "unpack the whole drive, or accept distorted scans with --point-time-field none",
+        )
+    turn = np.median(steps[steps > 0])
+    half = np.where((steps > 0.5 * turn) & (steps < 1.5 * turn), steps, turn).astype(np.int64) // 2
+    ends = round(float(turn)) // 2
+    start_ns = forward.time_ns - np.concatenate(([ends], half))
+    end_ns = forward.time_ns + np.concatenate((half, [ends]))
+    return _Files(forward.paths, forward.time_ns, start_ns, end_ns, forward.missing)
+
+
+def _point_time_evidence(scans: _Files, options: RecordingOptions, folder: Path) -> Evidence:
+    key = "point_time_field"
     if options.point_time_field == NO_POINT_TIME:
         text = "every point is taken at the time of its scan, as asked for: motion within a scan is not corrected"
-        return Evidence("point_time_field", "none", "warning", text)
+        return Evidence(key, "none", "warning", text)
     duration = float(np.median(scans.end_ns - scans.start_ns)) * 1e-9
-    text = f"a turn takes {duration:.4f} s from timestamps_start to timestamps_end; the laser turns clockwise from the rear"
-    return Evidence("point_time_field", "azimuth", "ok" if 0.02 < duration < 0.5 else "warning", text)
+    turns = "the laser turns clockwise from the rear"
+    if not _has_turn_times(folder):
+        text = (
+            "the times of the points are reconstructed: timestamps_start.txt or timestamps_end.txt is missing, so a turn takes "
+            f"{duration:.4f} s around the time in timestamps.txt, at which the laser faces forward; {turns}; unpack the whole "
+            "drive for measured times, or take a scan as one instant with --point-time-field none"
+        )
+        return Evidence(key, "azimuth", "warning", text)
+    text = f"a turn takes {duration:.4f} s from timestamps_start to timestamps_end; {turns}"
+    return Evidence(key, "azimuth", "ok" if 0.02 < duration < 0.5 else "warning", text)
 
 
 def _calibration(path: Path) -> tuple[NDArray[np.float64] | None, str]:

@@ -91,13 +91,45 @@ def test_broken_and_missing_files_are_counted(drive: Path) -> None:
     assert sum(isinstance(e, Scan) for e in events) == 4
 
 
-def test_without_start_and_end_times(drive: Path) -> None:
+def test_without_the_ends_of_the_turns_they_are_reconstructed(drive: Path) -> None:
+    with open_recording(drive) as recording:
+        measured = [e for e in recording if isinstance(e, Scan)]
     (drive / "velodyne_points" / "timestamps_end.txt").unlink()
-    with pytest.raises(RecordingError, match=r"timestamps_start.txt and timestamps_end.txt.*--point-time-field none"):
-        open_recording(drive)
+    with open_recording(drive) as recording:
+        found = {e.key: e for e in recording.info.evidence}["point_time_field"]
+        assert found.verdict == "warning" and "reconstructed" in found.text and "--point-time-field none" in found.text
+        scans = [e for e in recording if isinstance(e, Scan)]
+    assert len(scans) == len(measured)
+    for scan, other in zip(scans, measured, strict=True):
+        np.testing.assert_allclose(scan.time_ns, other.time_ns, atol=20)
+
+
+def test_a_gap_between_turns_does_not_stretch_them(drive: Path) -> None:
+    velodyne = drive / "velodyne_points"
+    for end in ("start", "end"):
+        (velodyne / f"timestamps_{end}.txt").unlink()
+    (velodyne / "timestamps.txt").write_text(stamps(0.05, 0.1, 2) + stamps(1.05, 0.1, 3))
+    with open_recording(drive) as recording:
+        scans = [e for e in recording if isinstance(e, Scan)]
+    assert all(95_000_000 < scan.end_ns - scan.start_ns < 100_000_000 for scan in scans)
+    forward = [(scan.start_ns + scan.end_ns) // 2 - int(START.astype(np.int64)) for scan in scans]
+    np.testing.assert_allclose(forward, [50e6, 150e6, 1050e6, 1150e6, 1250e6], atol=20)
+
+
+def test_without_any_time_of_a_point(drive: Path) -> None:
     with open_recording(drive, RecordingOptions(point_time_field="none")) as recording:
         scans = [e for e in recording if isinstance(e, Scan)]
     assert all(scan.start_ns == scan.end_ns for scan in scans)
+    velodyne = drive / "velodyne_points"
+    (velodyne / "timestamps_start.txt").unlink()
+    (velodyne / "timestamps.txt").write_text(stamps(0.05, 0.0, 5))
+    with pytest.raises(RecordingError, match=r"two times one after the other.*--point-time-field none"):
+        open_recording(drive)
+
+
+def test_a_start_beyond_the_end(drive: Path) -> None:
+    with pytest.raises(RecordingError, match=r"which ends after 0\.500 s – got --start 60 – skip less of it"):
+        open_recording(drive, RecordingOptions(start_s=60.0))
 
 
 def test_wrong_calibration_and_times(drive: Path) -> None:
