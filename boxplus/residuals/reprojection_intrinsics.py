@@ -1,0 +1,164 @@
+"""Reprojection error of a point in a camera whose intrinsics are a variable too (SPEC.md 3.2 to 3.4).
+
+Residual [px], with X' = T_camera_world p_world and c = [fx, fy, cx, cy, then k1, k2, p1, p2, k3 as far as the model goes]:
+
+    e = pixel − π(X'; c)
+
+Jacobians: those of `reprojection` by pose and point, and with the distorted normalised point (ũ, ṽ)
+
+    ∂e/∂[fx, fy, cx, cy] = −[[ũ, 0, 1, 0], [0, ṽ, 0, 1]]
+
+and −∂π/∂k likewise, as `boxplus.cameras.pinhole.intrinsics_jacobian` writes them out.
+
+Singular: a depth X'_z ≤ z_min of the camera (0.05 m) is invalid and never projected.
+
+Source: SPEC.md 3.1 to 3.4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._jit import kernel
+from boxplus.cameras.distortion import distort
+from boxplus.cameras.pinhole import Pinhole, intrinsics_jacobian, project_point
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.quaternion import rotation_entries
+from boxplus.manifolds.se3 import SE3Left
+from boxplus.residuals.reprojection import check_pixels, write_pose_point
+from boxplus.residuals.residual import Residual
+from boxplus.residuals.whitening import Whitening
+
+_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
+
+
+@kernel
+def _reprojection_intrinsics(
+    begin: int,
+    end: int,
+    poses: NDArray[np.float64],
+    pose_of: NDArray[np.uint32],
+    points: NDArray[np.float64],
+    point_of: NDArray[np.uint32],
+    intrinsics: NDArray[np.float64],
+    intrinsics_of: NDArray[np.uint32],
+    pixels: NDArray[np.float64],
+    z_min: float,
+    r: NDArray[np.float64],
+    J_pose: NDArray[np.float64],
+    J_point: NDArray[np.float64],
+    J_intrinsics: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    with_jacobians: bool,
+) -> None:
+    count = intrinsics.shape[1]
+    for n in range(np.uint64(begin), np.uint64(end)):
+        i, j, c = pose_of[n], point_of[n], intrinsics_of[n]
+        R = rotation_entries(poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3])
+        px, py, pz = points[j, 0], points[j, 1], points[j, 2]
+        x = R[0] * px + R[1] * py + R[2] * pz + poses[i, 4]
+        y = R[3] * px + R[4] * py + R[5] * pz + poses[i, 5]
+        z = R[6] * px + R[7] * py + R[8] * pz + poses[i, 6]
+        # Written so that a NaN passes on into the residual, where it is seen and named.
+        valid[n] = not z <= z_min
+        if z <= z_min:
+            r[n, 0] = 0.0
+            r[n, 1] = 0.0
+            if with_jacobians:
+                J_pose[n] = 0.0
+                J_point[n] = 0.0
+                J_intrinsics[n] = 0.0
+            continue
+        k1 = intrinsics[c, 4] if count > 4 else 0.0
+        k2 = intrinsics[c, 5] if count > 4 else 0.0
+        p1 = intrinsics[c, 6] if count > 6 else 0.0
+        p2 = intrinsics[c, 7] if count > 6 else 0.0
+        k3 = intrinsics[c, 8] if count > 8 else 0.0
+        fx, fy = intrinsics[c, 0], intrinsics[c, 1]
+        u, v, p00, p01, p02, p10, p11, p12 = project_point(
+            x, y, z, fx, fy, intrinsics[c, 2], intrinsics[c, 3], k1, k2, p1, p2, k3
+        )
+        r[n, 0] = pixels[n, 0] - u
+        r[n, 1] = pixels[n, 1] - v
+        if with_jacobians:
+            write_pose_point(n, x, y, z, (p00, p01, p02, p10, p11, p12), R, J_pose, J_point)
+            a, b = x / z, y / z
+            xd, yd, _, _, _ = distort(a, b, k1, k2, p1, p2, k3)
+            intrinsics_jacobian(a, b, fx, fy, xd, yd, -1.0, J_intrinsics[n])
+
+
+class ReprojectionIntrinsics(Residual):
+    """Points seen in a camera that is calibrated along: pixel − π(T_camera_world p_world; intrinsics), as derived above.
+
+    Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `intrinsics` on `Euclidean(4)`, 6, 8
+    or 9, laid out as `Pinhole.parameters`.
+
+    Args:
+        camera: its distortion model and `z_min` are used; its numbers are a start value, `camera.parameters`, no more.
+        pixels: (N, 2) measured, distorted as the camera distorts [px].
+        sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
+
+    Raises:
+        InputError: `pixels` of another shape or not finite, or noise that `Whitening.of` refuses.
+    """
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        pixels: ArrayLike,
+        *,
+        sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+    ) -> None:
+        self.z_min, self.pixels = camera.z_min, check_pixels("pixels", pixels)
+        count = len(self.pixels)
+        super().__init__(
+            dim=2,
+            count=count,
+            manifolds=(SE3Left, Euclidean(3), Euclidean(len(camera.parameters))),
+            roles=("T_camera_world", "p_world", "intrinsics"),
+            whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
+        )
+
+    def linearize_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.linearize_into`."""
+        self._run(begin, end, x, index, r, jacobians, valid, True)
+
+    def evaluate_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.evaluate_into`."""
+        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
+
+    def _run(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+        with_jacobians: bool,
+    ) -> None:
+        _reprojection_intrinsics(
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.z_min,
+            r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+        )  # fmt: skip
