@@ -1,0 +1,232 @@
+"""Reprojection error of a point given by its pixel in an anchor camera and its inverse depth there (SPEC.md 8.3).
+
+Residual [px], with the ray m = [x, y, 1] of the anchor's pixel, T = T_observer_world T_anchor_world⁻¹ = (R, t) and the
+point Y = R m + ρ t, which is the point in the observer times ρ and is projected alike:
+
+    e = pixel − π(Y)
+
+Jacobians, with P = ∂π/∂Y, both poses moved on the left, T ← Exp([w, v]) T:
+
+    ∂e/∂[w, v] of the observer = −P [−[Y]×  ρ I]
+    ∂e/∂[w, v] of the anchor   = −P [R [m]×  −ρ R]
+    ∂e/∂ρ                      = −P t            (without distortion −f (t_x − ũ t_z)/(ρ Z') etc., as in SPEC.md 8.3)
+
+Singular: ρ < 10⁻⁶ 1/m, also negative, stands for a point at infinity: Y = R m, and ∂e/∂ρ is the limit above, so that a
+solver finds its way back. No parallax (t = 0) leaves a zero derivative: unobservable. A depth up to z_min of the camera
+(0.05 m) in the observer, for a point at infinity a direction that does not point forward, is invalid.
+
+Source: SPEC.md 8.3; Civera et al., Inverse depth parametrization for monocular SLAM, 2008.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._jit import kernel
+from boxplus.cameras.pinhole import Pinhole, project_point
+from boxplus.errors import InputError
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
+from boxplus.manifolds.se3 import SE3Left
+from boxplus.residuals.reprojection import check_pixels
+from boxplus.residuals.residual import Residual
+from boxplus.residuals.whitening import Whitening
+
+RHO_MIN = 1e-6  # inverse depth below which a point counts as at infinity [1/m]
+_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 1)))
+
+
+@kernel(inline=True)
+def relative_pose(
+    poses_a: NDArray[np.float64], i: np.uint32, poses_b: NDArray[np.float64], j: np.uint32
+) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float, float, float]:
+    """R, row by row, and t of T_b_world T_a_world⁻¹."""
+    aw, ax, ay, az = poses_a[i, 0], -poses_a[i, 1], -poses_a[i, 2], -poses_a[i, 3]
+    qw, qx, qy, qz = multiply_scalars(poses_b[j, 0], poses_b[j, 1], poses_b[j, 2], poses_b[j, 3], aw, ax, ay, az)
+    sx, sy, sz = rotate(qw, qx, qy, qz, poses_a[i, 4], poses_a[i, 5], poses_a[i, 6])
+    return rotation_entries(qw, qx, qy, qz), poses_b[j, 4] - sx, poses_b[j, 5] - sy, poses_b[j, 6] - sz
+
+
+@kernel(inline=True)
+def write_anchor_observer_rho(
+    n: np.uint64,
+    m: tuple[float, float, float],
+    Y: tuple[float, float, float],
+    rho: float,
+    R: tuple[float, float, float, float, float, float, float, float, float],
+    t: tuple[float, float, float],
+    P: tuple[float, float, float, float, float, float],
+    J_anchor: NDArray[np.float64],
+    J_observer: NDArray[np.float64],
+    J_rho: NDArray[np.float64],
+) -> None:
+    """The rows of residual n of all three Jacobians, as in the head of this file."""
+    for row in range(2):
+        a, b, c = (P[0], P[1], P[2]) if row == 0 else (P[3], P[4], P[5])
+        # −P (w × Y) = w · (row × Y) up to sign: rows of −P times −[Y]×.
+        J_observer[n, row, 0] = b * Y[2] - c * Y[1]
+        J_observer[n, row, 1] = c * Y[0] - a * Y[2]
+        J_observer[n, row, 2] = a * Y[1] - b * Y[0]
+        J_observer[n, row, 3] = -rho * a
+        J_observer[n, row, 4] = -rho * b
+        J_observer[n, row, 5] = -rho * c
+        g0 = a * R[0] + b * R[3] + c * R[6]
+        g1 = a * R[1] + b * R[4] + c * R[7]
+        g2 = a * R[2] + b * R[5] + c * R[8]
+        J_anchor[n, row, 0] = g2 * m[1] - g1 * m[2]
+        J_anchor[n, row, 1] = g0 * m[2] - g2 * m[0]
+        J_anchor[n, row, 2] = g1 * m[0] - g0 * m[1]
+        J_anchor[n, row, 3] = rho * g0
+        J_anchor[n, row, 4] = rho * g1
+        J_anchor[n, row, 5] = rho * g2
+        J_rho[n, row, 0] = -(a * t[0] + b * t[1] + c * t[2])
+
+
+@kernel
+def _inverse_depth(
+    begin: int,
+    end: int,
+    anchors: NDArray[np.float64],
+    anchor_of: NDArray[np.uint32],
+    observers: NDArray[np.float64],
+    observer_of: NDArray[np.uint32],
+    rhos: NDArray[np.float64],
+    rho_of: NDArray[np.uint32],
+    rays: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    c: NDArray[np.float64],
+    z_min: float,
+    r: NDArray[np.float64],
+    J_anchor: NDArray[np.float64],
+    J_observer: NDArray[np.float64],
+    J_rho: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    with_jacobians: bool,
+) -> None:
+    for n in range(np.uint64(begin), np.uint64(end)):
+        R, tx, ty, tz = relative_pose(anchors, anchor_of[n], observers, observer_of[n])
+        rho = rhos[rho_of[n], 0]
+        if rho < RHO_MIN:
+            rho = 0.0
+        m0, m1, m2 = rays[n, 0], rays[n, 1], rays[n, 2]
+        x = R[0] * m0 + R[1] * m1 + R[2] * m2 + rho * tx
+        y = R[3] * m0 + R[4] * m1 + R[5] * m2 + rho * ty
+        z = R[6] * m0 + R[7] * m1 + R[8] * m2 + rho * tz
+        # Written so that a NaN passes on into the residual, where it is seen and named.
+        valid[n] = not z <= z_min * rho
+        if z <= z_min * rho:
+            r[n, 0] = 0.0
+            r[n, 1] = 0.0
+            if with_jacobians:
+                J_anchor[n] = 0.0
+                J_observer[n] = 0.0
+                J_rho[n] = 0.0
+            continue
+        u, v, p00, p01, p02, p10, p11, p12 = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+        r[n, 0] = pixels[n, 0] - u
+        r[n, 1] = pixels[n, 1] - v
+        if with_jacobians:
+            write_anchor_observer_rho(
+                n, (m0, m1, m2), (x, y, z), rho, R, (tx, ty, tz), (p00, p01, p02, p10, p11, p12), J_anchor, J_observer, J_rho
+            )
+
+
+class InverseDepthReprojection(Residual):
+    """Points of an anchor camera, by pixel and inverse depth, seen in another camera, as derived in the head of this file.
+
+    Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera, `rho` on `Euclidean(1)`,
+    one over the depth z in the anchor [1/m].
+
+    Args:
+        camera: the observer.
+        anchor_pixels: (N, 2) where the anchor sees the points; exact, the noise is that of `pixels` [px].
+        pixels: (N, 2) where the observer sees them [px].
+        anchor_camera: of the anchor, where it is not `camera`.
+        sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
+
+    Raises:
+        InputError: pixels of another shape, not finite or not as many of both; an anchor's pixel that its lens does not
+            reach; or noise that `Whitening.of` refuses.
+    """
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        anchor_pixels: ArrayLike,
+        pixels: ArrayLike,
+        *,
+        anchor_camera: Pinhole | None = None,
+        sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+    ) -> None:
+        self.camera, self.pixels = camera, check_pixels("pixels", pixels)
+        anchors = check_pixels("anchor_pixels", anchor_pixels)
+        check_pairs(anchors, self.pixels)
+        self._rays, found = (camera if anchor_camera is None else anchor_camera).unproject(anchors)
+        if not found.all():
+            n = int(np.argmin(found))
+            raise InputError(
+                "anchor_pixels that the distortion of the anchor's camera reaches",
+                f"{anchors[n]} in row {n}",
+                "check the calibration, or leave the observation out",
+            )
+        count = len(self.pixels)
+        super().__init__(
+            dim=2,
+            count=count,
+            manifolds=(SE3Left, SE3Left, Euclidean(1)),
+            roles=("T_anchor_world", "T_observer_world", "rho"),
+            whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
+        )
+        self._parameters = camera.padded_parameters
+
+    def linearize_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.linearize_into`."""
+        self._run(begin, end, x, index, r, jacobians, valid, True)
+
+    def evaluate_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.evaluate_into`."""
+        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
+
+    def _run(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+        with_jacobians: bool,
+    ) -> None:
+        _inverse_depth(
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self._rays, self.pixels, self._parameters,
+            self.camera.z_min, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+        )  # fmt: skip
+
+
+def check_pairs(anchors: NDArray[np.float64], pixels: NDArray[np.float64]) -> None:
+    """Raise InputError unless there is one anchor's pixel for each pixel."""
+    if len(anchors) != len(pixels):
+        raise InputError(
+            "as many anchor_pixels as pixels", f"{len(anchors)} and {len(pixels)}", "repeat an anchor's pixel for every observer"
+        )
