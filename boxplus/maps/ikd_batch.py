@@ -40,7 +40,7 @@ from boxplus.maps.ikd_update import (
 )
 
 
-@kernel
+@kernel(borrow=True)
 def log_operation(work: Work, kind: np.int64, box: NDArray[np.float32]) -> None:
     """Note an operation for the running rebuild. Room in the log must be there."""
     job = work.job[0]
@@ -53,7 +53,7 @@ def log_operation(work: Work, kind: np.int64, box: NDArray[np.float32]) -> None:
     job["logged"] += ONE
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def round_up(value: np.float64) -> np.float32:
     """The smallest float32 that is not less than `value`."""
     rounded = np.float32(value)
@@ -62,7 +62,7 @@ def round_up(value: np.float64) -> np.float32:
     return np.float32(np.int32(bits + (step if bits >= 0 else -step)).view(np.float32))
 
 
-@kernel
+@kernel(borrow=True)
 def search_cell(
     pool: Pool, node: np.uint32, side: np.uint32, stack: NDArray[np.void], cell: NDArray[np.float32], best: NDArray[np.float32]
 ) -> tuple[np.int64, bool, np.uint32]:
@@ -129,7 +129,7 @@ def search_cell(
         label = np.uint8(stack[top]["label"])
 
 
-@kernel
+@kernel(borrow=True)
 def set_cell(
     x: np.float32, y: np.float32, z: np.float32, origin: NDArray[np.float64], size: float, cell: NDArray[np.float32]
 ) -> None:
@@ -153,7 +153,7 @@ def set_cell(
         cell[axis + 6] = np.float32((index + 0.5) * size - origin[axis])
 
 
-@kernel
+@kernel(borrow=True)
 def replace_point(
     pool: Pool,
     work: Work,
@@ -200,7 +200,7 @@ def replace_point(
     return True
 
 
-@kernel
+@kernel(borrow=True)
 def update_batch(
     pool: Pool,
     work: Work,

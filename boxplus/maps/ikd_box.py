@@ -10,13 +10,13 @@ from boxplus.maps.ikd_leaf import lanes_in_box
 from boxplus.maps.ikd_pool import all_bits
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def in_box(leaf: NDArray[np.void], index: np.uint32, box: NDArray[np.float32]) -> np.uint32:
     """Which stored points of a leaf lie in a half-open box (as bits)."""
     return np.uint32(lanes_in_box(leaf, np.uint32(index), box) & all_bits(np.uint32(leaf[index]["count"])))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def disjoint(slots: NDArray[np.float32], side: np.uint32, box: NDArray[np.float32]) -> bool:
     """Whether the box of a slot and a half-open box have no point in common."""
     return bool(
@@ -29,7 +29,7 @@ def disjoint(slots: NDArray[np.float32], side: np.uint32, box: NDArray[np.float3
     )
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def contained(slots: NDArray[np.float32], side: np.uint32, box: NDArray[np.float32]) -> bool:
     """Whether the box of a slot lies in a half-open box."""
     return bool(

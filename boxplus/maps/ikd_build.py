@@ -54,7 +54,7 @@ BUILDER = np.dtype(
 )
 
 
-@kernel
+@kernel(borrow=True)
 def start_build(builder: NDArray[np.void], points: np.uint32, node: np.uint32, side: np.uint32) -> None:
     """Prepare to build the first `points` rows of a buffer into a slot."""
     state = builder[0]
@@ -64,7 +64,7 @@ def start_build(builder: NDArray[np.void], points: np.uint32, node: np.uint32, s
         push_task(builder, ZERO, points, node, side)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def push_task(builder: NDArray[np.void], begin: np.uint32, end: np.uint32, node: np.uint32, side: np.uint32) -> None:
     """Remember a range to build."""
     top = builder[0]["top"]
@@ -76,7 +76,7 @@ def push_task(builder: NDArray[np.void], begin: np.uint32, end: np.uint32, node:
     builder[0]["top"] = top + ONE
 
 
-@kernel
+@kernel(borrow=True)
 def choose_pivot(builder: NDArray[np.void], points: NDArray[np.float32], target: np.uint32) -> None:
     """Pick the element of a sample of [low, high) whose rank is that of `target`, and start a partition around it."""
     state = builder[0]
@@ -99,7 +99,7 @@ def choose_pivot(builder: NDArray[np.void], points: NDArray[np.float32], target:
     state["phase"] = np.uint32(SELECT_LESS)
 
 
-@kernel
+@kernel(borrow=True)
 def make_leaf(pool: Pool, builder: NDArray[np.void], points: NDArray[np.float32]) -> None:
     """Turn the range at hand into a leaf."""
     state = builder[0]
@@ -121,7 +121,7 @@ def make_leaf(pool: Pool, builder: NDArray[np.void], points: NDArray[np.float32]
     pool.inner[state["node"]]["child"][state["side"]] = index | LEAF_BIT
 
 
-@kernel
+@kernel(borrow=True)
 def split_range(pool: Pool, builder: NDArray[np.void], middle: np.uint32, split: np.float32) -> None:
     """Turn the range at hand into an inner node, and note its halves; the left one is built first."""
     state = builder[0]
@@ -137,7 +137,7 @@ def split_range(pool: Pool, builder: NDArray[np.void], middle: np.uint32, split:
     state["phase"] = np.uint32(NEXT)
 
 
-@kernel
+@kernel(borrow=True)
 def measure(builder: NDArray[np.void], points: NDArray[np.float32], stop: np.uint32) -> None:
     """Extend the box of the range at hand by its points up to `stop`."""
     state = builder[0]
@@ -158,7 +158,7 @@ def measure(builder: NDArray[np.void], points: NDArray[np.float32], stop: np.uin
     state["cursor"] = stop
 
 
-@kernel
+@kernel(borrow=True)
 def partition(builder: NDArray[np.void], points: NDArray[np.float32], stop: np.uint32, inclusive: bool) -> None:
     """Move what is below the pivot (or equal, if `inclusive`) to the front; branch-free, one pass."""
     state = builder[0]
@@ -179,7 +179,7 @@ def partition(builder: NDArray[np.void], points: NDArray[np.float32], stop: np.u
     state["cursor"] = stop
 
 
-@kernel
+@kernel(borrow=True)
 def build_step(pool: Pool, builder: NDArray[np.void], points: NDArray[np.float32], budget: np.int64) -> np.int64:
     """Go on building until done or `budget` point visits are spent; returns what is left of the budget.
 

@@ -26,7 +26,7 @@ from boxplus.maps.ikd_pool import (
 from boxplus.maps.ikd_search import IkdView, five_nearest, knn, point_sq
 
 
-@kernel
+@kernel(borrow=True)
 def nearest_batch(
     view: IkdView,
     queries: NDArray[np.float32],
@@ -74,7 +74,7 @@ def nearest_batch(
                 points[row, i, axis] = np.nan
 
 
-@kernel
+@kernel(borrow=True)
 def collect(
     view: IkdView,
     box: NDArray[np.float32],

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_inner import INNER
 from boxplus.maps.ikd_leaf import LEAF, count_bits
 
 FILL = 26  # points in a leaf after a rebuild: leaves room for inserts
@@ -31,18 +32,6 @@ ROOT = np.uint32(0)
 LEFT = np.uint32(0)
 RIGHT = np.uint32(1)
 
-# One cache line: a visit reads both children's boxes here and never touches a child it prunes.
-INNER = np.dtype(
-    [
-        ("box", np.float32, (2, 6)),  # per child: low x, y, z, high x, y, z; covers every stored point below
-        ("child", np.uint32, 2),
-        ("split", np.float32),  # left ≤ split ≤ right on `axis`
-        ("axis", np.uint8),
-        ("label", np.uint8, 2),
-        ("queued", np.uint8),  # already noted as out of balance
-    ],
-    align=True,
-)
 COUNT = np.dtype(
     [("size", np.uint32), ("dead", np.uint32)], align=True
 )  # stored points below an inner node, and how many are deleted
@@ -101,7 +90,7 @@ def reserve(pool: Pool, inner: int, leaves: int) -> None:
         pool.leaf.resize(len(pool.leaf) + max(short, len(pool.leaf) // 16), refcheck=False)
 
 
-@kernel
+@kernel(borrow=True)
 def free_subtree(pool: Pool, ref: np.uint32) -> None:
     """Discard a subtree in constant time; its nodes are taken apart when they are needed."""
     if ref == NIL:
@@ -117,7 +106,7 @@ def free_subtree(pool: Pool, ref: np.uint32) -> None:
         head["subtree_free"] = ref
 
 
-@kernel
+@kernel(borrow=True)
 def take_apart(pool: Pool) -> None:
     """Free the root of one discarded subtree; its children become discarded subtrees."""
     head = pool.head[0]
@@ -131,7 +120,7 @@ def take_apart(pool: Pool) -> None:
     head["inner_free_count"] += ONE
 
 
-@kernel
+@kernel(borrow=True)
 def sweep(pool: Pool, inner: np.uint32, leaves: np.uint32) -> None:
     """Take discarded subtrees apart until so many nodes of each kind are free, or none is left."""
     head = pool.head[0]
@@ -139,7 +128,7 @@ def sweep(pool: Pool, inner: np.uint32, leaves: np.uint32) -> None:
         take_apart(pool)
 
 
-@kernel
+@kernel(borrow=True)
 def has_room(pool: Pool, inner: np.uint32, leaves: np.uint32) -> bool:
     """Whether so many nodes can be taken without growing the arrays."""
     sweep(pool, inner, leaves)
@@ -150,7 +139,7 @@ def has_room(pool: Pool, inner: np.uint32, leaves: np.uint32) -> bool:
     )
 
 
-@kernel
+@kernel(borrow=True)
 def take_inner(pool: Pool) -> np.uint32:
     """A free inner node without children. Room must have been reserved."""
     head = pool.head[0]
@@ -172,7 +161,7 @@ def take_inner(pool: Pool) -> np.uint32:
     return np.uint32(node)
 
 
-@kernel
+@kernel(borrow=True)
 def take_leaf(pool: Pool) -> np.uint32:
     """The index of a free leaf. Room must have been reserved."""
     head = pool.head[0]
@@ -188,13 +177,13 @@ def take_leaf(pool: Pool) -> np.uint32:
     return np.uint32(index)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def all_bits(count: np.uint32) -> np.uint32:
     """A mask with the lowest `count` bits set."""
     return np.uint32((np.uint64(1) << np.uint64(count)) - np.uint64(1))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def live_bits(pool_leaf: NDArray[np.void], index: np.uint32, label: np.uint8) -> np.uint32:
     """Which points of a leaf are live, given the label that holds over it."""
     if label == LABEL_NONE:
@@ -204,7 +193,7 @@ def live_bits(pool_leaf: NDArray[np.void], index: np.uint32, label: np.uint8) ->
     return np.uint32(all_bits(np.uint32(pool_leaf[index]["count"])))
 
 
-@kernel
+@kernel(borrow=True)
 def slot_counts(pool: Pool, node: np.uint32, side: np.uint32) -> tuple[np.uint32, np.uint32]:
     """Stored points below a slot, and how many of them are deleted."""
     ref = pool.inner[node]["child"][side]
@@ -225,7 +214,7 @@ def slot_counts(pool: Pool, node: np.uint32, side: np.uint32) -> tuple[np.uint32
     return size, dead
 
 
-@kernel
+@kernel(borrow=True)
 def slot_size(pool: Pool, node: np.uint32, side: np.uint32) -> np.uint32:
     """Stored points below a slot."""
     ref = pool.inner[node]["child"][side]

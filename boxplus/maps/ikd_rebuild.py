@@ -30,7 +30,7 @@ from boxplus.maps.ikd_pool import (
 from boxplus.maps.ikd_update import BUILDING, IDLE, Work, save_leaf, unbalanced
 
 
-@kernel
+@kernel(borrow=True)
 def gather(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> np.uint32:
     """Copy all points below a slot to the rows of `small`; returns how many there are."""
     row = ZERO
@@ -66,7 +66,7 @@ def gather(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> np.uint3
     return row
 
 
-@kernel
+@kernel(borrow=True)
 def rebuild_in_place(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -> None:
     """Rebuild a small subtree at once. Room for its nodes must be there."""
     points = gather(pool, work, node, side)
@@ -76,7 +76,7 @@ def rebuild_in_place(pool: Pool, work: Work, node: np.uint32, side: np.uint32) -
     build_step(pool, work.small_builder, work.small, np.int64(1) << np.int64(62))
 
 
-@kernel
+@kernel(borrow=True)
 def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside: bool) -> bool:
     """Whether a small subtree may be replaced now: neither inside the one being rebuilt nor above it."""
     job = work.job[0]
@@ -91,7 +91,7 @@ def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside
     return not above
 
 
-@kernel
+@kernel(borrow=True)
 def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32, np.uint32, np.uint32, bool]:
     """The topmost unbalanced subtree on a path: its slot (node NIL if there is none), its depth, and whether it lies in the
     subtree being rebuilt. `Work.path` gets the inner nodes above it."""
@@ -118,7 +118,7 @@ def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32,
         side = np.uint32((path & bit) != np.uint64(0))
 
 
-@kernel
+@kernel(borrow=True)
 def trim_path(path: np.uint64, depth: np.uint32) -> np.uint64:
     """The first `depth` steps of a path."""
     while path >> np.uint64(1) >= np.uint64(1) << np.uint64(depth):
@@ -126,7 +126,7 @@ def trim_path(path: np.uint64, depth: np.uint32) -> np.uint64:
     return path
 
 
-@kernel
+@kernel(borrow=True)
 def settle(pool: Pool, work: Work) -> bool:
     """Go through the subtrees noted as out of balance: rebuild small ones, and choose a large one for a rebuild in slices.
 
@@ -167,7 +167,7 @@ def settle(pool: Pool, work: Work) -> bool:
     return chosen
 
 
-@kernel
+@kernel(borrow=True)
 def copy_step(pool: Pool, work: Work, budget: np.int64) -> np.int64:
     """Go on copying until done or the budget is spent; returns what is left of it."""
     job = work.job[0]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.maps.ikd_inner import boxes_sq
 from boxplus.maps.ikd_leaf import BUCKET, lanes_within, trailing_zeros
 from boxplus.maps.ikd_pool import (
     INDEX_MASK,
@@ -25,7 +26,6 @@ from boxplus.maps.ikd_pool import (
     LEFT,
     NIL,
     ONE,
-    RIGHT,
     ROOT,
     ZERO,
     all_bits,
@@ -34,7 +34,6 @@ from boxplus.maps.ikd_pool import (
 STACK = np.dtype([("ref", np.uint32), ("sq", np.float32), ("live", np.uint32)], align=True)
 STACK_DEPTH = 256  # the tree keeps its height below this
 _POINT_BITS = np.uint64(32)
-_ZERO_F = np.float32(0)
 
 
 class IkdView(NamedTuple):
@@ -44,22 +43,7 @@ class IkdView(NamedTuple):
     leaf: NDArray[np.void]
 
 
-@kernel(inline=True)
-def box_sq(box: NDArray[np.float32], side: np.uint32, qx: np.float32, qy: np.float32, qz: np.float32) -> np.float32:
-    """Squared distance from a point to the box of one child."""
-    below, above = box[side, 0] - qx, qx - box[side, 3]
-    dx = below if below > above else above
-    dx = dx if dx > _ZERO_F else _ZERO_F
-    below, above = box[side, 1] - qy, qy - box[side, 4]
-    dy = below if below > above else above
-    dy = dy if dy > _ZERO_F else _ZERO_F
-    below, above = box[side, 2] - qz, qz - box[side, 5]
-    dz = below if below > above else above
-    dz = dz if dz > _ZERO_F else _ZERO_F
-    return np.float32(dx * dx + dy * dy + dz * dz)
-
-
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def leaf_within(
     leaf: NDArray[np.void], index: np.uint32, qx: np.float32, qy: np.float32, qz: np.float32, max_sq: np.float32, live: np.uint32
 ) -> np.uint32:
@@ -69,7 +53,7 @@ def leaf_within(
     return np.uint32(bits & (all_bits(np.uint32(record["count"])) if live else np.uint32(record["live"])))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def point_sq(
     leaf: NDArray[np.void], index: np.uint32, i: np.uint32, qx: np.float32, qy: np.float32, qz: np.float32
 ) -> np.float32:
@@ -79,7 +63,7 @@ def point_sq(
     return np.float32(dx * dx + dy * dy + dz * dz)
 
 
-@kernel
+@kernel(borrow=True)
 def precedes(leaf: NDArray[np.void], a: np.uint32, b: np.uint32) -> bool:
     """Whether point `a` comes before point `b` (leaf · BUCKET + i, or NIL) by (x, y, z); NIL comes last."""
     if b == NIL:
@@ -93,13 +77,13 @@ def precedes(leaf: NDArray[np.void], a: np.uint32, b: np.uint32) -> bool:
     return bool(p["z"][i] < q["z"][j])
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def comes_before(leaf: NDArray[np.void], sq: np.float32, point: np.uint32, other_sq: np.float32, other: np.uint32) -> bool:
     """Whether a point is nearer than another, or as near and earlier by (x, y, z)."""
     return bool(sq < other_sq or (sq == other_sq and precedes(leaf, point, other)))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def enter(
     inner: NDArray[np.void], qx: np.float32, qy: np.float32, qz: np.float32, max_sq: np.float32
 ) -> tuple[np.uint32, np.uint32]:
@@ -120,7 +104,7 @@ def enter(
     return np.uint32(NIL if label == LABEL_DEAD or not finite else ref), np.uint32(label == LABEL_LIVE)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def next_leaf(
     inner: NDArray[np.void],
     ref: np.uint32,
@@ -134,15 +118,13 @@ def next_leaf(
 ) -> tuple[np.uint32, np.uint32, np.uint32]:
     """Go on from a reference, or from the stack if it is NIL, to the next leaf within `worst`, the nearer child first.
 
-    Returns the leaf (NIL if there is none), whether all in it is live, and the new `top`. The choice of the child has no
-    branch: in a scan it cannot be guessed.
+    Returns the leaf (NIL if there is none), whether all in it is live, and the new `top`.
     """
     while True:
         while ref < LEAF_BIT:
             node = inner[ref]
             child, label = node["child"], node["label"]
-            sq_left = box_sq(node["box"], LEFT, qx, qy, qz)
-            sq_right = box_sq(node["box"], RIGHT, qx, qy, qz)
+            sq_left, sq_right = boxes_sq(inner, ref, qx, qy, qz)
             left, right = np.uint32(child[0]), np.uint32(child[1])
             live_left = live_right = live
             if label[0] | label[1] and not live:
@@ -170,7 +152,7 @@ def next_leaf(
         ref, live = np.uint32(stack[top]["ref"]), np.uint32(stack[top]["live"])
 
 
-@kernel
+@kernel(borrow=True)
 def knn(
     view: IkdView,
     qx: np.float32,
@@ -227,25 +209,25 @@ def knn(
         ref = NIL
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def pack(sq: np.float32, point: np.uint32) -> np.uint64:
     """A squared distance and a point as one number, which is ordered like them."""
     return np.uint64(np.uint64(np.float32(sq).view(np.uint32)) << _POINT_BITS | np.uint64(point))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def packed_sq(packed: np.uint64) -> np.float32:
     """The squared distance of a packed point."""
     return np.float32(np.uint32(packed >> _POINT_BITS).view(np.float32))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrow=True)
 def tied(a: np.uint64, b: np.uint64) -> bool:
     """Whether two packed points, the first not after the second, are equally far."""
     return bool((a >> _POINT_BITS == b >> _POINT_BITS) & (np.uint32(b) != NIL))
 
 
-@kernel
+@kernel(borrow=True)
 def five_nearest(
     view: IkdView,
     qx: np.float32,
@@ -294,7 +276,7 @@ def five_nearest(
     return found
 
 
-@kernel
+@kernel(borrow=True)
 def knn5(
     view: IkdView,
     qx: np.float32,

@@ -96,7 +96,7 @@ class Work(NamedTuple):
     order: NDArray[np.uint32]  # (BUCKET,)
 
 
-@kernel
+@kernel(borrow=True)
 def push_down(pool: Pool, node: np.uint32, side: np.uint32) -> None:
     """Hand the label of a slot down by one level."""
     record = pool.inner[node]
@@ -116,7 +116,7 @@ def push_down(pool: Pool, node: np.uint32, side: np.uint32) -> None:
         pool.counts[ref]["dead"] = pool.counts[ref]["size"] if label == LABEL_DEAD else ZERO
 
 
-@kernel
+@kernel(borrow=True)
 def pull_up(pool: Pool, node: np.uint32, side: np.uint32) -> None:
     """Recompute the counts of the inner node in a slot, whose label has been pushed down."""
     ref = pool.inner[node]["child"][side]
@@ -129,7 +129,7 @@ def pull_up(pool: Pool, node: np.uint32, side: np.uint32) -> None:
         pool.inner[node]["label"][side] = LABEL_DEAD
 
 
-@kernel
+@kernel(borrow=True)
 def save_leaf(pool: Pool, work: Work, index: np.uint32, live: np.uint32) -> None:
     """Append a leaf to the copy of the running rebuild, once."""
     job = work.job[0]
@@ -152,7 +152,7 @@ def save_leaf(pool: Pool, work: Work, index: np.uint32, live: np.uint32) -> None
     job["copied"] = row
 
 
-@kernel
+@kernel(borrow=True)
 def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
     """Whether an inner node violates the balance criterion (SPEC 10.4)."""
     size = np.uint32(pool.counts[ref]["size"])
@@ -162,7 +162,7 @@ def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
     return bool(max(left, np.uint32(size - left)) > work.job[0]["balance"] * np.float32(size - ONE))
 
 
-@kernel
+@kernel(borrow=True)
 def extend_box(pool: Pool, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> None:
     """Let the box of a slot cover a point."""
     box = pool.inner[node]["box"]
@@ -174,7 +174,7 @@ def extend_box(pool: Pool, node: np.uint32, side: np.uint32, x: np.float32, y: n
     box[side, 5] = z if z > box[side, 5] else box[side, 5]
 
 
-@kernel
+@kernel(borrow=True)
 def note_unbalanced(pool: Pool, work: Work, ref: np.uint32, path: np.uint64) -> None:
     """Note a subtree out of balance, once; `settle` deals with it."""
     job = work.job[0]
@@ -184,7 +184,7 @@ def note_unbalanced(pool: Pool, work: Work, ref: np.uint32, path: np.uint64) -> 
         job["queued"] += ONE
 
 
-@kernel
+@kernel(borrow=True)
 def put_in_leaf(pool: Pool, index: np.uint32, x: np.float32, y: np.float32, z: np.float32, live: np.uint32) -> None:
     """Append a point to a leaf that has room for it; `live` is 0 or 1."""
     leaf = pool.leaf[index]
@@ -196,7 +196,7 @@ def put_in_leaf(pool: Pool, index: np.uint32, x: np.float32, y: np.float32, z: n
     leaf["count"] = count + ONE
 
 
-@kernel
+@kernel(borrow=True)
 def new_leaf(pool: Pool, stamp: np.uint32) -> np.uint32:
     """The index of an empty leaf."""
     index = take_leaf(pool)
@@ -207,7 +207,7 @@ def new_leaf(pool: Pool, stamp: np.uint32) -> np.uint32:
     return np.uint32(index)
 
 
-@kernel
+@kernel(borrow=True)
 def split_leaf(pool: Pool, order: NDArray[np.uint32], node: np.uint32, side: np.uint32) -> np.uint32:
     """Replace a full leaf by an inner node over its lower and upper half along the longest axis; returns the inner node."""
     slot = pool.inner[node]
@@ -247,7 +247,7 @@ def split_leaf(pool: Pool, order: NDArray[np.uint32], node: np.uint32, side: np.
     return np.uint32(ref)
 
 
-@kernel
+@kernel(borrow=True)
 def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np.float32, y: np.float32, z: np.float32) -> bool:
     """Insert a point below a slot; notes the topmost subtree of its path that is out of balance.
 
@@ -293,7 +293,7 @@ def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np
     return inside
 
 
-@kernel
+@kernel(borrow=True)
 def update_leaf(leaf: NDArray[np.void], index: np.uint32, box: NDArray[np.float32], kind: np.int64) -> np.int64:
     """Delete, revive or drop the points of a leaf in a box; returns how many became or ceased to be live."""
     bits = in_box(leaf, index, box)
@@ -320,7 +320,7 @@ def update_leaf(leaf: NDArray[np.void], index: np.uint32, box: NDArray[np.float3
     return changed
 
 
-@kernel
+@kernel(borrow=True)
 def update_box(pool: Pool, work: Work, node: np.uint32, side: np.uint32, box: NDArray[np.float32], kind: np.int64) -> np.int64:
     """Delete (label), revive (label) or drop all points of a half-open box below a slot.
 
