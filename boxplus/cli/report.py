@@ -11,8 +11,8 @@ import typer
 def report(folder: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio'.", metavar="FOLDER")]) -> None:
     """Draw the report of a run again, also of an interrupted one, and say how far the run came."""
     from boxplus.report import write_report
-    from boxplus.systems.run_folder import RunFolder
-    from boxplus.systems.run_summary import read_summary
+    from boxplus.report.run_data import load_run
 
-    typer.echo(read_summary(RunFolder(folder).summary).describe_state())
-    typer.echo(str(write_report(folder)))
+    data = load_run(folder)
+    typer.echo(data.summary.describe_state())
+    typer.echo(str(write_report(data)))

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from boxplus.report.run_data import RunData
 
 
-def write_report(folder: str | Path) -> Path:
+def write_report(run: str | Path | RunData) -> Path:
     """Draw `report.html` and the pictures in `plots/` from the output folder of a run, finished or not.
+
+    Args:
+        run: the folder, or what `run_data.load_run` read from it.
 
     Returns:
         The path of the report.
@@ -17,8 +24,8 @@ def write_report(folder: str | Path) -> Path:
     """
     from boxplus.report.page import write_page
     from boxplus.report.plots import write_plots
-    from boxplus.report.run_data import load_run
+    from boxplus.report.run_data import RunData, load_run
 
-    data = load_run(folder)
+    data = run if isinstance(run, RunData) else load_run(run)
     write_plots(data)
     return write_page(data)

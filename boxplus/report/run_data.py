@@ -26,7 +26,8 @@ class RunData:
 
     Attributes:
         folder: where it lies.
-        summary: the facts.
+        summary: the facts; how far the run came is counted in the rows that can be read, not taken from a summary that a
+            killed run left behind.
         seconds: (N,) float64, time of every scan since the first one [s].
         position: (N, 3) float64, of the IMU in the world [m].
         sigma: (N, 6) float64, standard deviations of the pose: rotation [rad], position [m].
@@ -61,12 +62,14 @@ def load_run(folder: str | Path) -> RunData:
     trajectory, scans = read_trajectory(run.trajectory, "csv"), read_scan_log(run.scans)
     count = min(len(trajectory), len(scans))  # a killed run may have written one row more to one of them
     if not count:
-        raise InputError("a run with at least one scan", f"none in {run.path}", "see run.json for the reason")
+        raise InputError(
+            "a run with at least one scan", f"none in {run.path} ({summary.describe_state()})", "see run.json for the reason"
+        )
     scans = scans.first(count)
     points, remarks = _thinned_map(run)
     return RunData(
         folder=run,
-        summary=summary,
+        summary=_counted(summary, scans, trajectory.p[:count]),
         seconds=(scans.time_ns - scans.time_ns[0]) * 1e-9,
         position=trajectory.p[:count],
         sigma=_sigmas(trajectory, count),
@@ -74,6 +77,22 @@ def load_run(folder: str | Path) -> RunData:
         map_points=points,
         map_remarks=remarks,
     )
+
+
+def _counted(summary: RunSummary, scans: ScanLog, position: NDArray[np.float64]) -> RunSummary:
+    """The summary of a run that did not end, brought up to its last row; it is written every few seconds only."""
+    if summary.state != "running":
+        return summary
+    names, counts = np.unique(scans.status, return_counts=True)
+    facts: dict[str, object] = {
+        "scans": len(scans),
+        "status": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "first_time_ns": int(scans.time_ns[0]),
+        "last_time_ns": int(scans.time_ns[-1]),
+        "duration_s": float(scans.time_ns[-1] - scans.time_ns[0]) * 1e-9,
+        "path_length_m": float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
+    }
+    return summary.model_copy(update=facts)
 
 
 def _sigmas(trajectory: Trajectory, count: int) -> NDArray[np.float64]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+import shutil
 import types
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.report import palette, run_data, write_report
 from boxplus.report.run_data import load_run
@@ -51,6 +54,27 @@ class _Page(HTMLParser):
         if self._in_heading:
             self.headings.append(data)
             self._in_heading = False
+
+
+def test_a_killed_run_is_counted_by_its_rows(folder: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
+    shutil.copytree(folder, killed)
+    finished = read_summary(killed / "run.json")
+    # As written in the first second of the run; no process has this number.
+    unknown = {"scans": 0, "status": {}, "duration_s": 0.0, "path_length_m": 0.0, "first_time_ns": None, "last_time_ns": None}
+    finished.model_copy(update={"state": "running", "process": 2**30, **unknown}).write(killed / "run.json")
+    rows = (killed / "scans.csv").read_bytes()
+    (killed / "scans.csv").write_bytes(rows[:-20])  # the last one is cut
+    summary = load_run(killed).summary
+    assert summary.scans == sum(summary.status.values()) == finished.scans - 1
+    assert 0.9 * finished.duration_s < summary.duration_s < finished.duration_s
+    assert 0.0 < summary.path_length_m <= finished.path_length_m
+    result = CliRunner().invoke(app, ["report", str(killed)])
+    assert result.exit_code == 0
+    expected = f"interrupted (the process ended without a word) after at least {finished.scans - 1} scans ("
+    assert result.stdout.startswith(expected)
+    text = (killed / "report.html").read_text(encoding="utf-8")
+    assert f"after at least {finished.scans - 1} scans" in text
 
 
 def test_page_is_self_contained_and_has_its_sections(folder: Path) -> None:
