@@ -7,21 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import (
-    DEFAULTS,
-    AccelUnitOption,
-    DurationS,
-    GyroUnitOption,
-    ImuTopic,
-    LidarTopic,
-    MaxRange,
-    MinRange,
-    PointTimeField,
-    PointTimeReference,
-    PointTimeUnit,
-    StartS,
-    recording_options,
-)
+from boxplus.cli.options import takes_recording_options
+from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.recordings.doctor import Diagnosis
@@ -29,21 +16,13 @@ if TYPE_CHECKING:
 _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
 
+@takes_recording_options
 def inspect(
     recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
     json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the findings as JSON to this file too.")] = None,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
-    point_time_field: PointTimeField = None,
-    point_time_unit: PointTimeUnit = None,
-    point_time_reference: PointTimeReference = None,
-    gyro_unit: GyroUnitOption = None,
-    accel_unit: AccelUnitOption = None,
-    min_range: MinRange = DEFAULTS.min_range,
-    max_range: MaxRange = DEFAULTS.max_range,
-    start: StartS = 0.0,
-    duration: DurationS = None,
+    *,
+    options: RecordingOptions,
 ) -> None:
     """Examine a recording: topics, rates, gaps, times, units, noise, extrinsic, points. Exit code 1 when there are errors."""
     from rich.console import Console
@@ -51,19 +30,6 @@ def inspect(
 
     from boxplus.recordings.doctor import diagnose
 
-    options = recording_options(
-        lidar_topic,
-        imu_topic,
-        point_time_field,
-        point_time_unit,
-        point_time_reference,
-        gyro_unit,
-        accel_unit,
-        min_range,
-        max_range,
-        start,
-        duration,
-    )
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)
         diagnosis = diagnose(recording, options, on_progress=lambda done: progress.update(task, completed=done))
@@ -78,13 +44,11 @@ def inspect(
 
 
 def _write(output: Path, diagnosis: Diagnosis) -> None:
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_text(diagnosis.to_json() + "\n", encoding="utf-8")
-    except OSError as error:
-        raise typer.BadParameter(
-            f"cannot write {output}: {error.strerror}; choose another file", param_hint="--output"
-        ) from error
+    from boxplus.formats.output import atomic_file, make_folder
+
+    make_folder(output.parent)
+    with atomic_file(output) as file:
+        file.write(f"{diagnosis.to_json()}\n".encode())
 
 
 def _print_table(diagnosis: Diagnosis) -> None:

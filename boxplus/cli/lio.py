@@ -8,21 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import (
-    DEFAULTS,
-    AccelUnitOption,
-    DurationS,
-    GyroUnitOption,
-    ImuTopic,
-    LidarTopic,
-    MaxRange,
-    MinRange,
-    PointTimeField,
-    PointTimeReference,
-    PointTimeUnit,
-    StartS,
-    recording_options,
-)
+from boxplus.cli.options import takes_recording_options
+from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.systems.odometry_run import View
@@ -30,6 +17,7 @@ if TYPE_CHECKING:
     from boxplus.systems.run_summary import RunSummary
 
 
+@takes_recording_options
 def lio(
     recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
     output: Annotated[
@@ -56,17 +44,8 @@ def lio(
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
-    lidar_topic: LidarTopic = None,
-    imu_topic: ImuTopic = None,
-    point_time_field: PointTimeField = None,
-    point_time_unit: PointTimeUnit = None,
-    point_time_reference: PointTimeReference = None,
-    gyro_unit: GyroUnitOption = None,
-    accel_unit: AccelUnitOption = None,
-    min_range: MinRange = DEFAULTS.min_range,
-    max_range: MaxRange = DEFAULTS.max_range,
-    start: StartS = 0.0,
-    duration: DurationS = None,
+    *,
+    options: RecordingOptions,
 ) -> None:
     """Turn a recording into a trajectory, a map and a report.
 
@@ -76,26 +55,16 @@ def lio(
     from boxplus.systems.run_config import load_run_config
     from boxplus.systems.run_transform import parse_transform
 
-    options = recording_options(
-        lidar_topic,
-        imu_topic,
-        point_time_field,
-        point_time_unit,
-        point_time_reference,
-        gyro_unit,
-        accel_unit,
-        min_range,
-        max_range,
-        start,
-        duration,
-    )
-    given = {key: value for key, value in options if value != getattr(DEFAULTS, key)}
     odometry: dict[str, object] = {}
     if T_imu_lidar is not None:
         odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
     if threads is not None:
         odometry["threads"] = threads
-    overrides: dict[str, dict[str, object]] = {"recording": given, "odometry": odometry, "map": {"save": False} if no_map else {}}
+    overrides: dict[str, dict[str, object]] = {
+        "recording": options.model_dump(exclude_defaults=True),
+        "odometry": odometry,
+        "map": {"save": False} if no_map else {},
+    }
     run_config = load_run_config(config, settings or (), overrides)
     if "threads" not in run_config.odometry.model_fields_set:
         both = {"threads": min(2, os.cpu_count() or 1)}

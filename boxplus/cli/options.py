@@ -2,83 +2,60 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
-from boxplus.recordings.options import AccelUnit, GyroUnit, RecordingOptions, TimeReference, TimeUnit
+from boxplus.recordings.options import RecordingOptions
 
 _PANEL = "Reading the recording (found from the data unless given)"
 
-LidarTopic = Annotated[str | None, typer.Option("--lidar-topic", help="Topic of the LiDAR.", rich_help_panel=_PANEL)]
-ImuTopic = Annotated[str | None, typer.Option("--imu-topic", help="Topic of the IMU.", rich_help_panel=_PANEL)]
-PointTimeField = Annotated[
-    str | None,
-    typer.Option(
-        "--point-time-field",
-        help="Field with the time of each point; 'none' takes every scan as one instant.",
-        rich_help_panel=_PANEL,
-    ),
-]
-PointTimeUnit = Annotated[
-    TimeUnit | None, typer.Option("--point-time-unit", help="Unit of the point times.", rich_help_panel=_PANEL)
-]
-PointTimeReference = Annotated[
-    TimeReference | None,
-    typer.Option("--point-time-reference", help="Instant from which the point times count.", rich_help_panel=_PANEL),
-]
-GyroUnitOption = Annotated[
-    GyroUnit | None, typer.Option("--gyro-unit", help="Unit of the angular velocity.", rich_help_panel=_PANEL)
-]
-AccelUnitOption = Annotated[
-    AccelUnit | None, typer.Option("--accel-unit", help="Unit of the acceleration.", rich_help_panel=_PANEL)
-]
-MinRange = Annotated[
-    float, typer.Option("--min-range", help="Drop points nearer than this [m].", min=0.0, rich_help_panel=_PANEL)
-]
-MaxRange = Annotated[
-    float, typer.Option("--max-range", help="Drop points farther than this [m].", min=0.0, rich_help_panel=_PANEL)
-]
-StartS = Annotated[float, typer.Option("--start", help="Skip this much at the beginning [s].", min=0.0, rich_help_panel=_PANEL)]
-DurationS = Annotated[float | None, typer.Option("--duration", help="Read at most this much [s].", rich_help_panel=_PANEL)]
 
-DEFAULTS = RecordingOptions()
+def takes_recording_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command one option for every field of `RecordingOptions`, and pass them to it as `options`.
 
+    `--point-time-unit` sets `point_time_unit`; the unit at the end of a name (`start_s`) is left out.
 
-def recording_options(
-    lidar_topic: str | None,
-    imu_topic: str | None,
-    point_time_field: str | None,
-    point_time_unit: TimeUnit | None,
-    point_time_reference: TimeReference | None,
-    gyro_unit: GyroUnit | None,
-    accel_unit: AccelUnit | None,
-    min_range: float,
-    max_range: float,
-    start_s: float,
-    duration_s: float | None,
-) -> RecordingOptions:
-    """The options above as one object.
-
-    Raises:
+    Raises, when the command is called:
         typer.BadParameter: a value outside its range.
     """
-    from pydantic import ValidationError
+    own = inspect.signature(command, eval_str=True)
+    fields = RecordingOptions.model_fields
 
-    try:
-        return RecordingOptions(
-            lidar_topic=lidar_topic,
-            imu_topic=imu_topic,
-            point_time_field=point_time_field,
-            point_time_unit=point_time_unit,
-            point_time_reference=point_time_reference,
-            gyro_unit=gyro_unit,
-            accel_unit=accel_unit,
-            min_range=min_range,
-            max_range=max_range,
-            start_s=start_s,
-            duration_s=duration_s,
+    @functools.wraps(command)
+    def with_options(**words: Any) -> None:
+        given = {name: words.pop(name) for name in fields}
+        try:
+            options = RecordingOptions(**given)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = _flag(str(first["loc"][0]))
+            raise typer.BadParameter(f"{first['msg']} (got {first['input']!r})", param_hint=name) from error
+        command(**words, options=options)
+
+    added = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=Annotated[
+                field.annotation, typer.Option(_flag(name), help=_sentence(field.description or ""), rich_help_panel=_PANEL)
+            ],
         )
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise typer.BadParameter(f"{first['msg']} (got {first['input']!r})", param_hint=str(first["loc"][0])) from error
+        for name, field in fields.items()
+    ]
+    kept = [parameter for name, parameter in own.parameters.items() if name != "options"]
+    with_options.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
+    return with_options
+
+
+def _flag(name: str) -> str:
+    return "--" + name.removesuffix("_s").replace("_", "-")
+
+
+def _sentence(description: str) -> str:
+    return f"{description[0].upper()}{description[1:]}."

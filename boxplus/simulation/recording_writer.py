@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import InputError, OutputError
+from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
 from boxplus.formats.trajectory_rows import tum_row
 from boxplus.manifolds import quaternion
@@ -64,8 +64,8 @@ def write_recording(
         The path that was written.
 
     Raises:
-        InputError: unknown format.
-        OutputError: the path exists, or it cannot be written.
+        InputError: unknown format, or the path exists.
+        OutputError: it cannot be written.
     """
     if format not in ("ros2", "ros1"):
         raise InputError("the format 'ros2' or 'ros1'", repr(format), "choose one of the two")
@@ -73,7 +73,7 @@ def write_recording(
     if format == "ros1":
         target = target.with_name(f"{target.name.removesuffix('.bag')}.bag")
     if target.exists():
-        raise OutputError(f"expected a new recording {target} – got one that exists – remove it or choose another name")
+        raise InputError("the path of a new recording", f"one that exists, {target}", "remove it or choose another name")
     make_folder(target.parent)
     stem = target.with_suffix("") if format == "ros1" else target
     try:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 import boxplus
 from boxplus.cli import _COMMANDS, app
+from boxplus.recordings import RecordingOptions
+from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation.recording_writer import write_recording
 
 
 def test_help_lists_every_command() -> None:
@@ -41,6 +45,31 @@ def test_unknown_command() -> None:
     result = CliRunner().invoke(app, ["oi"])
     assert result.exit_code == 2
     assert "No such command 'oi'" in result.stderr
+
+
+def test_every_field_of_the_recording_is_an_option() -> None:
+    for name in ("lio", "inspect"):
+        text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "120"}).stdout
+        for field in RecordingOptions.model_fields:
+            assert f"--{field.removesuffix('_s').replace('_', '-')} " in text
+
+
+def test_a_value_out_of_range_names_its_option() -> None:
+    result = CliRunner().invoke(app, ["inspect", "nothing.bag", "--start", "-1"])
+    assert result.exit_code == 2
+    assert "Invalid value for --start: Input should be greater than or equal to 0 (got -1.0)" in result.stderr
+
+
+def test_exit_codes_of_paths_that_cannot_be_written(tmp_path: Path) -> None:
+    recording = write_recording(simulate("walk", duration_s=1.0, lidar=SpinningLidar(azimuth_steps=100)), tmp_path / "walk")
+    (tmp_path / "file").write_text("mine")
+    result = CliRunner().invoke(app, ["inspect", str(recording), "-o", str(tmp_path / "file" / "out.json")])
+    assert (result.exit_code, result.stderr.strip().split(" – ")[0]) == (1, f"error: expected to write {tmp_path / 'file'}")
+    result = CliRunner().invoke(app, ["simulate", "walk", "--duration", "1", "-o", str(tmp_path)])
+    assert (result.exit_code, result.stderr.strip().split(", ")[0]) == (
+        2,
+        "error: expected the path of a new recording – got one that exists",
+    )
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -90,7 +90,7 @@ def test_empty_scans_and_backward_stamps_reach_the_disk(simulation: Simulation, 
 
 def test_refused(simulation: Simulation, tmp_path: Path) -> None:
     (tmp_path / "taken").mkdir()
-    with pytest.raises(OutputError, match="got one that exists – remove it or choose another name"):
+    with pytest.raises(InputError, match=r"got one that exists, .*taken – remove it or choose another name"):
         write_recording(simulation, tmp_path / "taken")
     with pytest.raises(InputError, match="expected the format 'ros2' or 'ros1' – got 'ros3'"):
         write_recording(simulation, tmp_path / "new", "ros3")  # type: ignore[arg-type]
