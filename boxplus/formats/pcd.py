@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.cloud_writer import CloudWriter
-from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, read_header, read_records, read_text_table
+from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
 
 _KNOWN = {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -58,11 +58,8 @@ def read_pcd(path: str | Path) -> PointCloud:
         InputError: the file is missing, cut, compressed or malformed; the message names file and line.
     """
     source = Path(path)
-    try:
-        with source.open("rb") as file:
-            return _read(file, source)
-    except OSError as error:
-        raise InputError("a readable PCD file", f"{source}: {error.strerror}", "check the path") from error
+    with opened(source, "PCD") as file:
+        return _read(file, source)
 
 
 def _read(file: BinaryIO, path: Path) -> PointCloud:

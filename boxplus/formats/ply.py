@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.cloud_writer import CloudWriter
-from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, read_header, read_records, read_text_table
+from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
@@ -74,11 +74,8 @@ def read_ply(path: str | Path) -> PointCloud:
         InputError: the file is missing, cut or malformed; the message names file and line.
     """
     source = Path(path)
-    try:
-        with source.open("rb") as file:
-            return _read(file, source)
-    except OSError as error:
-        raise InputError("a readable PLY file", f"{source}: {error.strerror}", "check the path") from error
+    with opened(source, "PLY") as file:
+        return _read(file, source)
 
 
 def ply_vertex_count(path: str | Path) -> int:
@@ -88,13 +85,10 @@ def ply_vertex_count(path: str | Path) -> int:
         InputError: as `read_ply`.
     """
     source = Path(path)
-    try:
-        with source.open("rb") as file:
-            layout, elements, _ = _parse_header(file, source)
-            vertex = _skip_to_vertices(file, source, layout, elements)
-            left = file.seek(0, 2) - file.tell() if layout == "ascii" else source.stat().st_size - file.tell()
-    except OSError as error:
-        raise InputError("a readable PLY file", f"{source}: {error.strerror}", "check the path") from error
+    with opened(source, "PLY") as file:
+        layout, elements, _ = _parse_header(file, source)
+        vertex = _skip_to_vertices(file, source, layout, elements)
+        left = file.seek(0, 2) - file.tell() if layout == "ascii" else source.stat().st_size - file.tell()
     size = sum(np.dtype(kind).itemsize for _, kind in vertex.fields)
     if layout != "ascii" and left < vertex.count * size:
         raise InputError(f"{vertex.count} points, as the header says", f"{left // max(size, 1)} ({source})", "the file was cut")

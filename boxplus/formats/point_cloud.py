@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -53,6 +55,20 @@ def as_records(points: ArrayLike, intensity: ArrayLike | None) -> NDArray[np.flo
     records[:, :3] = xyz
     records[:, 3] = strength
     return records
+
+
+@contextmanager
+def opened(path: Path, kind: str) -> Iterator[BinaryIO]:
+    """The file, opened for reading.
+
+    Raises:
+        InputError: it cannot be opened or read.
+    """
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"a readable {kind} file", f"{path}: {error.strerror}", "check the path") from error
 
 
 def read_header(file: BinaryIO, path: Path, last_line: str) -> list[str]:
