@@ -126,3 +126,14 @@ def test_configuration_page_names_every_setting_and_its_default(
         value = field.default
         text = f"{value:g}" if type(value) in (int, float) else yaml.safe_dump(value).splitlines()[0].strip("'")
         assert rows.get(name, "").strip("`") == text, f"{name}: {rows.get(name)!r}, not {text!r}"
+
+
+def test_command_line_page_names_the_defaults_of_its_settings() -> None:
+    page = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    sections = {"odometry": LioConfig, "recording": RecordingOptions, "map": MapConfig}
+    rows = re.findall(r"^\| `(\w+)\.(\w+)` \| ([^|]+?) \|", page, re.MULTILINE)
+    assert len(rows) >= 4
+    for section, name, told in rows:
+        value = sections[section].model_fields[name].default
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+        assert told.split()[0].strip("`") == text, f"{section}.{name}: {told!r}, not {text!r}"
