@@ -4,17 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from boxplus.errors import InputError
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import DenseSystem, LinearSystem, SparseSystem
+from boxplus.optimization.schur import SchurSystem
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import Variables
 
 # Below this many degrees of freedom one dense factorisation is faster than any analysis.
 _DENSE_DOF = 150
 
 
 def choose_system(layout: Layout, groups: Sequence[Group], options: SolverOptions) -> LinearSystem:
-    """The linear system for `options.linear_solver`; `auto` decides, and the system's description says why."""
-    if options.linear_solver == "dense" or (options.linear_solver == "auto" and layout.dof <= _DENSE_DOF):
+    """The linear system for `options.linear_solver`; `auto` decides, and the system's description says why.
+
+    Raises:
+        InputError: Schur elimination is asked for where no block of variables can be eliminated.
+    """
+    wanted = options.linear_solver
+    eliminated = _largest_independent(layout, groups)
+    if wanted == "schur":
+        if eliminated is None:
+            raise InputError(
+                "a block of variables no two of which share a residual",
+                "none",
+                "let the solver choose, or put the variables to eliminate into a block of their own",
+            )
+        return SchurSystem(layout, groups, eliminated, options.threads)
+    if wanted == "dense" or (wanted == "auto" and layout.dof <= _DENSE_DOF):
         return DenseSystem(layout, groups, options.threads)
+    if wanted == "auto" and eliminated is not None and 2 * _free_dof(layout, eliminated) > layout.dof:
+        return SchurSystem(layout, groups, eliminated, options.threads)
     return SparseSystem(layout, groups, options.threads)
+
+
+def _free_dof(layout: Layout, block: Variables) -> int:
+    return int((layout.number[block.number] >= 0).sum()) * block.manifold.dof
+
+
+def _largest_independent(layout: Layout, groups: Sequence[Group]) -> Variables | None:
+    """The block with the most degrees of freedom none of whose variables shares a residual with another of it."""
+    candidates = []
+    for block in layout.blocks:
+        met = max(sum(c.block is block for c in group.connections) for group in groups)
+        if met == 1 and 0 < _free_dof(layout, block) < layout.dof:
+            candidates.append(block)
+    return max(candidates, key=lambda block: _free_dof(layout, block), default=None)

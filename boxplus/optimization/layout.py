@@ -21,19 +21,24 @@ class Layout:
         start: (free variables + 1,) int64, where each begins in the tangent vector; the last is its length.
     """
 
-    def __init__(self, blocks: Sequence[Variables]) -> None:
+    def __init__(self, blocks: Sequence[Variables], without: Variables | None = None) -> None:
         self.blocks = tuple(blocks)
         self.number: list[NDArray[np.int64]] = []
         count = 0
+        sizes = []
         for block in self.blocks:
             number = np.full(len(block), -1, dtype=np.int64)
-            free = ~block.is_fixed
+            free = ~block.is_fixed & (block is not without)
+            sizes.append(np.full(int(free.sum()), block.manifold.dof, dtype=np.int64))
             number[free] = count + np.arange(int(free.sum()))
             count += int(free.sum())
             self.number.append(number)
-        parts = [np.full(int((~b.is_fixed).sum()), b.manifold.dof, dtype=np.int64) for b in self.blocks]
-        self.sizes = np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+        self.sizes = np.concatenate(sizes) if sizes else np.zeros(0, dtype=np.int64)
         self.start = np.concatenate([[0], np.cumsum(self.sizes)])
+
+    def without(self, block: Variables) -> Layout:
+        """The layout of all variables but those of `block`, which count as fixed."""
+        return Layout(self.blocks, block)
 
     @property
     def dof(self) -> int:

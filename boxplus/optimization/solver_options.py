@@ -22,7 +22,7 @@ class SolverOptions(BaseModel):
     cost_tolerance: float = Field(1e-9, ge=0, description="converged when a step changes the cost by less than this share of it")
     step_tolerance: float = Field(1e-10, ge=0, description="converged when no tangent moves by more than this")
     gradient_tolerance: float = Field(1e-10, ge=0, description="converged when no entry of the gradient exceeds this")
-    initial_damping: float = Field(1e-4, gt=0, description="λ at the start of Levenberg-Marquardt, relative to the diagonal of H")
+    initial_damping: float = Field(1e-5, gt=0, description="λ at the start of Levenberg-Marquardt, relative to the diagonal of H")
     damping: Literal["diagonal", "identity"] = Field(
         "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start as in SPEC 2.2"
     )

@@ -1,0 +1,193 @@
+"""Schur elimination: variables that meet no other of their kind are solved for in closed form (SPEC.md 2.1).
+
+With E the eliminated variables (the points of a bundle adjustment) and F the kept ones, H = [[F, W], [Wᵀ, C]] and C is
+block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F − Z Zᵀ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import run_chunks
+from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.optimization.group import Group
+from boxplus.optimization.layout import Layout
+from boxplus.optimization.linear_system import LinearSystem
+from boxplus.optimization.normal_equations import Gather, NormalEquations, add_gradient, add_products
+from boxplus.optimization.schur_kernels import (
+    cross_kernel,
+    factorize_eliminated,
+    products_kernel,
+    reduce_kernel,
+    solve_eliminated,
+    subtract_from_eliminated,
+    subtract_from_rest,
+)
+from boxplus.optimization.schur_structure import Entries, build_entries, build_products, eliminated_numbers
+from boxplus.optimization.variables import Variables
+
+# Items that a thread takes in one go.
+_VARIABLES, _ENTRIES, _BLOCKS = 2048, 1024, 16
+
+
+class SchurSystem(LinearSystem):
+    """H with one block of variables eliminated, the rest factorised by the supernodal Cholesky."""
+
+    def __init__(self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int) -> None:
+        self._layout, self._threads = layout, threads
+        self._rest = layout.without(eliminated)
+        own = layout.number[eliminated.number]
+        self._first, count, e = int(own[own >= 0][0]), int((own >= 0).sum()), eliminated.manifold.dof
+        # The eliminated variables are one block, so their tangents are one piece of the tangent vector.
+        begin = int(layout.start[self._first])
+        self._own = slice(begin, begin + count * e)
+        self._others = np.delete(np.arange(layout.dof), self._own)
+        self._C, self._L = np.zeros((count, e, e)), np.zeros((count, e, e))
+        self._b, self._y = np.zeros((count, e)), np.zeros((count, e))
+        self._squares, self._slopes = _gathers_of(layout, groups, eliminated, e)
+        self._equations = NormalEquations(self._rest, groups)
+        self._entries = build_entries(layout, self._rest, groups, eliminated, count)
+        self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
+        self._values = np.zeros(int(self._pattern.value_start[-1]))
+        self._cholesky = SparseCholesky(self._pattern)
+        self.gradient, self.diagonal = np.zeros(layout.dof), np.zeros(layout.dof)
+        self.description = (
+            f"Schur elimination of {count} {eliminated.name!r} ({e} degrees of freedom each, no residual connects two of them), "
+            f"then sparse Cholesky of the {self._rest.dof} degrees of freedom left, {self._cholesky.nnz_factor:,} non-zeros"
+        )
+
+    def assemble(self) -> None:
+        """See `LinearSystem.assemble`."""
+        self._equations.assemble(self._threads)
+        self._C[:] = 0.0
+        self._b[:] = 0.0
+        for gather in self._squares:
+            add_products(gather, self._C.reshape(-1), self._threads)
+        for gather in self._slopes:
+            add_gradient(gather, self._b.reshape(-1), self._threads)
+        for entries in self._entries:
+            entries.W[:] = 0.0
+            for gather in entries.gathers:
+                self._add_cross(gather, entries)
+        self.gradient[self._own] = self._b.reshape(-1)
+        self.gradient[self._others] = self._equations.gradient
+        self.diagonal[self._own] = np.einsum("nii->ni", self._C).reshape(-1)
+        self.diagonal[self._others] = self._equations.diagonal
+
+    def _add_cross(self, gather: Gather, entries: Entries) -> None:
+        Je, Jf = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
+        run = cross_kernel(gather.group.residual.dim, Je.shape[2], entries.dof)
+
+        def work(_: int, begin: int, end: int) -> None:
+            run(begin, end, gather.target, gather.begin, gather.residual, Je, Jf, entries.W)
+
+        run_chunks(work, len(gather.target), _ENTRIES, self._threads)
+
+    def factorize(self, damping: NDArray[np.float64] | None) -> None:
+        """See `LinearSystem.factorize`."""
+        self._eliminate(np.zeros(0) if damping is None else damping[self._own])
+        self._reduce()
+        try:
+            self._cholesky.factorize(self._values, diagonal=0.0 if damping is None else damping[self._others])
+        except NotPositiveDefinite as error:
+            number = error.block if error.block < self._first else error.block + len(self._C)
+            raise NotPositiveDefinite(number, error.component, error.pivot) from error
+
+    def _eliminate(self, damping: NDArray[np.float64]) -> None:
+        """C + D = L Lᵀ and Z = W L⁻ᵀ."""
+        failed = np.full(max(1, -(-len(self._C) // _VARIABLES)), -1, dtype=np.int64)
+
+        def invert(chunk: int, begin: int, end: int) -> None:
+            failed[chunk] = factorize_eliminated(begin, end, self._C, damping, self._L)
+
+        run_chunks(invert, len(self._C), _VARIABLES, self._threads)
+        if (failed >= 0).any():
+            row = int(failed[failed >= 0][0])
+            raise NotPositiveDefinite(self._first + row, 0, float(np.linalg.eigvalsh(self._C[row])[0]))
+        for entries in self._entries:
+            run = reduce_kernel(entries.Z.shape[1], entries.Z.shape[2])
+
+            def reduce(_: int, begin: int, end: int, run=run, entries=entries) -> None:  # type: ignore[no-untyped-def]
+                run(begin, end, entries.eliminated, self._L, entries.W, entries.Z)
+
+            run_chunks(reduce, len(entries.eliminated), _ENTRIES, self._threads)
+
+    def _reduce(self) -> None:
+        """S = F − Z Zᵀ."""
+        self._values[:] = 0.0
+        self._values[self._places] = self._equations.values
+        for products in self._products:
+            run = products_kernel(products.a.Z.shape[1], products.a.dof, products.b.dof)
+
+            def subtract(_: int, begin: int, end: int, run=run, k=products) -> None:  # type: ignore[no-untyped-def]
+                run(begin, end, k.target, k.begin, k.entry_a, k.entry_b, k.a.Z, k.b.Z, self._values)
+
+            run_chunks(subtract, len(products.target), _BLOCKS, self._threads)
+
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `LinearSystem.solve`."""
+        y, reduced = self._y, right[self._others]
+        y[:] = right[self._own].reshape(y.shape)
+        solve_eliminated(self._L, False, y)
+        for k in self._entries:
+            subtract_from_rest(k.start, k.begin, k.eliminated, k.Z, k.dof, y, reduced)
+        rest = self._cholesky.solve(reduced)
+        for k in self._entries:
+            subtract_from_eliminated(k.of_eliminated, k.order, k.start_of_entry, k.Z, k.dof, rest, y)
+        solve_eliminated(self._L, True, y)
+        x = np.empty_like(right)
+        x[self._own], x[self._others] = y.reshape(-1), rest
+        return x
+
+    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """See `LinearSystem.inverse_blocks`.
+
+        With M = L⁻ᵀ Zᵀ, the inverse is S⁻¹ between kept variables, −M S⁻¹ between an eliminated and the kept ones, and
+        (C + D)⁻¹ + M S⁻¹ Mᵀ between eliminated ones.
+        """
+        reached = {int(n): self._reached(int(n)) for n in np.unique(np.concatenate([first, second]))}
+        wanted = sorted({(a, b) for i, j in zip(first, second, strict=True) for a, _ in reached[i] for b, _ in reached[j]})
+        pairs = np.array(wanted, dtype=np.int64).reshape(-1, 2)
+        inverse = dict(zip(wanted, self._cholesky.inverse_blocks(pairs[:, 0], pairs[:, 1]), strict=True))
+        blocks = []
+        for i, j in zip(first, second, strict=True):
+            sizes = self._layout.sizes
+            block = np.zeros((sizes[i], sizes[j]))
+            for a, left in reached[int(i)]:
+                for b, right in reached[int(j)]:
+                    block += left @ inverse[a, b] @ right.T
+            own = int(i) - self._first
+            if i == j and 0 <= own < len(self._L):
+                root = np.linalg.inv(np.tril(self._L[own]))
+                block += root.T @ root
+            blocks.append(block)
+        return blocks
+
+    def _reached(self, number: int) -> list[tuple[int, NDArray[np.float64]]]:
+        """The kept variables through which a variable is correlated, with the factor for each: 1, or −M of its entry."""
+        own = number - self._first
+        if not 0 <= own < len(self._L):
+            return [(number if own < 0 else number - len(self._L), np.eye(int(self._layout.sizes[number])))]
+        root = np.linalg.inv(np.tril(self._L[own])).T
+        reached = []
+        for k in self._entries:
+            for n in k.order[k.of_eliminated[own] : k.of_eliminated[own + 1]]:
+                reached.append((int(k.kept[n]), -root @ k.Z[n, :, : k.dof]))
+        return reached
+
+
+def _gathers_of(layout: Layout, groups: Sequence[Group], eliminated: Variables, e: int) -> tuple[list[Gather], list[Gather]]:
+    """The residuals that add to C, and to the gradient, of each eliminated variable."""
+    squares, slopes = [], []
+    for group in groups:
+        found = eliminated_numbers(layout, eliminated, group)
+        if found is None:
+            continue
+        slot, number = found
+        selected = np.flatnonzero(number >= 0)
+        squares.append(Gather.sorted_by(group, slot, slot, number[selected] * e * e, selected))
+        slopes.append(Gather.sorted_by(group, slot, slot, number[selected] * e, selected))
+    return squares, slopes
