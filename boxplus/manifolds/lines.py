@@ -145,7 +145,7 @@ class _Line3D(KernelManifold):
         return rows
 
     def identity(self) -> NDArray[np.float64]:
-        """The line along y through the point (0, 0, 1)."""
+        """The line along y through the point (0, 0, −1)."""
         return np.array([1.0, 0.0, 0.0, 0.0, 0.25 * np.pi])
 
     def random(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
