@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import run_chunks
 from boxplus.errors import BoxplusError, InputError
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.inverse_blocks import SelectedInverse, locate_blocks
@@ -47,18 +48,21 @@ class SparseCholesky:
     """L Lᵀ = P H Pᵀ for symmetric positive definite H with the given pattern.
 
     The constructor orders and analyses; `factorize` takes new values any number of times and allocates nothing. One object
-    must not be used by two threads at once. Results are the same bits on every run.
+    must not be used by two threads at once. Results are the same bits on every run and for any number of threads.
 
     Args:
         pattern: of H.
         ordering: name of the fill-reducing ordering, or (n,) integers: the variable at each position.
+        threads: that factorise subtrees side by side.
 
     Raises:
-        InputError: an ordering that is no permutation of the variables.
+        InputError: an ordering that is no permutation of the variables, or no thread.
     """
 
-    def __init__(self, pattern: BlockPattern, *, ordering: Method | NDArray[np.int64] = "auto") -> None:
-        self.pattern = pattern
+    def __init__(self, pattern: BlockPattern, *, ordering: Method | NDArray[np.int64] = "auto", threads: int = 1) -> None:
+        if threads < 1:
+            raise InputError("at least one thread", f"{threads}", "give the number of threads")
+        self.pattern, self._threads = pattern, threads
         if isinstance(ordering, str):
             first = order(pattern.col_start, pattern.row, pattern.sizes, ordering).permutation
         else:
@@ -67,7 +71,7 @@ class SparseCholesky:
                 raise InputError(
                     f"a permutation of 0 … {len(pattern.sizes) - 1}", f"{first}", "give every variable its place once"
                 )
-        self._fronts = fronts = lay_out(pattern, first)
+        self._fronts = fronts = lay_out(pattern, first, threads)
         size = int(pattern.start[-1])
         self._factor = _aligned(fronts.factor_size)
         self._stack = _aligned(fronts.stack_size)
@@ -124,17 +128,31 @@ class SparseCholesky:
         fronts = self._fronts
         self._diagonal[:] = diagonal
         self._factorized, self._selected = False, None
-        failed = int(
-            factorize(
-                np.uint64(0), np.uint64(self.front_count), fronts.table, fronts.children, fronts.runs, fronts.entries,
-                fronts.scalar_order, values, self._diagonal, self._factor, self._stack, self._inverse, self._pivots,
-            )
-        )  # fmt: skip
+        failed = self._factorize_parts(values)
         if failed < len(self._pivots):
             row = int(fronts.scalar_order[failed])
             block = int(np.searchsorted(self.pattern.start, row, side="right")) - 1
             raise NotPositiveDefinite(block, row - int(self.pattern.start[block]), float(self._pivots[failed]))
         self._factorized = True
+
+    def _factorize_parts(self, values: NDArray[np.float64]) -> int:
+        """Subtrees side by side, then the rest; returns the first failed scalar position, or N."""
+        fronts, subtrees = self._fronts, len(self._fronts.parts) - 2
+        failed = [len(self._pivots)] * (subtrees + 1)
+
+        def work(part: int, _begin: int, _end: int) -> None:
+            begin, end = fronts.parts[part : part + 2].astype(np.uint64)
+            failed[part] = int(
+                factorize(
+                    fronts.sequence, begin, end, fronts.table, fronts.children, fronts.runs, fronts.entries,
+                    fronts.scalar_order, values, self._diagonal, self._factor, self._stack, self._inverse, self._pivots,
+                )
+            )  # fmt: skip
+
+        run_chunks(work, subtrees, 1, self._threads)
+        if min(failed) == len(self._pivots):
+            work(subtrees, 0, 0)
+        return min(failed)
 
     def solve(self, b: ArrayLike) -> NDArray[np.float64]:
         """x with H x = b for one right-hand side (N,) or several (N, k).

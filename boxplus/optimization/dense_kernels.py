@@ -41,16 +41,16 @@ _BLOCK = np.uint64(96)  # columns that are eliminated together: their panel stay
 
 @kernel
 def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint64, lda: np.uint64, b: Buffer, b_at: np.uint64,
-           ldb: np.uint64, rows: np.uint64, columns: np.uint64, depth: np.uint64, lower: bool,
-           accumulate: bool) -> None:  # fmt: skip
+           ldb: np.uint64, rows: np.uint64, columns: np.uint64, depth: np.uint64, lower: np.uint64,
+           accumulate: np.uint64) -> None:  # fmt: skip
     """C ← C - A Bᵀ, or -A Bᵀ without `accumulate`; C is (rows, columns), A (rows, depth), B (columns, depth).
 
-    With `lower` only what lies at or below the diagonal of C is meaningful (part of what is above is overwritten too).
+    `lower` and `accumulate` are 1 or 0. With `lower`, what lies above the diagonal of C is not meaningful.
     """
     j = np.uint64(0)
     while j < columns:
         left = columns - j
-        i = j if lower else np.uint64(0)
+        i = j * lower
         if left >= _SIX:
             while i < rows:
                 count, at = min(rows - i, _TALL), c_at + i + j * ldc
@@ -162,10 +162,9 @@ def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
         rest = rows - behind
         if behind < width:
             here, a_at = at + behind + behind * ld, corner + depth
-            update(p, here, ld, p, a_at, ld, p, a_at, ld, rest, width - behind, depth, True, True)
+            update(p, here, ld, p, a_at, ld, p, a_at, ld, rest, width - behind, depth, _ONE, _ONE)
         if rows > width:
             below, a_at = rows - width, at + width + k * ld
-            first = k == np.uint64(0)
-            update(c, c_at, ldc, p, a_at, ld, p, a_at, ld, below, below, depth, True, not first)
+            update(c, c_at, ldc, p, a_at, ld, p, a_at, ld, below, below, depth, _ONE, min(k, _ONE))
         k = behind
     return width

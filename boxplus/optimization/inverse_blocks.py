@@ -80,17 +80,17 @@ def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffe
         width, below, at, ld = front["width"], front["below"], front["panel_at"], front["panel_ld"]
         below_at, below_ld = front["update_at"], front["update_ld"]
         _invert_triangle(factor, at, ld, inverse, front["column"], width, m, negative)
-        update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, True, False)
+        update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, _ONE, _ZERO)
         if below > _ZERO:
             for j in range(below):
                 for i in range(j):
                     stack[below_at + i + j * below_ld] = stack[below_at + j + i * below_ld]
-            update(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, False, False)
-            update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, False, False)
+            update(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, _ZERO, _ZERO)
+            update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, _ZERO, _ZERO)
             for j in range(width):
                 for i in range(below):
                     z_transposed[j + i * width] = z[at + width + i + j * ld]
-            update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, True, True)
+            update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, _ONE, _ONE)
         for c in range(front["child_start"], following["child_start"]):
             child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
             _hand_to_child(child, last, runs, z, at, ld, width, stack, below_at, below_ld)

@@ -62,10 +62,10 @@ def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, l
 
 
 @kernel
-def factorize(begin: np.uint64, end: np.uint64, table: Table, children: Indices, runs: Table, entries: Table,
+def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table, children: Indices, runs: Table, entries: Table,
               scalar_order: Indices, values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, inverse: Buffer,
               pivots: Buffer) -> np.uint64:  # fmt: skip
-    """Factorise the fronts `begin … end`, whose children are among them or done.
+    """Factorise the fronts `sequence[begin:end]`, whose children come before them or are done.
 
     Args:
         diagonal: (N,) added to the diagonal, in the order of the matrix.
@@ -75,7 +75,8 @@ def factorize(begin: np.uint64, end: np.uint64, table: Table, children: Indices,
     Returns:
         The scalar position whose pivot is not positive and finite, or N.
     """
-    for g in range(begin, end):
+    for place in range(begin, end):
+        g = sequence[place]
         front, following = table[g], table[g + np.uint64(1)]
         column, width, below = front["column"], front["width"], front["below"]
         at, ld = front["panel_at"], front["panel_ld"]

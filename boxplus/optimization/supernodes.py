@@ -3,7 +3,8 @@
 A front eliminates the columns of one supernode. Its panel, `width + below` rows by `width` columns, becomes part of the factor
 L; its update matrix, `below` by `below`, is what the elimination adds to the later rows, and is added to the parent front.
 Both are column-major. Update matrices live in two stacks that grow towards each other, one for the even and one for the odd
-levels of the tree, so that a front's own update matrix can be formed while those of its children are still there.
+levels of the tree, so that a front's own update matrix can be formed while those of its children are still there. Each of the
+subtrees that threads work on side by side has its own pair of stacks, and so has the rest of the tree.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.subtrees import split_tree
 from boxplus.optimization.symbolic import (
     Indices,
     below_counts,
@@ -69,6 +71,8 @@ class Fronts:
         front_of: (n,) uint64, front that eliminates each variable.
         table: (fronts + 1,) FRONT, children before parents.
         children: (fronts,) uint64.
+        sequence: (fronts,) uint64, order of work: subtree after subtree, then the rest.
+        parts: (subtrees + 2,) int64, where each subtree and the rest begin in `sequence`, and its end.
         runs: RUN records.
         entries: ENTRY records, by front.
         rows: uint64, scalar rows below each front, in elimination order.
@@ -83,6 +87,8 @@ class Fronts:
     front_of: NDArray[np.uint64]
     table: NDArray[np.void]
     children: NDArray[np.uint64]
+    sequence: NDArray[np.uint64]
+    parts: NDArray[np.int64]
     runs: NDArray[np.void]
     entries: NDArray[np.void]
     rows: NDArray[np.uint64]
@@ -100,31 +106,30 @@ def stride(rows: int) -> int:
 
 
 @kernel
-def _stack_offsets(parent: Indices, below: Indices, strides: Indices) -> tuple[Indices, int]:
-    """Place of each update matrix, and the size of both stacks together."""
+def _stack_offsets(parent: Indices, below: Indices, strides: Indices, part: Indices, parts: int) -> tuple[Indices, int]:
+    """Place of each update matrix, and the size of all stacks together. Every part of the tree has two stacks of its own."""
     groups = len(parent)
     level, offset = np.zeros(groups + 1, np.int64), np.zeros(groups, np.int64)
     for g in range(groups - 1, -1, -1):
         level[g] = level[parent[g]] + 1 if parent[g] < groups else 0
     lowest_child = np.full(groups + 1, groups)
-    top = np.zeros(2, np.int64)
-    peak = 0
+    top, peak, base = np.zeros((parts, 2), np.int64), np.zeros(parts, np.int64), np.zeros(parts + 1, np.int64)
+    size = (below * strides + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
     for g in range(groups):
-        side = level[g] % 2
-        offset[g] = top[side]
-        size = (below[g] * strides[g] + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
-        top[side] += size
-        peak = max(peak, top[0] + top[1])
+        p, side = part[g], level[g] % 2
+        offset[g] = top[p, side]
+        top[p, side] += size[g]
+        peak[p] = max(peak[p], top[p, 0] + top[p, 1])
         if lowest_child[g] < groups:
-            top[1 - side] = offset[lowest_child[g]]
-        if parent[g] < groups:
+            top[p, 1 - side] = offset[lowest_child[g]]
+        if parent[g] < groups and part[parent[g]] == p:
             lowest_child[parent[g]] = min(lowest_child[parent[g]], g)
-        else:
-            top[side] = offset[g]
+    for p in range(parts):
+        base[p + 1] = base[p] + peak[p]
     for g in range(groups):
-        if level[g] % 2:
-            offset[g] = peak - offset[g] - (below[g] * strides[g] + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
-    return offset, peak
+        p = part[g]
+        offset[g] = base[p + 1] - offset[g] - size[g] if level[g] % 2 else base[p] + offset[g]
+    return offset, base[parts]
 
 
 @kernel
@@ -205,8 +210,8 @@ def _entries(col_start: Indices, row: Indices, value_start: Indices, position: I
             entries[e, 4] = DIAGONAL if a == b else (STORED if a > b else TRANSPOSED)
 
 
-def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
-    """Analyse a pattern in the given elimination order (variable at each position)."""
+def lay_out(pattern: BlockPattern, order: NDArray[np.int64], threads: int) -> Fronts:
+    """Analyse a pattern in the given elimination order (variable at each position) for a number of threads."""
     n = len(pattern.sizes)
     position = np.empty(n, np.int64)
     position[order] = np.arange(n)
@@ -228,6 +233,7 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
     scalar_rows = np.zeros(len(rows) + 1, np.int64)
     np.cumsum(sizes[rows], out=scalar_rows[1:])
     below = np.diff(scalar_rows[row_start])
+    part, parts = split_tree(group_parent, width, below, threads)
     table = np.zeros(groups + 1, FRONT)
     table["column"] = start[first]
     table["width"][:groups], table["below"][:groups] = width, below
@@ -236,7 +242,7 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
     table["panel_at"][1:] = np.cumsum(panel_sizes)
     update_strides = np.array([stride(int(rows)) for rows in below], np.int64)
     table["update_ld"][:groups] = update_strides
-    table["update_at"][:groups], stack_size = _stack_offsets(group_parent, below, update_strides)
+    table["update_at"][:groups], stack_size = _stack_offsets(group_parent, below, update_strides, part, len(parts) - 1)
     table["parent"][:groups] = group_parent
     table["row_start"] = scalar_rows[row_start]
     table["child_start"][1:] = np.cumsum(np.bincount(group_parent, minlength=groups + 1)[:groups])
@@ -254,6 +260,8 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64]) -> Fronts:
         front_of=group_of[position].astype(np.uint64),
         table=table,
         children=np.argsort(group_parent, kind="stable").astype(np.uint64),
+        sequence=np.argsort(part, kind="stable").astype(np.uint64),
+        parts=parts,
         runs=runs[:run_count].copy().view(RUN)[:, 0],
         entries=entries.view(ENTRY)[:, 0],
         rows=_expand(start[rows], sizes[rows]),

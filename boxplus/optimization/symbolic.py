@@ -15,11 +15,11 @@ from boxplus._jit import kernel
 Indices = NDArray[np.int64]
 
 # Time of a front in nanoseconds, see `front_time`; fitted on pose graphs.
-TIME_FRONT = 250.0
-TIME_COLUMN = 15.0
-TIME_PANEL = 0.35
-TIME_UPDATE = 0.55
-TIME_FLOP = 0.021
+TIME_FRONT = 100.0
+TIME_COLUMN = 8.0
+TIME_PANEL = 0.8
+TIME_UPDATE = 0.5
+TIME_FLOP = 0.025
 
 
 @kernel

@@ -155,7 +155,7 @@ def _compiled_update(columns: int, vectors: int) -> Callable[..., None]:
         emit = tile.emit
         for place, products in zip(tile.places, tile.products, strict=True):
             entry, add, store = builder.block, builder.append_basic_block("accumulate"), builder.append_basic_block("store")
-            builder.cbranch(args[11], add, store)
+            builder.cbranch(builder.icmp_unsigned("!=", args[11], _INDEX(0)), add, store)
             builder.position_at_end(add)
             old = emit.load(place)
             builder.branch(store)
@@ -170,7 +170,7 @@ def _compiled_update(columns: int, vectors: int) -> Callable[..., None]:
     @intrinsic  # type: ignore[misc]
     def tile(typing: Any, c: Any, c_at: Any, ldc: Any, a: Any, a_at: Any, lda: Any, b: Any, b_at: Any, ldb: Any, depth: Any,
              rows: Any, accumulate: Any) -> Any:  # fmt: skip
-        return types.void(*_OPERANDS, types.boolean), generate
+        return types.void(*_OPERANDS, _N), generate
 
     return tile  # type: ignore[no-any-return]
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.optimization import subtrees
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 
@@ -172,3 +173,22 @@ def test_blocks_of_the_inverse_follow_the_latest_factorisation() -> None:
         np.testing.assert_array_equal(one / 4.0, quarter)
     with pytest.raises(InputError, match="pairs of variables from 0 to 29"):
         cholesky.inverse_blocks([0], [30])
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_change_no_bit(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subtrees, "WORTHWHILE", 0.0)
+    for shape in ("grid", "two components", "arrow to the first", "chain", "diagonal", "empty"):
+        pattern, _ = BlockPattern.from_pairs(*SHAPES[shape])
+        values, dense = positive_definite(pattern, np.random.default_rng(0))
+        alone, together = SparseCholesky(pattern), SparseCholesky(pattern, threads=threads)
+        for cholesky in (alone, together):
+            cholesky.factorize(values)
+        b = np.arange(len(dense), dtype=np.float64)
+        np.testing.assert_array_equal(alone.solve(b), together.solve(b))
+        every = np.arange(len(pattern.sizes))
+        for one, other in zip(alone.inverse_blocks(every, every), together.inverse_blocks(every, every), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert len(SparseCholesky(BlockPattern.from_pairs(*SHAPES["grid"])[0], threads=threads)._fronts.parts) > 3
+    with pytest.raises(InputError, match="at least one thread"):
+        SparseCholesky(pattern, threads=0)
