@@ -1,0 +1,162 @@
+"""Multi-view line sets of the Visual Geometry Group, Oxford: cameras, segments, 3D lines and which segment shows which line.
+
+A folder holds for every view a camera `*.P` (3 × 4, up to scale) and segments `*.lines` (x0 y0 x1 y1, then columns that are
+not used), and for all views `*l3d` (x0 y0 z0 x1 y1 z1, a row a line) and `*nview-lines` (a row a line, a column a view: the
+row of the segment in that view, or * where there is none).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VggLines:
+    """V views of L lines in N observations.
+
+    Attributes:
+        names: of the views, their camera files without ending.
+        K: (V, 3, 3) calibration matrices, upper triangular, K[2, 2] = 1, with skew [px].
+        T_camera_world: (V, 7) wxyz and xyz, z forward.
+        end_points_world: (L, 6) two points of each line.
+        view_of, line_of: (N,) the view and the line of each observation.
+        segments: (N, 4) u_start, v_start, u_end, v_end [px].
+    """
+
+    names: tuple[str, ...]
+    K: NDArray[np.float64]
+    T_camera_world: NDArray[np.float64]
+    end_points_world: NDArray[np.float64]
+    view_of: NDArray[np.uint32]
+    line_of: NDArray[np.uint32]
+    segments: NDArray[np.float64]
+
+
+def read_vgg_lines(folder: str | Path) -> VggLines:
+    """Read a line set.
+
+    Where there are several files of matches (Corridor), the one with as many rows as there are 3D lines is read.
+
+    Raises:
+        InputError: a file is missing or a line of it malformed; the message names file and line number.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError("a folder with *.P, *.lines, *l3d and *nview-lines", f"{root}", "check the path")
+    cameras = sorted(root.glob("*.P"))
+    if not cameras:
+        raise InputError("a camera file *.P for every view", f"none in {root}", "check the path")
+    P = np.stack([_read_camera(file) for file in cameras])
+    segments = [_read_table(_existing(file.with_suffix(".lines")), 4) for file in cameras]
+    lines = sorted(root.glob("*l3d"))
+    if len(lines) != 1:
+        raise InputError("one file *l3d of 3D lines", f"{len(lines)} in {root}", "check the path")
+    end_points = _read_table(lines[0], 6)
+    candidates = sorted(root.glob("*nview-lines"))
+    matches = [file for file in candidates if sum(1 for _ in _rows(file)) == len(end_points)]
+    if len(matches) != 1:
+        raise InputError(
+            f"one file *nview-lines with {len(end_points)} rows, one for each 3D line",
+            f"{len(matches)} of {[file.name for file in candidates]} in {root}",
+            "remove the files of another reconstruction",
+        )
+    view_of, line_of, observed = _read_matches(matches[0], segments)
+    K, T_camera_world = _decompose(P)
+    return VggLines(
+        names=tuple(file.stem for file in cameras),
+        K=K,
+        T_camera_world=T_camera_world,
+        end_points_world=end_points,
+        view_of=view_of,
+        line_of=line_of,
+        segments=observed,
+    )
+
+
+def _existing(file: Path) -> Path:
+    if not file.is_file():
+        raise InputError(f"the segments of the view in {file.name}", "no such file", "put it beside the camera file")
+    return file
+
+
+def _rows(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number, from 1, and words of every line that is not empty."""
+    for number, line in enumerate(file.read_text(encoding="ascii", errors="replace").splitlines(), start=1):
+        words = line.split()
+        if words:
+            yield number, words
+
+
+def _read_table(file: Path, columns: int) -> NDArray[np.float64]:
+    """(n, columns): the first numbers of every line."""
+    table = []
+    for number, words in _rows(file):
+        try:
+            row = [float(word) for word in words[:columns]]
+        except ValueError:
+            row = []
+        if len(row) < columns or not np.isfinite(row).all():
+            raise InputError(
+                f"{columns} numbers", f"{' '.join(words)!r} ({file}, line {number})", "repair the line or take the file anew"
+            )
+        table.append(row)
+    return np.array(table, dtype=np.float64).reshape(-1, columns)
+
+
+def _read_camera(file: Path) -> NDArray[np.float64]:
+    P = _read_table(file, 4)
+    if P.shape != (3, 4) or np.linalg.matrix_rank(P[:, :3]) < 3:
+        raise InputError(
+            "a projection matrix of 3 × 4 numbers, the left 3 × 3 regular", f"shape {P.shape} ({file})", "check the file"
+        )
+    return P
+
+
+def _read_matches(
+    file: Path, segments: list[NDArray[np.float64]]
+) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.float64]]:
+    view_of, line_of, observed = [], [], []
+    for line, (number, words) in enumerate(_rows(file)):
+        is_match = [word == "*" or word.isdecimal() for word in words]
+        if len(words) != len(segments) or not all(is_match):
+            raise InputError(
+                f"{len(segments)} row numbers or *, one for each view",
+                f"{' '.join(words)!r} ({file}, line {number})",
+                "repair the line or take the file anew",
+            )
+        for view, word in enumerate(words):
+            if word == "*":
+                continue
+            if int(word) >= len(segments[view]):
+                raise InputError(
+                    f"a segment from 0 to {len(segments[view]) - 1} in view {view}",
+                    f"{word} ({file}, line {number})",
+                    "the matches belong to other segments",
+                )
+            view_of.append(view)
+            line_of.append(line)
+            observed.append(segments[view][int(word)])
+    return np.array(view_of, np.uint32), np.array(line_of, np.uint32), np.array(observed, np.float64).reshape(-1, 4)
+
+
+def _decompose(P: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """K (V, 3, 3) and T_camera_world (V, 7) with P ~ K [R t], focal lengths positive, R a rotation."""
+    K, poses = np.empty((len(P), 3, 3)), np.empty((len(P), 7))
+    for v, given in enumerate(P):
+        signed = given * np.sign(np.linalg.det(given[:, :3]))  # P is known up to scale, also a negative one
+        upper, orthogonal = scipy.linalg.rq(signed[:, :3])
+        signs = np.sign(np.diag(upper))
+        upper, R = upper * signs, signs[:, None] * orthogonal
+        poses[v, :4] = quaternion.from_matrix(R)
+        poses[v, 4:] = scipy.linalg.solve_triangular(upper, signed[:, 3])
+        K[v] = np.triu(upper) / upper[2, 2]
+    return K, poses
