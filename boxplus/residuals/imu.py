@@ -1,0 +1,272 @@
+"""IMU error between two keyframes (SPEC.md 7.5).
+
+States: pose (q, p) of the IMU in the world, and [v, b_a, b_g]; T the duration, R = R(q_i), g gravity pointing down. With α̂, β̂,
+γ̂ corrected for the bias (7.4) and E = γ̂⁻¹ ⊗ q_i⁻¹ ⊗ q_j, its sign such that w ≥ 0, the residual (15) is
+
+    [ Rᵀ(p_j − p_i − v_i T − ½ g T²) − α̂,  Log(E) or 2 E_xyz,  Rᵀ(v_j − v_i − g T) − β̂,  b_aj − b_ai,  b_gj − b_gi ]
+
+Its Jacobians are those of SPEC.md 7.5, with the columns of a pose in the order of its tangent, [θ, p]; q is moved on the right
+and p is added to. `2 E_xyz` saturates at 2 and loses rank at a half turn; Log(E) does neither.
+
+Source: Forster et al., TRO 2017; Qin, Li and Shen, VINS-Mono, TRO 2018; corrections to the derivation in SPEC.md 7.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._jit import kernel
+from boxplus.errors import InputError
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.product import Product
+from boxplus.manifolds.quaternion import UnitQuaternion, exp_scalars, multiply_scalars, rotation_entries
+from boxplus.manifolds.so3 import exp_coefficients, inverse_jacobian_coefficient, log_quaternion
+from boxplus.residuals.imu_preintegration import Preintegration
+from boxplus.residuals.matrix3 import IDENTITY, Matrix3, apply, multiply, polynomial, scaled, transposed
+from boxplus.residuals.residual import Residual
+from boxplus.residuals.whitening import Whitening
+
+POSE = Product(UnitQuaternion, Euclidean(3))
+VELOCITY_BIAS = Euclidean(9)
+NO_JACOBIANS = (np.zeros((0, 15, 6)), np.zeros((0, 15, 9)))
+
+
+@kernel(inline=True)
+def _store(A: Matrix3, J: NDArray[np.float64], n: np.uint64, row: int, column: int) -> None:
+    for i in range(3):
+        for j in range(3):
+            J[n, row + i, column + j] = A[3 * i + j]
+
+
+@kernel(inline=True)
+def _block(A: NDArray[np.float64], n: np.uint64, row: int, column: int) -> Matrix3:
+    return (
+        A[n, row, column],
+        A[n, row, column + 1],
+        A[n, row, column + 2],
+        A[n, row + 1, column],
+        A[n, row + 1, column + 1],
+        A[n, row + 1, column + 2],
+        A[n, row + 2, column],
+        A[n, row + 2, column + 1],
+        A[n, row + 2, column + 2],
+    )
+
+
+@kernel
+def _imu(
+    begin: int,
+    end: int,
+    poses_i: NDArray[np.float64],
+    states_i: NDArray[np.float64],
+    poses_j: NDArray[np.float64],
+    states_j: NDArray[np.float64],
+    pose_i_of: NDArray[np.uint32],
+    state_i_of: NDArray[np.uint32],
+    pose_j_of: NDArray[np.uint32],
+    state_j_of: NDArray[np.uint32],
+    duration_s: NDArray[np.float64],
+    alpha: NDArray[np.float64],
+    gamma_wxyz: NDArray[np.float64],
+    beta: NDArray[np.float64],
+    bias_jacobian: NDArray[np.float64],
+    bias_accel: NDArray[np.float64],
+    bias_gyro: NDArray[np.float64],
+    gravity: NDArray[np.float64],
+    is_log: bool,
+    r: NDArray[np.float64],
+    J_pose_i: NDArray[np.float64],
+    J_state_i: NDArray[np.float64],
+    J_pose_j: NDArray[np.float64],
+    J_state_j: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    with_jacobians: bool,
+) -> None:
+    for n in range(np.uint64(begin), np.uint64(end)):
+        xi, si = poses_i[pose_i_of[n]], states_i[state_i_of[n]]
+        xj, sj = poses_j[pose_j_of[n]], states_j[state_j_of[n]]
+        valid[n] = True
+        T = duration_s[n]
+
+        # What the IMU measured, corrected for the change of bias (7.4).
+        ax, ay, az = si[3] - bias_accel[n, 0], si[4] - bias_accel[n, 1], si[5] - bias_accel[n, 2]
+        gx, gy, gz = si[6] - bias_gyro[n, 0], si[7] - bias_gyro[n, 1], si[8] - bias_gyro[n, 2]
+        J_alpha_a, J_alpha_g = _block(bias_jacobian, n, 0, 0), _block(bias_jacobian, n, 0, 3)
+        J_beta_a, J_beta_g = _block(bias_jacobian, n, 6, 0), _block(bias_jacobian, n, 6, 3)
+        J_theta_g = _block(bias_jacobian, n, 3, 3)
+        alpha_a, alpha_g = apply(J_alpha_a, ax, ay, az), apply(J_alpha_g, gx, gy, gz)
+        beta_a, beta_g = apply(J_beta_a, ax, ay, az), apply(J_beta_g, gx, gy, gz)
+        tx, ty, tz = apply(J_theta_g, gx, gy, gz)
+        ew, ex, ey, ez = exp_scalars(tx, ty, tz)
+        cw, cx, cy, cz = multiply_scalars(gamma_wxyz[n, 0], gamma_wxyz[n, 1], gamma_wxyz[n, 2], gamma_wxyz[n, 3], ew, ex, ey, ez)
+
+        # What the states say, in the first frame.
+        R = rotation_entries(xi[0], xi[1], xi[2], xi[3])
+        Rt = transposed(R)
+        half = 0.5 * T * T
+        dx, dy, dz = apply(
+            Rt,
+            xj[4] - xi[4] - si[0] * T - half * gravity[0],
+            xj[5] - xi[5] - si[1] * T - half * gravity[1],
+            xj[6] - xi[6] - si[2] * T - half * gravity[2],
+        )
+        ux, uy, uz = apply(Rt, sj[0] - si[0] - gravity[0] * T, sj[1] - si[1] - gravity[1] * T, sj[2] - si[2] - gravity[2] * T)
+        w, x, y, z = multiply_scalars(xi[0], -xi[1], -xi[2], -xi[3], xj[0], xj[1], xj[2], xj[3])
+        w, x, y, z = multiply_scalars(cw, -cx, -cy, -cz, w, x, y, z)
+        if w < 0.0:
+            w, x, y, z = -w, -x, -y, -z
+        if is_log:
+            ex, ey, ez = log_quaternion(w, x, y, z)
+        else:
+            ex, ey, ez = 2.0 * x, 2.0 * y, 2.0 * z
+
+        r[n, 0] = dx - (alpha[n, 0] + alpha_a[0] + alpha_g[0])
+        r[n, 1] = dy - (alpha[n, 1] + alpha_a[1] + alpha_g[1])
+        r[n, 2] = dz - (alpha[n, 2] + alpha_a[2] + alpha_g[2])
+        r[n, 3], r[n, 4], r[n, 5] = ex, ey, ez
+        r[n, 6] = ux - (beta[n, 0] + beta_a[0] + beta_g[0])
+        r[n, 7] = uy - (beta[n, 1] + beta_a[1] + beta_g[1])
+        r[n, 8] = uz - (beta[n, 2] + beta_a[2] + beta_g[2])
+        for k in range(3, 9):
+            r[n, 6 + k] = sj[k] - si[k]
+        if not with_jacobians:
+            continue
+
+        if is_log:
+            d = inverse_jacobian_coefficient(ex * ex + ey * ey + ez * ez)
+            E_left = polynomial(1.0, -0.5, d, ex, ey, ez)  # J_l⁻¹(ε)
+            E_right = polynomial(1.0, 0.5, d, ex, ey, ez)  # J_r⁻¹(ε)
+        else:
+            E_left = polynomial(w, -1.0, 0.0, x, y, z)  # ⟨E⟩_R
+            E_right = polynomial(w, 1.0, 0.0, x, y, z)  # ⟨E⟩_L
+        _, b, c = exp_coefficients(tx * tx + ty * ty + tz * tz)
+        minus_Rt = scaled(-1.0, Rt)
+        J_pose_i[n] = 0.0
+        J_state_i[n] = 0.0
+        J_pose_j[n] = 0.0
+        J_state_j[n] = 0.0
+        _store(polynomial(0.0, 1.0, 0.0, dx, dy, dz), J_pose_i, n, 0, 0)
+        _store(minus_Rt, J_pose_i, n, 0, 3)
+        _store(scaled(-1.0, multiply(E_left, transposed(rotation_entries(cw, cx, cy, cz)))), J_pose_i, n, 3, 0)
+        _store(polynomial(0.0, 1.0, 0.0, ux, uy, uz), J_pose_i, n, 6, 0)
+        _store(scaled(T, minus_Rt), J_state_i, n, 0, 0)
+        _store(scaled(-1.0, J_alpha_a), J_state_i, n, 0, 3)
+        _store(scaled(-1.0, J_alpha_g), J_state_i, n, 0, 6)
+        J_right = multiply(polynomial(1.0, -b, c, tx, ty, tz), J_theta_g)  # J_r(δθ_g) J^γ_bg
+        _store(scaled(-1.0, multiply(E_left, J_right)), J_state_i, n, 3, 6)
+        _store(minus_Rt, J_state_i, n, 6, 0)
+        _store(scaled(-1.0, J_beta_a), J_state_i, n, 6, 3)
+        _store(scaled(-1.0, J_beta_g), J_state_i, n, 6, 6)
+        _store(scaled(-1.0, IDENTITY), J_state_i, n, 9, 3)
+        _store(scaled(-1.0, IDENTITY), J_state_i, n, 12, 6)
+        _store(Rt, J_pose_j, n, 0, 3)
+        _store(E_right, J_pose_j, n, 3, 0)
+        _store(Rt, J_state_j, n, 6, 0)
+        _store(IDENTITY, J_state_j, n, 9, 3)
+        _store(IDENTITY, J_state_j, n, 12, 6)
+
+
+class ImuPreintegration(Residual):
+    """Preintegrated IMU samples between keyframes i and j, as derived in the head of this file.
+
+    Rows [α, θ, β, b_a, b_g]: m, rad, m/s, m/s², rad/s, whitened by the covariance of the preintegration.
+    Variables: `T_world_imu_i`, `T_world_imu_j` (7,), wxyz and xyz, on `Product(UnitQuaternion, Euclidean(3))`: rotation and
+    position move apart, unlike on `SE3`; `velocity_bias_i`, `velocity_bias_j` (9,) on `Euclidean(9)`: v_world [m/s],
+    b_a [m/s²], b_g [rad/s]. They come in the order i, i, j, j.
+
+    Args:
+        preintegration: of N intervals.
+        gravity: (3,) in the world frame, pointing down [m/s²].
+        rotation: `log` for Log(E), `vector` for 2 E_xyz, as in the VINS papers.
+
+    Raises:
+        InputError: gravity of another shape; an unknown `rotation`; an interval of a single step, whose covariance is
+            singular.
+    """
+
+    def __init__(
+        self,
+        preintegration: Preintegration,
+        *,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        rotation: Literal["log", "vector"] = "log",
+    ) -> None:
+        if rotation not in ("log", "vector"):
+            raise InputError('rotation "log" or "vector"', repr(rotation), 'leave it out for "log"')
+        self.rotation = rotation
+        self.gravity = np.array(gravity, dtype=np.float64)
+        if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
+            raise InputError("gravity as three finite numbers", repr(gravity), "give (0, 0, -9.81) in a world with z up")
+        super().__init__(
+            dim=15,
+            count=len(preintegration),
+            manifolds=(POSE, VELOCITY_BIAS, POSE, VELOCITY_BIAS),
+            roles=("T_world_imu_i", "velocity_bias_i", "T_world_imu_j", "velocity_bias_j"),
+            whitening=_whitening(preintegration),
+        )
+        self._set(preintegration)
+
+    def refresh(self, velocity_bias_i: ArrayLike) -> int:
+        """Integrate anew, at these biases, what moved too far from those of its integration (SPEC.md 7.4).
+
+        Residuals and whitening jump a little, so that it is called between solves, not within one.
+
+        Args:
+            velocity_bias_i: (N, 9) the present value for every residual.
+
+        Returns:
+            intervals integrated anew.
+        """
+        state = np.broadcast_to(np.asarray(velocity_bias_i, dtype=np.float64), (self.count, 9))
+        stale = self.preintegration.is_stale(state[:, 3:6], state[:, 6:])
+        if stale.any():
+            preintegration = self.preintegration.reintegrated(state[:, 3:6], state[:, 6:], stale)
+            self.whitening = _whitening(preintegration)
+            self._set(preintegration)
+        return int(stale.sum())
+
+    def _set(self, preintegration: Preintegration) -> None:
+        self.preintegration, p = preintegration, preintegration
+        self._terms = (
+            p.duration_s, p.alpha, p.gamma_wxyz, p.beta, p.bias_jacobian, p.bias_accel, p.bias_gyro,
+            self.gravity, self.rotation == "log",
+        )  # fmt: skip
+
+    def linearize_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.linearize_into`."""
+        _imu(begin, end, *x, *index, *self._terms, r, *jacobians, valid, True)
+
+    def evaluate_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """See `Residual.evaluate_into`."""
+        _imu(begin, end, *x, *index, *self._terms, r, *NO_JACOBIANS, *NO_JACOBIANS, valid, False)
+
+
+def _whitening(preintegration: Preintegration) -> Whitening:
+    single = preintegration.steps < 2
+    if single.any():
+        raise InputError(
+            "at least two steps between IMU samples in every interval",
+            f"{preintegration.steps[np.argmax(single)]} in interval {np.argmax(single)}",
+            "position and velocity share the noise of a single step: take keyframes further apart",
+        )
+    return Whitening.of(15, len(preintegration), covariance=preintegration.covariance)

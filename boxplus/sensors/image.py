@@ -1,0 +1,77 @@
+"""What a camera delivers to direct methods: a grey image, and its pyramid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
+from boxplus.residuals.photometric_sampling import checked_image
+
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """Grey values on a grid, u to the right, v down, pixel centres at integers.
+
+    Attributes:
+        grey: (height, width) float32, finite, in any unit.
+    """
+
+    grey: NDArray[np.float32]
+
+    @classmethod
+    def from_array(cls, values: ArrayLike) -> Image:
+        """From grey values (H, W), or from colours (H, W, 3 or 4): red, green, blue, and an alpha that is left out.
+
+        Raises:
+            InputError: another shape, fewer than 2×2 pixels, or values that are not finite.
+        """
+        array = np.asarray(values)
+        if array.ndim == 3 and array.shape[2] in (3, 4):
+            array = array[..., :3].astype(np.float32) @ _LUMA
+        return cls(checked_image("image", array))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.grey.shape[0], self.grey.shape[1]
+
+    def half(self) -> Image:
+        """The image at half the resolution: means of 2×2 pixels; an odd last row or column is left out."""
+        blocks = two_by_two(self.grey)
+        return Image(np.ascontiguousarray(blocks.mean(axis=(1, 3), dtype=np.float32)))
+
+    def pyramid(self, levels: int) -> list[Image]:
+        """This image and its halves, finest first.
+
+        Raises:
+            InputError: more levels than the image can be halved, or none.
+        """
+        if levels < 1 or min(self.shape) >> (levels - 1) < 2:
+            raise InputError(
+                f"1 to {min(self.shape).bit_length() - 1} levels of an image of {self.shape[1]}×{self.shape[0]} pixels",
+                f"{levels}",
+                "the coarsest level still needs 2×2 pixels",
+            )
+        images = [self]
+        while len(images) < levels:
+            images.append(images[-1].half())
+        return images
+
+
+def two_by_two(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A view (H // 2, 2, W // 2, 2) of (H, W): axes 1 and 3 run within a block of 2×2 pixels."""
+    height, width = values.shape[0] // 2, values.shape[1] // 2
+    return values[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+
+
+def half_camera(camera: Pinhole) -> Pinhole:
+    """The camera of the image at half the resolution: u' = (u + ½)/2 − ½, as pixel centres are at integers."""
+    return replace(
+        camera, fx=0.5 * camera.fx, fy=0.5 * camera.fy, cx=0.5 * (camera.cx + 0.5) - 0.5, cy=0.5 * (camera.cy + 0.5) - 0.5
+    )
