@@ -22,6 +22,9 @@ PLANE = 13
 # the rings lie far apart, the neighbours must spread across their longest extent by this sum of squares [m²].
 _MIN_SPREAD = 0.1
 _FAR = 15.0  # m
+# Where such a line turns a corner its points do spread, still within the plane of the beams. No beam comes back from a surface
+# it lies in: the sine of the angle between a point's ray and its plane must exceed this.
+_GRAZING = 0.04
 # A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
 _SLACK = 1.0 + 1e-5
 
@@ -89,7 +92,9 @@ def match_planes(
         ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
         rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
         range_sq = rx * rx + ry * ry + rz * rz
-        if fit[8] < _MIN_SPREAD * min(1.0, range_sq * range_sq / _FAR**4):
+        along_normal = ux * rx + uy * ry + uz * rz
+        too_thin = fit[8] < _MIN_SPREAD * min(1.0, range_sq * range_sq / _FAR**4)
+        if too_thin or along_normal * along_normal < _GRAZING * _GRAZING * range_sq:
             fate[n] = ONE_LINE
             continue
         fate[n] = USED

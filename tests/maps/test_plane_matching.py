@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import NavState
-from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, USED
+from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
@@ -17,6 +17,7 @@ from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 
 MAX_DISTANCE = 0.8
 THRESHOLD = 0.1
+GRAZING = 0.04  # sine of the least angle between a ray and the plane it hits
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -95,13 +96,34 @@ def test_against_brute_force(seed: int, far: bool) -> None:
         if match.fate[n] == NOT_A_PLANE:
             assert distance > THRESHOLD - 1e-4 or singular[1] < 0.051 * singular[0]
             continue
+        ray = y - (x.R_world_imu @ x.p_imu_lidar + x.p_world_imu)
+        sine = abs(Vt[2] @ ray) / np.linalg.norm(ray)
+        if match.fate[n] == ONE_LINE:
+            assert sine < GRAZING + 2e-3
+            continue
         assert match.fate[n] == USED
+        assert sine > GRAZING - 2e-3 or singular[1] - singular[2] < 0.05
         assert distance < THRESHOLD + 1e-4
         if singular[1] - singular[2] > 0.05:
             u = match.planes[n, :3]
             assert np.isclose(abs(u @ Vt[2]), 1.0, atol=1e-5)
             assert np.isclose(match.planes[n, 3], u @ centroid, atol=2e-3 if far else 1e-4)
             assert np.isclose(match.planes[n, 4], singular[2] ** 2 / 2.0, atol=1e-4)
+
+
+def test_a_ring_around_a_corner_is_not_taken_for_a_floor() -> None:
+    """Two walls that meet at (20, 20), seen by the one horizontal ring of a LiDAR at the origin."""
+    along = np.arange(15.0, 20.0, 0.4)
+    wall = np.full_like(along, 20.0)
+    ring = np.concatenate([np.stack([along, wall, 0.0 * wall], axis=1), np.stack([wall, along, 0.0 * wall], axis=1)])
+    ring += 0.02 * np.random.default_rng(0).normal(size=ring.shape) * (1.0, 1.0, 0.0)
+    match = _match(IkdTree(ring), NavState.identity(), ring.astype(np.float32))
+    assert (match.fate != USED).all()
+    # A second ring makes planes of both walls.
+    match = _match(IkdTree(np.concatenate([ring, ring + (0.0, 0.0, 0.5)])), NavState.identity(), ring.astype(np.float32))
+    used = match.fate == USED
+    assert used.mean() > 0.5
+    assert (np.abs(match.planes[used, 2]) < 0.3).all()
 
 
 @settings(max_examples=15)
