@@ -12,6 +12,7 @@ import numpy as np
 
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.sensors.time_steps import TimeSteps
 
 _GYRO_LIMIT, _ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
 _LONGEST_SCAN_NS = 1_000_000_000
@@ -63,6 +64,12 @@ class Sequencer:
         self._newest_scan_end_ns: int | None = None
         self._imu_jumps = 0
         self._scan_jumps = 0
+        self._imu_steps, self._scan_steps = TimeSteps("IMU"), TimeSteps("LiDAR")
+
+    @property
+    def time_steps(self) -> list[str]:
+        """Where times stepped back for a second or more, and how much was left out: one sentence each."""
+        return self._scan_steps.sentences() + self._imu_steps.sentences()
 
     def add_imu(self, samples: ImuSamples) -> None:
         """Take samples in; non-finite ones and those that do not move forward in time are counted and left out."""
@@ -70,6 +77,7 @@ class Sequencer:
             return
         if self._in_order(samples):
             self._imu_jumps = 0
+            self._imu_steps.went_on()
             self._last_imu_ns = int(samples.time_ns[-1])
             self._imu.append(samples)
         else:
@@ -100,12 +108,14 @@ class Sequencer:
                 continue
             if last is not None and now < last:
                 self.rejected["IMU sample going back in time"] += 1
+                self._imu_steps.went_back(now, last)
                 continue
             if last is not None and now - last > self._max_jump_ns and self._imu_jumps < self._MAX_JUMP_PROOF:
                 self._imu_jumps += 1
                 self.rejected["IMU sample jumping ahead in time"] += 1
                 continue
             self._imu_jumps = 0
+            self._imu_steps.went_on()
             self._last_imu_ns = now
             keep[i] = True
         if keep.any():
@@ -125,6 +135,7 @@ class Sequencer:
                 return
             if scan.end_ns < newest:
                 self.rejected["scan going back in time"] += 1
+                self._scan_steps.went_back(scan.end_ns, newest)
                 return
             # Where the IMU has gone as far, the time has really passed.
             ahead = scan.end_ns - max(newest, self._last_imu_ns or newest)
@@ -133,6 +144,7 @@ class Sequencer:
                 self.rejected["scan jumping ahead in time"] += 1
                 return
         self._scan_jumps = 0
+        self._scan_steps.went_on()
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)
 

@@ -76,6 +76,11 @@ class LidarInertialOdometry:
         """What could not be used before it reached the filter, by reason."""
         return Counter({reason: count for reason, count in self._sequencer.rejected.items() if count})
 
+    @property
+    def time_steps(self) -> list[str]:
+        """Where the times of a sensor stepped back for good, and how much of it was left out: one sentence each."""
+        return self._sequencer.time_steps
+
     def push_imu(self, samples: ImuSamples) -> list[Estimate]:
         """Take IMU samples; returns the estimates that became ready."""
         self._sequencer.add_imu(samples)

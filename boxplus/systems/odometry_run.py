@@ -237,6 +237,7 @@ class _Run:
     def _nothing_found(self) -> InputError:
         statistics = self._statistics
         reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
+        reasons += self._odometry.time_steps
         if self._odometry.start_problem:
             reasons.append(self._odometry.start_problem)
         return InputError(
@@ -306,6 +307,7 @@ class _Run:
             ),
             peak_memory_mb=_peak_memory_mb(),
             warnings=[
+                *(WarningFacts(text=text, count=1) for text in self._odometry.time_steps),
                 *statistics.status_warnings(),
                 *statistics.warnings.facts(origin),
                 *(

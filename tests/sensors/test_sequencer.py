@@ -208,3 +208,49 @@ def test_without_any_sample_a_scan_is_counted() -> None:
     sequencer.add_scan(_scan(0, 100))
     assert sequencer.frames(flush=True) == []
     assert sequencer.rejected["scan without any IMU sample"] == 1
+
+
+def _feed(sequencer: Sequencer, begin_ms: float, seconds: float) -> list[Frame]:
+    frames = []
+    for k in range(round(10 * seconds)):
+        now = begin_ms + 100.0 * k
+        sequencer.add_imu(_imu(*np.arange(now, now + 100.0, 10.0)))
+        sequencer.add_scan(_scan(now, now + 99.0))
+        frames += sequencer.frames()
+    return frames
+
+
+def test_times_that_step_back_for_good_are_told() -> None:
+    sequencer = Sequencer()
+    _feed(sequencer, 0.0, 3.0)
+    assert sequencer.time_steps == []
+    assert _feed(sequencer, -60_000.0, 0.9) == []
+    assert sequencer.time_steps == []  # not yet: samples out of order
+    assert _feed(sequencer, -59_100.0, 4.1) == []
+    lidar, imu = sequencer.time_steps
+    assert lidar.startswith(
+        "the times of the LiDAR step back by 62.900 s after 1700000002.999 s and go on from there: 4.9 s of it"
+    )
+    assert imu.startswith("the times of the IMU step back by 62.990 s after 1700000002.990 s and go on from there: 5.0 s of it")
+    assert "split the recording there" in lidar
+
+
+def test_a_stretch_that_comes_twice_is_told_and_left_out() -> None:
+    sequencer = Sequencer()
+    first = _feed(sequencer, 0.0, 5.0)
+    again = _feed(sequencer, 2000.0, 5.0)  # of which three seconds were there before
+    assert len(first) + len(again) >= 68
+    assert [text.split(" and ")[0] for text in sequencer.time_steps] == [
+        "the times of the LiDAR step back by 2.900 s after 1700000004.999 s",
+        "the times of the IMU step back by 2.990 s after 1700000004.990 s",
+    ]
+
+
+def test_single_samples_out_of_order_are_only_counted() -> None:
+    sequencer = Sequencer()
+    for k in range(200):
+        sequencer.add_imu(_imu(10.0 * k, 10.0 * k - 25.0))
+        sequencer.add_scan(_scan(10.0 * k, 10.0 * k + 9.0))
+        sequencer.add_scan(_scan(10.0 * k - 50.0, 10.0 * k - 41.0))
+    assert sequencer.rejected["IMU sample going back in time"] == sequencer.rejected["scan going back in time"] == 200
+    assert sequencer.time_steps == []

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +22,10 @@ from boxplus.formats.pcd import read_pcd
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.maps.tile_store import TileStore
-from boxplus.recordings.recording import Recording
+from boxplus.recordings.recording import Event, Recording
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation import Fault, SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems import odometry_run
 from boxplus.systems.odometry_run import Progress, run_odometry
@@ -318,3 +320,25 @@ def test_extrinsic_without_any_turn_is_identity_with_the_reason() -> None:
     assert extrinsic.source == "identity"
     np.testing.assert_array_equal(extrinsic.T_imu_lidar, np.eye(4))
     assert "identity assumed" in extrinsic.warning
+
+
+def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
+    simulation = simulate("walk", duration_s=4.0, lidar=LIDAR)
+    middle_ns = (simulation.start_ns + simulation.end_ns) // 2
+    hour_ns = 3600 * 10**9
+
+    def step_back(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, Scan):
+                shift = -hour_ns * (event.start_ns > middle_ns)
+                yield replace(event, time_ns=event.time_ns + shift, start_ns=event.start_ns + shift, end_ns=event.end_ns + shift)
+            else:
+                yield replace(event, time_ns=event.time_ns - hour_ns * (event.time_ns > middle_ns))
+
+    summary = run_odometry(as_recording(simulation, Fault("step", "the clock steps back", step_back)), tmp_path / "out")
+    assert summary.state == "finished" and 15 <= summary.scans <= 21
+    lidar, imu = (warning.text for warning in summary.warnings[:2])
+    assert re.match(
+        r"the times of the LiDAR step back by 3599\.9\d* s after \d+\.\d+ s and go on from there: 1\.\d s of it", lidar
+    )
+    assert re.match(r"the times of the IMU step back by (3600\.0|3599\.9)\d* s after", imu)
