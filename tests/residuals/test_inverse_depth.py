@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from central_differences import assert_jacobians
 from numpy.typing import NDArray
 
 from boxplus.cameras import Pinhole, Radial, RadialTangential
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
-from boxplus.manifolds.se3 import SE3Left
+from boxplus.manifolds.se3 import SE3, SE3Left
+from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.residuals.inverse_depth import InverseDepthReprojection
 from boxplus.residuals.inverse_depth_intrinsics import InverseDepthIntrinsics
+from boxplus.residuals.residual import Residual
 
 CAMERA = Pinhole(420.0, 430.0, 310.0, 245.0)
 LENS = Pinhole(420.0, 430.0, 310.0, 245.0, RadialTangential(-0.21, 0.06, 1e-3, -2e-3, 0.02))
 COUNT = 40
+
+
+def assert_jacobians(residual: Residual, *x: NDArray[np.float64]) -> None:
+    """Against differences far from zero residual, poses moved on the left, where they are derived, and on the right."""
+    sides = {residual.manifolds, tuple(SE3 if m == SE3Left else m for m in residual.manifolds)}
+    for manifolds in sides:
+        report = check_jacobian(residual, *x, manifolds=manifolds)
+        assert report.passed and report.invalid == report.unsteady == 0 and report.largest_residual > 1.0, str(report)
 
 
 def views(seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

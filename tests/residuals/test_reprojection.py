@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from central_differences import assert_jacobians
 from numpy.typing import NDArray
 
 from boxplus.cameras import Pinhole, Radial, RadialTangential
@@ -15,10 +14,12 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.se3 import SE3Left
+from boxplus.manifolds.se3 import SE3, SE3Left
+from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
 from boxplus.residuals.reprojection import Reprojection
 from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
+from boxplus.residuals.residual import Residual
 
 CAMERAS = [
     Pinhole(420.0, 430.0, 310.0, 245.0),
@@ -27,6 +28,14 @@ CAMERAS = [
     Pinhole(420.0, 430.0, 310.0, 245.0, RadialTangential(-0.21, 0.06, 1e-3, -2e-3, 0.02)),
 ]
 by_model = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{len(c.parameters)} intrinsics")
+
+
+def assert_jacobians(residual: Residual, *x: NDArray[np.float64]) -> None:
+    """Against differences far from zero residual, poses moved on the left, where they are derived, and on the right."""
+    sides = {residual.manifolds, tuple(SE3 if m == SE3Left else m for m in residual.manifolds)}
+    for manifolds in sides:
+        report = check_jacobian(residual, *x, manifolds=manifolds)
+        assert report.passed and report.invalid == report.unsteady == 0 and report.largest_residual > 1.0, str(report)
 
 
 def poses_and_points(seed: int, count: int, side: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
