@@ -167,7 +167,7 @@ class Preintegration:
     @property
     def duration_s(self) -> NDArray[np.float64]:
         """T of every interval (N,) [s]."""
-        seconds: NDArray[np.float64] = (self.intervals_ns[:, 1] - self.intervals_ns[:, 0]) * 1e-9
+        seconds: NDArray[np.float64] = (self.intervals_ns[:, 1] - self.intervals_ns[:, 0]).astype(np.float64) * 1e-9
         return seconds
 
     @property

@@ -1,0 +1,171 @@
+"""The IMU error: SPEC.md 7.5 in NumPy, its Jacobians, and the scale of what is whitened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from imu_streams import random_stream
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion, so3
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.jacobian_check import check_jacobian
+from boxplus.residuals.imu import POSE, VELOCITY_BIAS, ImuPreintegration
+from boxplus.residuals.imu_preintegration import ImuNoise, Preintegration
+
+NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
+GRAVITY = np.array([0.3, -0.2, -9.7])
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def preintegration(seed: int, count: int = 6) -> Preintegration:
+    stream = random_stream(seed, 60)
+    rng = np.random.default_rng(seed)
+    begin = stream[0][0] + rng.integers(0, 300_000_000, count)
+    return Preintegration.integrate(
+        *stream,
+        noise=NOISE,
+        intervals_ns=np.stack([begin, begin + rng.integers(150_000_000, 400_000_000, count)], axis=1),
+        bias_accel=rng.normal(size=(count, 3)) * 0.2,
+        bias_gyro=rng.normal(size=(count, 3)) * 0.1,
+    )
+
+
+def random_states(seed: int, count: int = 6) -> list[NDArray[np.float64]]:
+    """Poses anywhere, velocities and biases that have nothing to do with the samples: far from zero residual."""
+    rng = np.random.default_rng(seed + 1)
+    return [
+        POSE.random(rng, count),
+        VELOCITY_BIAS.random(rng, count) * np.repeat([2.0, 0.3, 0.1], 3),
+        POSE.random(rng, count),
+        VELOCITY_BIAS.random(rng, count) * np.repeat([2.0, 0.3, 0.1], 3),
+    ]
+
+
+@pytest.mark.parametrize("rotation", ["log", "vector"])
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=8)
+def test_jacobians(rotation: str, seed: int) -> None:
+    residual = ImuPreintegration(preintegration(seed), gravity=GRAVITY, rotation=rotation)  # type: ignore[arg-type]
+    for manifolds in (residual.manifolds, (SE3, VELOCITY_BIAS, SE3, VELOCITY_BIAS)):
+        report = check_jacobian(residual, *random_states(seed), manifolds=manifolds)
+        assert report.passed and report.invalid == report.unsteady == 0 and report.largest_residual > 0.5, str(report)
+
+
+@pytest.mark.parametrize("rotation", ["log", "vector"])
+def test_residual_is_the_formula(rotation: str) -> None:
+    p = preintegration(3)
+    (pose_i, state_i, pose_j, state_j) = x = random_states(3)
+    found = ImuPreintegration(p, gravity=GRAVITY, rotation=rotation).evaluate(*x)  # type: ignore[arg-type]
+    alpha, gamma, beta = p.corrected(state_i[:, 3:6], state_i[:, 6:])
+    Rt = quaternion.to_matrix(pose_i[:, :4]).swapaxes(1, 2)
+    T = p.duration_s[:, None]
+    up = -GRAVITY
+    moved = pose_j[:, 4:] - pose_i[:, 4:] - state_i[:, :3] * T + 0.5 * up * T**2
+    q = quaternion.multiply(pose_i[:, :4] * CONJUGATE, pose_j[:, :4])
+    E = quaternion.multiply(gamma * CONJUGATE, q)
+    E *= np.where(E[:, :1] < 0.0, -1.0, 1.0)
+    turned = 2.0 * E[:, 1:] if rotation == "vector" else so3.log(quaternion.to_matrix(E))
+    np.testing.assert_allclose(found[:, 0:3], np.einsum("nij,nj->ni", Rt, moved) - alpha, atol=1e-12)
+    np.testing.assert_allclose(found[:, 3:6], turned, atol=1e-12)
+    faster = state_j[:, :3] - state_i[:, :3] + up * T
+    np.testing.assert_allclose(found[:, 6:9], np.einsum("nij,nj->ni", Rt, faster) - beta, atol=1e-12)
+    np.testing.assert_allclose(found[:, 9:], state_j[:, 3:] - state_i[:, 3:], atol=1e-15)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=10)
+def test_predicted_states_have_no_error(seed: int) -> None:
+    p = preintegration(seed)
+    pose_i, state_i, _, _ = random_states(seed)
+    pose_j, state_j = p.predict(pose_i, state_i, GRAVITY)
+    for rotation in ("log", "vector"):
+        residual = ImuPreintegration(p, gravity=GRAVITY, rotation=rotation)  # type: ignore[arg-type]
+        assert np.abs(residual.evaluate(pose_i, state_i, pose_j, state_j)).max() < 1e-13
+    # q and −q are the same rotation.
+    pose_j[:, :4] *= -1.0
+    assert np.abs(residual.evaluate(pose_i, state_i, pose_j, state_j)).max() < 1e-13
+
+
+def test_two_exyz_is_log_for_small_errors_and_saturates() -> None:
+    p = preintegration(5)
+    pose_i, state_i, _, _ = random_states(5)
+    pose_j, state_j = p.predict(pose_i, state_i)
+    for angle, largest in ((1e-3, 1e-9), (2.0, 0.4)):
+        delta = np.zeros(6)
+        delta[0] = angle
+        x = pose_i, state_i, POSE.boxplus(pose_j, delta), state_j
+        log, vector = (ImuPreintegration(p, rotation=name).evaluate(*x)[:, 3] for name in ("log", "vector"))  # type: ignore[arg-type]
+        np.testing.assert_allclose(log, angle, atol=1e-12)
+        np.testing.assert_allclose(vector, 2.0 * np.sin(0.5 * angle), atol=1e-12)
+        assert (np.abs(log - vector) < largest).all()
+
+
+def test_whitened_residual_has_the_right_scale() -> None:
+    """Simulated noise, shared between neighbouring steps as it is: squared whitened errors are χ² with 15 degrees of freedom."""
+    intervals, steps, dt = 600, 100, 0.005
+    rng = np.random.default_rng(0)
+    count = intervals * steps + 1
+    time_ns = np.arange(count, dtype=np.int64) * 5_000_000
+    s = np.arange(count) * dt
+    gyro = np.stack([np.sin(1.3 * s), 0.8 * np.cos(0.7 * s), 0.5 * np.sin(2.1 * s + 1.0)], axis=1)
+    accel = np.stack([2.0 * np.sin(0.9 * s), np.cos(1.7 * s), 9.8 + np.sin(s)], axis=1)
+    noise = ImuNoise(gyro=2e-3, accel=2e-2, gyro_walk=1e-3, accel_walk=1e-2)
+    bias_gyro = np.cumsum(rng.normal(size=(count, 3)) * noise.gyro_walk * np.sqrt(dt), axis=0)
+    bias_accel = np.cumsum(rng.normal(size=(count, 3)) * noise.accel_walk * np.sqrt(dt), axis=0)
+    measured_gyro = gyro + bias_gyro + rng.normal(size=(count, 3)) * noise.gyro / np.sqrt(dt)
+    measured_accel = accel + bias_accel + rng.normal(size=(count, 3)) * noise.accel / np.sqrt(dt)
+    begin, end = np.arange(0, count - 1, steps), np.arange(steps, count, steps)
+    times = np.stack([time_ns[begin], time_ns[end]], axis=1)
+    truth = Preintegration.integrate(time_ns, gyro, accel, noise=noise, intervals_ns=times)
+    pose_i, v_i = POSE.random(rng, intervals), rng.normal(size=(intervals, 3))
+    pose_j, state_j = truth.predict(pose_i, np.hstack([v_i, np.zeros((intervals, 6))]))
+    nees = {}
+    for mode in ("merged", "independent"):
+        measured = Preintegration.integrate(
+            time_ns, measured_gyro, measured_accel, noise=noise, intervals_ns=times,
+            bias_accel=bias_accel[begin], bias_gyro=bias_gyro[begin], mode=mode,  # type: ignore[arg-type]
+        )  # fmt: skip
+        residual = ImuPreintegration(measured)
+        e = residual.evaluate(
+            pose_i,
+            np.hstack([v_i, bias_accel[begin], bias_gyro[begin]]),
+            pose_j,
+            np.hstack([state_j[:, :3], bias_accel[end], bias_gyro[end]]),
+        )
+        whitened = np.einsum("nij,nj->ni", residual.whitening.factors, e)
+        nees[mode] = (whitened**2).sum() / intervals
+    low, high = chi2.ppf([0.025, 0.975], 15 * intervals) / intervals
+    assert low < nees["merged"] < high
+    assert nees["independent"] > 1.4 * high  # variances of half the size in nine of fifteen rows
+
+
+def test_refresh_integrates_anew_what_moved() -> None:
+    p = preintegration(7)
+    residual = ImuPreintegration(p)
+    state = np.hstack([np.zeros((6, 3)), p.bias_accel, p.bias_gyro])
+    assert residual.refresh(state) == 0 and residual.preintegration is p
+    state[2, 3] += 0.2
+    state[4, 8] -= 0.02
+    assert residual.refresh(state) == 2
+    expected = p.reintegrated(state[:, 3:6], state[:, 6:])
+    assert np.array_equal(residual.preintegration.alpha, expected.alpha)
+    assert np.array_equal(residual.whitening.factors, ImuPreintegration(expected).whitening.factors)
+    x = random_states(7)
+    assert np.array_equal(residual.evaluate(*x), ImuPreintegration(expected).evaluate(*x))
+
+
+def test_refusals() -> None:
+    stream = random_stream(9, 5)
+    single = Preintegration.integrate(*stream, noise=NOISE, intervals_ns=(stream[0][1], stream[0][2]))
+    with pytest.raises(InputError, match="at least two steps between IMU samples in every interval – got 1 in interval 0"):
+        ImuPreintegration(single)
+    p = preintegration(1)
+    with pytest.raises(InputError, match="gravity as three finite numbers"):
+        ImuPreintegration(p, gravity=9.81)
+    with pytest.raises(InputError, match='rotation "log" or "vector"'):
+        ImuPreintegration(p, rotation="euler")  # type: ignore[arg-type]
