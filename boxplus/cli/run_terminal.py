@@ -88,7 +88,7 @@ class RunTerminal:
     def print_results(self, summary: RunSummary, folder: Path) -> None:
         """The facts of the run, its warnings and its files."""
         console, timing = self._console, summary.timing
-        style = "green" if summary.state == "finished" else "yellow"
+        style = "green" if summary.state == "finished" and summary.contradiction is None else "yellow"
         console.print(Text(summary.describe_state(), style))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")

@@ -125,10 +125,11 @@ def _head(data: RunData) -> str:
         (f"{summary.map.stored_points:,}", "map points"),
     ]
     tiles = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for value, name in numbers)
+    color = summary.state if summary.contradiction is None else "failed"
     told = summary.describe_state().removeprefix(summary.state).lstrip(": ")
     return (
         f"<h1>{escape(Path(summary.recording.path).name)}</h1>"
-        f'<p class="lead"><span class="state {summary.state}">{summary.state}</span> {escape(told)} · '
+        f'<p class="lead"><span class="state {color}">{summary.state}</span> {escape(told)} · '
         f"{escape(summary.recording.format)} · boxplus {escape(summary.versions['boxplus'])} · "
         f"{summary.started:%Y-%m-%d %H:%M} UTC</p>"
         f'<div class="figures">{tiles}</div>'

@@ -39,6 +39,9 @@ class Consistency:
 
     Args:
         min_matched_share: with less than this share of the points on the map, three scans in a row, the estimate is lost.
+
+    Attributes:
+        contradiction: what the last comparison of gyroscope and LiDAR found wrong, a sentence; None while they agree.
     """
 
     def __init__(self, min_matched_share: float) -> None:
@@ -50,6 +53,7 @@ class Consistency:
         self._until_check = 0
         self._previous_start_ns: int | None = None
         self._told: set[str] = set()
+        self.contradiction: str | None = None
 
     @property
     def lost(self) -> bool:
@@ -98,6 +102,8 @@ class Consistency:
         except InputError:
             return []
         text = judge_unit(found) or (judge_mounting(found, R_imu_lidar) if mounting_too else None)
+        if text is not None or mounting_too:
+            self.contradiction = text
         return [] if text is None else [text]
 
     def _span(self, frame: Frame) -> list[str]:

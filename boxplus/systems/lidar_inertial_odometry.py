@@ -77,6 +77,11 @@ class LidarInertialOdometry:
         return Counter({reason: count for reason, count in self._sequencer.rejected.items() if count})
 
     @property
+    def contradiction(self) -> str | None:
+        """What makes the estimate not to be trusted, whatever its status: gyroscope and LiDAR turn differently; a sentence."""
+        return self._consistency.contradiction
+
+    @property
     def time_steps(self) -> list[str]:
         """Where the times of a sensor stepped back for good, and how much of it was left out: one sentence each."""
         return self._sequencer.time_steps

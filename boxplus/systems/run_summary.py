@@ -127,6 +127,7 @@ class RunSummary(_Part):
     last_time_ns: int | None = None
     duration_s: float = Field(0.0, description="between the first and the last estimate [s]")
     path_length_m: float = Field(0.0, description="sum of the distances between successive estimates")
+    contradiction: str | None = Field(None, description="how gyroscope and LiDAR contradict each other, whatever the status")
     scans_read: int = 0
     imu_samples_read: int = 0
     rejected: dict[str, dict[str, int]] = Field(
@@ -150,7 +151,11 @@ class RunSummary(_Part):
             file.write(self.model_dump_json(indent=2).encode())
 
     def describe_state(self) -> str:
-        """One sentence on how far the run came."""
+        """One sentence on how far the run came, and whether the sensors contradict each other."""
+        doubt = "" if self.contradiction is None else f"; not to be trusted: {self.contradiction}"
+        return self._describe_progress() + doubt
+
+    def _describe_progress(self) -> str:
         reached = f"{self.scans} scans" + (f" ({self.duration_s:.1f} s)" if self.scans else "")
         if self.state == "finished":
             return f"finished: {reached}"

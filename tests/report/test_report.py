@@ -77,6 +77,17 @@ def test_a_killed_run_is_counted_by_its_rows(folder: Path, tmp_path: Path) -> No
     assert f"after at least {finished.scans - 1} scans" in text
 
 
+def test_a_contradiction_stands_in_the_headline(folder: Path, tmp_path: Path) -> None:
+    doubted = tmp_path / "doubted"
+    shutil.copytree(folder, doubted)
+    summary = read_summary(doubted / "run.json").model_copy(update={"contradiction": "gyroscope and LiDAR turn about other axes"})
+    summary.write(doubted / "run.json")
+    assert summary.describe_state().endswith(" s); not to be trusted: gyroscope and LiDAR turn about other axes")
+    text = write_report(doubted).read_text(encoding="utf-8")
+    assert '<span class="state failed">finished</span>' in text
+    assert "not to be trusted: gyroscope and LiDAR turn about other axes" in text
+
+
 def test_page_is_self_contained_and_has_its_sections(folder: Path) -> None:
     report = write_report(folder)
     text = report.read_text(encoding="utf-8")

@@ -162,6 +162,7 @@ def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
     named = [text for text in failed.warnings if "times as far as the LiDAR: it reports deg/s; convert it to rad/s" in text]
     assert named
     assert failed.estimates[-1].status == "lost"
+    assert failed.odometry.contradiction in named
     assert any("the estimate has left the map and is not to be trusted" in text for text in failed.warnings)
     first_warning = next(e.time_ns for e in failed.estimates if e.warnings)
     wrong_by_a_metre = failed.estimates[int(np.argmax(failed.distance > 1.0))].time_ns
@@ -172,6 +173,8 @@ def test_inverted_extrinsic_is_named() -> None:
     failed = walk(faults.inverted_extrinsic())
     assert any("under the given T_imu_lidar" in text for text in failed.warnings)
     assert any("its inverse fits" in text and "T_imu_lidar maps LiDAR coordinates to IMU" in text for text in failed.warnings)
+    # The points fit the map all the same, so that the status says nothing: the run itself does.
+    assert failed.odometry.contradiction in failed.warnings
 
 
 def test_saturated_accelerometer(healthy: Run) -> None:
