@@ -34,7 +34,7 @@ class Problem:
     def __init__(self) -> None:
         self.blocks: list[Variables] = []
         self.groups: list[Group] = []
-        self._analysed: tuple[tuple[Any, ...], LeastSquares, float] | None = None
+        self._analysed: tuple[tuple[Any, ...], LeastSquares, tuple[str, ...]] | None = None
 
     def add_variables(self, manifold: Manifold, values: ArrayLike, *, name: str | None = None) -> Variables:
         """A block of n variables.
@@ -132,7 +132,7 @@ class Problem:
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
         options = options if options is not None else SolverOptions(**settings)
-        model, analysis = self._analyse(options)
+        model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0
         model.start(self._values(start))
@@ -152,7 +152,7 @@ class Problem:
             method=strategy.name,
             linear_solver=model.system.description,
             invalid={group.name: int((~group.counted).sum()) for group in self.groups},
-            notes=tuple(self.defects()),
+            notes=notes,
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )
@@ -172,18 +172,17 @@ class Problem:
             checked.append(np.where(block.is_fixed[:, None], block.values, block.manifold.check(block.name, array)))
         return checked
 
-    def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, float]:
-        key = (options.linear_solver, options.threads)
-        if self._analysed is not None and self._analysed[0] == key:
-            return self._analysed[1], 0.0
+    def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, tuple[str, ...], float]:
+        """The problem as the solvers see it, what is wrong with its structure, and the seconds this took."""
         begin = time.perf_counter()
-        if not self.groups:
-            raise InputError("at least one group of residuals", "none", "call `add_residuals` first")
-        layout = Layout(self.blocks)
-        if layout.dof == 0:
-            raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
-        system = choose_system(layout, self.groups, options)
-        model = LeastSquares(layout, self.groups, system, options.threads)
-        elapsed = time.perf_counter() - begin
-        self._analysed = (key, model, elapsed)
-        return model, elapsed
+        key = (options.linear_solver, options.threads)
+        if self._analysed is None or self._analysed[0] != key:
+            if not self.groups:
+                raise InputError("at least one group of residuals", "none", "call `add_residuals` first")
+            layout = Layout(self.blocks)
+            if layout.dof == 0:
+                raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
+            system = choose_system(layout, self.groups, options)
+            model = LeastSquares(layout, self.groups, system, options.threads)
+            self._analysed = (key, model, tuple(self.defects()))
+        return self._analysed[1], self._analysed[2], time.perf_counter() - begin

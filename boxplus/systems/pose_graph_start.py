@@ -1,0 +1,278 @@
+"""Where the optimisation of a pose graph starts: along a spanning tree, or from the chordal relaxation.
+
+Chordal initialisation (Martinec and Pajdla, CVPR 2007; Carlone et al., ICRA 2015): the rotations are first sought among all
+matrices, where ‖R_j − R_i R_ij‖² is a linear least-squares problem, and then projected onto SO(d); the translations follow from
+a second linear problem. Neither depends on a starting value, which is why it reaches basins that no local start finds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.manifolds import quaternion
+from boxplus.manifolds.se3 import compose_into, inverse_into
+from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.cholesky import SparseCholesky
+
+_POLAR_ITERATIONS = 30
+
+
+def held_poses(graph: PoseGraph) -> NDArray[np.int64]:
+    """(k,) the poses that hold the graph in the world: those the file fixes, and the first of every component without any."""
+    label = _components(graph)
+    anchored = np.unique(label[graph.fixed])
+    components, first = np.unique(label, return_index=True)
+    return np.union1d(graph.fixed, first[~np.isin(components, anchored)]).astype(np.int64)
+
+
+def _components(graph: PoseGraph) -> NDArray[np.int64]:
+    """(n,) number of the connected component of every pose."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n, (i, j) = len(graph.ids), graph.edges.T
+    return np.asarray(connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1], dtype=np.int64)
+
+
+def spanning_tree_start(graph: PoseGraph) -> NDArray[np.float64]:
+    """Poses, laid out as the measurements, composed along breadth-first trees from the first held pose of every component.
+
+    Held poses stay where the graph has them, or are the identity. With breadth first, the chains of measurements that
+    errors pile up along are as short as can be.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    n, (i, j) = len(graph.ids), graph.edges.T
+    # Of parallel edges the last one stands; + 1 because a zero would be no edge.
+    number = np.arange(1, len(i) + 1, dtype=np.float64)
+    key, last = np.unique((np.minimum(i, j) * n + np.maximum(i, j))[::-1], return_index=True)
+    chosen = len(i) - 1 - last
+    links = coo_array((number[chosen], (key // n, key % n)), shape=(n, n)).tocsr()
+    links = (links + links.T).tocsr()
+    held = held_poses(graph)
+    poses = _at_held(graph, held)
+    roots = held[np.unique(_components(graph)[held], return_index=True)[1]]
+    for root in roots:
+        order, parent = breadth_first_order(links, int(root), directed=False, return_predecessors=True)
+        children = order[1:].astype(np.int64)
+        children = children[~np.isin(children, held)]
+        if not len(children):
+            continue
+        parents = parent[children].astype(np.int64)
+        edge = np.asarray(links[children, parents]).reshape(-1).astype(np.int64) - 1
+        forward = i[edge] == parents
+        if graph.dimension == 3:
+            _follow_3d(children, parents, edge, forward, graph.measurements, poses)
+        else:
+            _follow_2d(children, parents, edge, forward, graph.measurements, poses)
+    return poses
+
+
+def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
+    """Poses, laid out as the measurements, from the chordal relaxation.
+
+    Held poses stay where the graph has them, or are the identity. An edge weighs by the precision of its rotation and of
+    its translation, each averaged over the axes.
+    """
+    i, j = graph.edges.T
+    roots = held_poses(graph)
+    start = _at_held(graph, roots)
+    kappa, tau = _weights(graph)
+    if graph.dimension == 3:
+        Z = quaternion.to_matrix(graph.measurements[:, :4])
+        # A row of R, as a column u: u_j = Zᵀ u_i. The three rows are three right-hand sides.
+        known = np.swapaxes(quaternion.to_matrix(start[roots, :4]), 1, 2)
+        rows = _relaxed(len(graph.ids), i, j, np.swapaxes(Z, 1, 2), kappa, roots, known)
+        R = _nearest_rotations(np.swapaxes(rows, 1, 2))
+        start[:, :4] = quaternion.from_matrix(R)
+        measured, at = graph.measurements[:, 4:], slice(4, 7)
+    else:
+        c, s = np.cos(graph.measurements[:, 0]), np.sin(graph.measurements[:, 0])
+        Z = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+        known = np.stack([np.cos(start[roots, 0]), np.sin(start[roots, 0])], -1)[:, :, None]
+        u = _relaxed(len(graph.ids), i, j, Z, kappa, roots, known)[:, :, 0]
+        start[:, 0] = np.arctan2(u[:, 1], u[:, 0])
+        c, s = np.cos(start[:, 0]), np.sin(start[:, 0])
+        R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+        measured, at = graph.measurements[:, 1:], slice(1, 3)
+    steps = np.einsum("nab,nb->na", R[i], measured)
+    start[:, at] = _translations(len(graph.ids), i, j, steps, tau, roots, start[roots, at])
+    return start
+
+
+def _at_held(graph: PoseGraph, held: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Identities, and the poses of the graph where they are held."""
+    poses = np.zeros((len(graph.ids), 7 if graph.dimension == 3 else 3))
+    if graph.dimension == 3:
+        poses[:, 0] = 1.0
+    if graph.poses is not None:
+        poses[held] = graph.poses[held]
+    return poses
+
+
+def _weights(graph: PoseGraph) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Precision of rotation and of translation of every edge, averaged over the axes."""
+    split = 3 if graph.dimension == 3 else 1
+    diagonal = np.einsum("nii->ni", graph.information)
+    kappa, tau = diagonal[:, :split].mean(axis=1), diagonal[:, split:].mean(axis=1)
+    # An edge that says nothing of one of the two still must not leave the linear problem singular.
+    return np.maximum(kappa, 1e-9 * kappa.max()), np.maximum(tau, 1e-9 * tau.max())
+
+
+def _relaxed(
+    n: int,
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    M: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    roots: NDArray[np.int64],
+    known: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(n, d, k) minimising Σ weight ‖u_j − M u_i‖² with u[roots] = known (roots, d, k); M is (m, d, d) and orthogonal."""
+    d, k = known.shape[1:]
+    u = np.zeros((n, d, k))
+    u[roots] = known
+    free = np.ones(n, dtype=np.bool_)
+    free[roots] = False
+    number = np.cumsum(free) - 1
+    size = int(free.sum())
+    if size == 0:
+        return u
+    right = np.zeros((n, d, k))
+    degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
+    to, back = free[i] & ~free[j], ~free[i] & free[j]
+    np.add.at(right, i[to], weight[to, None, None] * np.swapaxes(M[to], 1, 2) @ u[j[to]])
+    np.add.at(right, j[back], weight[back, None, None] * M[back] @ u[i[back]])
+    inner = np.flatnonzero(free[i] & free[j])
+    a, b = number[j[inner]], number[i[inner]]
+    pattern, pairs = BlockPattern.from_pairs(np.full(size, d), a, b)
+    values = np.zeros(len(pattern.row) * d * d).reshape(-1, d, d)
+    coupling = -weight[inner, None, None] * M[inner]
+    np.add.at(values, pairs.block, np.where(pairs.transposed[:, None, None], np.swapaxes(coupling, 1, 2), coupling))
+    values[pattern.col_start[:-1]] += degree[free, None, None] * np.eye(d)
+    cholesky = SparseCholesky(pattern)
+    cholesky.factorize(values.reshape(-1))
+    u[free] = cholesky.solve(right[free].reshape(size * d, k)).reshape(size, d, k)
+    return u
+
+
+def _translations(
+    n: int,
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    steps: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    roots: NDArray[np.int64],
+    known: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(n, d) minimising Σ weight ‖t_j − t_i − step‖² with t[roots] = known."""
+    t = np.zeros((n, steps.shape[1]))
+    t[roots] = known
+    free = np.ones(n, dtype=np.bool_)
+    free[roots] = False
+    number = np.cumsum(free) - 1
+    size = int(free.sum())
+    if size == 0:
+        return t
+    right = np.zeros_like(t)
+    pull = weight[:, None] * (steps + np.where(free[i], 0.0, 1.0)[:, None] * t[i] - np.where(free[j], 0.0, 1.0)[:, None] * t[j])
+    np.add.at(right, j, pull)
+    np.add.at(right, i, -pull)
+    inner = np.flatnonzero(free[i] & free[j])
+    pattern, pairs = BlockPattern.from_pairs(np.ones(size, dtype=np.int64), number[j[inner]], number[i[inner]])
+    values = np.bincount(pairs.block, -weight[inner], len(pattern.row))
+    values[pattern.col_start[:-1]] += (np.bincount(i, weight, n) + np.bincount(j, weight, n))[free]
+    cholesky = SparseCholesky(pattern)
+    cholesky.factorize(values)
+    t[free] = cholesky.solve(right[free])
+    return t
+
+
+def _nearest_rotations(M: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation nearest to each matrix (n, 3, 3) in the Frobenius norm."""
+    R = np.ascontiguousarray(M)
+    failed = np.zeros(len(R), dtype=np.bool_)
+    _polar(R, failed)
+    if failed.any():
+        U, _, Vt = np.linalg.svd(M[failed])
+        U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+        R[failed] = U @ Vt
+    return R
+
+
+@kernel
+def _polar(M: NDArray[np.float64], failed: NDArray[np.bool_]) -> None:
+    """Replace matrices of positive determinant by their orthogonal polar factor (Newton's iteration, Higham 1986)."""
+    for n in range(M.shape[0]):
+        X = M[n]
+        failed[n] = True
+        for _ in range(_POLAR_ITERATIONS):
+            c00 = X[1, 1] * X[2, 2] - X[1, 2] * X[2, 1]
+            c01 = X[1, 2] * X[2, 0] - X[1, 0] * X[2, 2]
+            c02 = X[1, 0] * X[2, 1] - X[1, 1] * X[2, 0]
+            det = X[0, 0] * c00 + X[0, 1] * c01 + X[0, 2] * c02
+            if not det > 1e-12:
+                break
+            c10 = X[0, 2] * X[2, 1] - X[0, 1] * X[2, 2]
+            c11 = X[0, 0] * X[2, 2] - X[0, 2] * X[2, 0]
+            c12 = X[0, 1] * X[2, 0] - X[0, 0] * X[2, 1]
+            c20 = X[0, 1] * X[1, 2] - X[0, 2] * X[1, 1]
+            c21 = X[0, 2] * X[1, 0] - X[0, 0] * X[1, 2]
+            c22 = X[0, 0] * X[1, 1] - X[0, 1] * X[1, 0]
+            scale = det ** (1.0 / 3.0) if det < 0.5 or det > 2.0 else 1.0
+            a, b = 0.5 / scale, 0.5 * scale / det
+            change = 0.0
+            for row, (u, v, w) in enumerate(((c00, c01, c02), (c10, c11, c12), (c20, c21, c22))):
+                x, y, z = a * X[row, 0] + b * u, a * X[row, 1] + b * v, a * X[row, 2] + b * w
+                change = max(change, abs(x - X[row, 0]), abs(y - X[row, 1]), abs(z - X[row, 2]))
+                X[row, 0], X[row, 1], X[row, 2] = x, y, z
+            if change < 1e-14:
+                failed[n] = False
+                break
+
+
+@kernel
+def _follow_3d(
+    children: NDArray[np.int64],
+    parents: NDArray[np.int64],
+    edge: NDArray[np.int64],
+    forward: NDArray[np.bool_],
+    measurements: NDArray[np.float64],
+    poses: NDArray[np.float64],
+) -> None:
+    backward = np.empty(7)
+    for k in range(children.shape[0]):
+        step = measurements[edge[k]]
+        if not forward[k]:
+            inverse_into(step, backward)
+            step = backward
+        compose_into(poses[parents[k]], step, poses[children[k]])
+
+
+@kernel
+def _follow_2d(
+    children: NDArray[np.int64],
+    parents: NDArray[np.int64],
+    edge: NDArray[np.int64],
+    forward: NDArray[np.bool_],
+    measurements: NDArray[np.float64],
+    poses: NDArray[np.float64],
+) -> None:
+    for k in range(children.shape[0]):
+        angle, x, y = measurements[edge[k], 0], measurements[edge[k], 1], measurements[edge[k], 2]
+        if not forward[k]:
+            c, s = math.cos(angle), math.sin(angle)
+            angle, x, y = -angle, -c * x - s * y, s * x - c * y
+        p = poses[parents[k]]
+        c, s = math.cos(p[0]), math.sin(p[0])
+        child = children[k]
+        turned = p[0] + angle
+        poses[child, 0] = turned - 2.0 * math.pi * math.floor((turned + math.pi) / (2.0 * math.pi))
+        poses[child, 1] = p[1] + c * x - s * y
+        poses[child, 2] = p[2] + s * x + c * y
