@@ -1,0 +1,51 @@
+"""Bundle adjustment problems as published with "Bundle Adjustment on a Graph Processor" (Ortiz et al., CVPR 2020)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.bal_text import read_bal_text
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GbpProblem:
+    """m calibrated cameras looking along +z, n points and k observations.
+
+    Attributes:
+        intrinsics: (4,) float64, fx, fy, cx, cy of all cameras [px].
+        T_camera_world: (m, 7) float64, [qw, qx, qy, qz, x, y, z].
+        points: (n, 3) float64, p_world [m].
+        camera_of, point_of: (k,) int64, the camera and the point of each observation.
+        pixels: (k, 2) float64, x to the right and y downwards [px].
+    """
+
+    intrinsics: NDArray[np.float64]
+    T_camera_world: NDArray[np.float64]
+    points: NDArray[np.float64]
+    camera_of: NDArray[np.int64]
+    point_of: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+def read_gbp(path: str | Path) -> GbpProblem:
+    """Read such a file, plain or bzip2.
+
+    It is a BAL file with comments, a second line `fx fy cx cy`, and cameras of six numbers: translation of T_camera_world,
+    then the rotation vector.
+
+    Raises:
+        InputError: as `read_bal_text`.
+    """
+    header, camera_of, point_of, pixels, cameras, points = read_bal_text(path, 6, "the intrinsics fx fy cx cy", 4)
+    poses = np.hstack([_quaternions(cameras[:, 3:]), cameras[:, :3]])
+    return GbpProblem(header, poses, points, camera_of, point_of, pixels)
+
+
+def _quaternions(rotation_vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Exp_q of (m, 3) rotation vectors (SPEC.md 1.3), wxyz."""
+    half = 0.5 * np.linalg.norm(rotation_vectors, axis=1, keepdims=True)
+    return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation_vectors])
