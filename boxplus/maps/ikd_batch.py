@@ -14,7 +14,6 @@ from boxplus.maps.ikd_pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
-    LABEL_NONE,
     LEAF_BIT,
     NIL,
     ONE,
@@ -22,10 +21,9 @@ from boxplus.maps.ikd_pool import (
     Pool,
     all_bits,
     has_room,
-    live_bits,
 )
+from boxplus.maps.ikd_replace import log_operation, remove_point, replace_point
 from boxplus.maps.ikd_update import (
-    COPYING,
     DROP,
     IDLE,
     INSERT,
@@ -33,24 +31,37 @@ from boxplus.maps.ikd_update import (
     MAX_DEPTH,
     REVIVE,
     Work,
-    extend_box,
     insert_point,
-    save_leaf,
     update_box,
 )
 
 
 @kernel(borrow=True)
-def log_operation(work: Work, kind: np.int64, box: NDArray[np.float32]) -> None:
-    """Note an operation for the running rebuild. Room in the log must be there."""
-    job = work.job[0]
-    if job["phase"] == IDLE:
-        return
-    entry = work.log[job["logged"]]
-    entry["kind"] = np.uint32(kind)
-    for i in range(6):
-        entry["box"][i] = box[i]
-    job["logged"] += ONE
+def keep_near(
+    world: NDArray[np.float64], origin: NDArray[np.float64], extent: float, relative: NDArray[np.float32]
+) -> tuple[np.int64, np.int64]:
+    """Write the points (N, 3) that are within `extent` of the origin on each axis to the first rows of `relative` (N, 3).
+
+    Returns how many these are, and how many of the others are not finite.
+    """
+    kept, not_finite = np.int64(0), np.int64(0)
+    for row in range(len(world)):
+        x, y, z = world[row, 0], world[row, 1], world[row, 2]
+        not_finite += np.int64(not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)))
+        x, y, z = x - origin[0], y - origin[1], z - origin[2]
+        if abs(x) <= extent and abs(y) <= extent and abs(z) <= extent:
+            relative[kept, 0], relative[kept, 1], relative[kept, 2] = np.float32(x), np.float32(y), np.float32(z)
+            kept += 1
+    return kept, not_finite
+
+
+@kernel(borrow=True)
+def fill_operations(points: NDArray[np.float32], kind: np.int64, operations: NDArray[np.void]) -> None:
+    """Make an operation of this kind of each point (N, 3)."""
+    for row in range(len(points)):
+        operations[row]["kind"] = np.uint32(kind)
+        for axis in range(3):
+            operations[row]["box"][axis] = points[row, axis]
 
 
 @kernel(inline=True, borrow=True)
@@ -154,53 +165,6 @@ def set_cell(
 
 
 @kernel(borrow=True)
-def replace_point(
-    pool: Pool,
-    work: Work,
-    node: np.uint32,
-    side: np.uint32,
-    x: np.float32,
-    y: np.float32,
-    z: np.float32,
-    cell: NDArray[np.float32],
-    point: np.uint32,
-) -> bool:
-    """Put a point in the place of the only one of its cell, if it belongs in the same leaf; returns whether it does.
-
-    No count and no balance changes. The boxes passed are extended in either case: if not here, the point goes there next.
-    """
-    job = work.job[0]
-    label = LABEL_NONE
-    inside = False
-    while True:
-        extend_box(pool, node, side, x, y, z)
-        record = pool.inner[node]
-        label = label if label else np.uint8(record["label"][side])
-        inside = inside or (job["phase"] != IDLE and node == job["node"] and side == job["side"])
-        ref = np.uint32(record["child"][side])
-        if ref >= LEAF_BIT:
-            break
-        axis = pool.inner[ref]["axis"]
-        value = x if axis == 0 else (y if axis == 1 else z)
-        node = ref
-        side = np.uint32(value >= pool.inner[ref]["split"])
-    index, i = np.uint32(point // np.uint32(BUCKET)), np.uint32(point % np.uint32(BUCKET))
-    if ref != index | LEAF_BIT:
-        return False
-    if inside:
-        if job["phase"] == COPYING:
-            save_leaf(pool, work, index, live_bits(pool.leaf, index, label))
-        log_operation(work, DROP, cell)
-        cell[0], cell[1], cell[2] = x, y, z
-        log_operation(work, INSERT, cell)
-    leaf = pool.leaf[index]
-    leaf["x"][i] = x
-    leaf["y"][i] = y
-    leaf["z"][i] = z
-    return True
-
-
-@kernel(borrow=True)
 def update_batch(
     pool: Pool,
     work: Work,
@@ -235,6 +199,7 @@ def update_batch(
         x, y, z = box[0], box[1], box[2]
         drop = kind == DROP
         stored = np.int64(kind != DROP)
+        nearest, single = NIL, False
         if kind == INSERT_DOWNSAMPLED:
             set_cell(x, y, z, origin, cell_size, cell)
             found, has_dead, nearest = search_cell(pool, node, side, work.cell_stack, cell, best)
@@ -245,17 +210,22 @@ def update_batch(
                         continue
                     x, y, z = best[0], best[1], best[2]
                     stored = np.int64(0)
-                elif found == 1 and not has_dead and replace_point(pool, work, node, side, x, y, z, cell, nearest):
-                    job["changed"] += 1
-                    job["replaced"] += 1
-                    continue
+                else:
+                    single = found == 1 and not has_dead
+                    if single and replace_point(pool, work, node, side, x, y, z, cell, nearest):
+                        job["changed"] += 1
+                        job["replaced"] += 1
+                        continue
             drop = found > 0 or has_dead
             for i in range(6):
                 box[i] = cell[i]
         if job["depth"] > np.uint32(MAX_DEPTH) or not has_room(pool, np.uint32(2), np.uint32(4)):
             return np.int64(row)
         if drop:
-            job["live"] -= update_box(pool, work, node, side, box, DROP)
+            if single and remove_point(pool, work, node, side, nearest):
+                job["live"] -= 1
+            else:
+                job["live"] -= update_box(pool, work, node, side, box, DROP)
             log_operation(work, DROP, box)
         if kind != DROP:
             inside = insert_point(pool, work, node, side, x, y, z)

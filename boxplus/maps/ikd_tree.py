@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
-from boxplus.maps.ikd_batch import update_batch
+from boxplus.maps.ikd_batch import fill_operations, keep_near, update_batch
 from boxplus.maps.ikd_check import check_tree
 from boxplus.maps.ikd_collect import collect, nearest_batch
 from boxplus.maps.ikd_input import as_corner, as_points, round_down, round_up
@@ -144,8 +144,7 @@ class IkdTree:
             raise InputError("a cell_size for a downsampled insert", "none", "give IkdTree a cell_size, or insert all points")
         relative, not_finite, too_far = self._to_relative(as_points(points, "points"))
         operations = np.empty(len(relative), OPERATION)
-        operations["box"][:, :3] = relative
-        operations["kind"] = INSERT_DOWNSAMPLED if downsample else INSERT
+        fill_operations(relative, INSERT_DOWNSAMPLED if downsample else INSERT, operations)
         inserted = self._update(operations)
         return InsertReport(inserted, len(relative) - inserted, not_finite, too_far)
 
@@ -373,14 +372,9 @@ class IkdTree:
             if len(finite):
                 self.origin = np.round(np.median(finite, axis=0))
                 self._placed = True
-        relative = world - self.origin
-        not_finite = too_far = 0
-        if len(relative) and not np.abs(relative).max() <= MAX_EXTENT:
-            near = (np.abs(relative) <= MAX_EXTENT).all(axis=1)
-            not_finite = int(np.count_nonzero(~np.isfinite(world).all(axis=1)))
-            too_far = len(world) - int(np.count_nonzero(near)) - not_finite
-            relative = relative[near]
-        return relative.astype(np.float32), not_finite, too_far
+        relative = np.empty(world.shape, np.float32)
+        kept, not_finite = keep_near(np.ascontiguousarray(world), self.origin, MAX_EXTENT, relative)
+        return relative[:kept], not_finite, len(world) - kept - not_finite
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""

@@ -73,7 +73,7 @@ JOB = np.dtype(
 SLOT = np.dtype([("node", np.uint32), ("side", np.uint32), ("label", np.uint8), ("path", np.uint64)], align=True)
 PENDING = np.dtype([("ref", np.uint32), ("label", np.uint8)], align=True)
 OPERATION = np.dtype([("box", np.float32, 6), ("kind", np.uint32)], align=True)
-_LONG_PATH = np.uint64(1) << np.uint64(62)  # a path is the sides from the root, after a leading 1
+LONG_PATH = np.uint64(1) << np.uint64(62)  # a path is the sides from the root, after a leading 1
 _ENTER, _LEAVE, _INSIDE = np.uint8(0), np.uint8(1), np.uint8(2)  # states of a slot in a box update
 
 
@@ -178,7 +178,7 @@ def extend_box(pool: Pool, node: np.uint32, side: np.uint32, x: np.float32, y: n
 def note_unbalanced(pool: Pool, work: Work, ref: np.uint32, path: np.uint64) -> None:
     """Note a subtree out of balance, once; `settle` deals with it."""
     job = work.job[0]
-    if pool.inner[ref]["queued"] == 0 and job["queued"] < np.uint32(QUEUE_SIZE) and path < _LONG_PATH:
+    if pool.inner[ref]["queued"] == 0 and job["queued"] < np.uint32(QUEUE_SIZE) and path < LONG_PATH:
         pool.inner[ref]["queued"] = np.uint8(1)
         work.queue[job["queued"]] = path
         job["queued"] += ONE
@@ -288,7 +288,7 @@ def insert_point(pool: Pool, work: Work, node: np.uint32, side: np.uint32, x: np
         value = x if axis == 0 else (y if axis == 1 else z)
         node = ref
         side = np.uint32(value >= pool.inner[ref]["split"])
-        path = (path << np.uint64(1)) | np.uint64(side) if path < _LONG_PATH else path
+        path = (path << np.uint64(1)) | np.uint64(side) if path < LONG_PATH else path
     job["depth"] = max(np.uint32(job["depth"]), np.uint32(depth + ONE))
     return inside
 
@@ -369,6 +369,6 @@ def update_box(pool: Pool, work: Work, node: np.uint32, side: np.uint32, box: ND
             slots[top]["node"] = ref
             slots[top]["side"] = np.uint32(child)
             slots[top]["label"] = mark
-            slots[top]["path"] = (path << np.uint64(1)) | np.uint64(child) if path < _LONG_PATH else path
+            slots[top]["path"] = (path << np.uint64(1)) | np.uint64(child) if path < LONG_PATH else path
             top += ONE
     return changed
