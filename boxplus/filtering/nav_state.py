@@ -32,6 +32,18 @@ MEASURED = np.array([0, 1, 2, 3, 4, 5, 18, 19, 20, 21, 22, 23])
 STANDARD_GRAVITY = 9.81
 
 
+@kernel
+def _place_into(R: NDArray[np.float64], p: NDArray[np.float64], points: NDArray[np.float32], placed: NDArray[np.float64]) -> None:
+    """placed = R points + p, row by row (N, 3); a matrix product would wake the threads of BLAS for it."""
+    flat, out = points.reshape(-1), placed.reshape(-1)
+    for n in range(np.uint64(points.shape[0])):
+        i, j, k = np.uint64(3) * n, np.uint64(3) * n + np.uint64(1), np.uint64(3) * n + np.uint64(2)
+        x, y, z = np.float64(flat[i]), np.float64(flat[j]), np.float64(flat[k])
+        out[i] = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + p[0]
+        out[j] = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + p[1]
+        out[k] = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + p[2]
+
+
 @dataclass(frozen=True, slots=True)
 class NavState:
     """The navigation state, one attribute a symbol.
@@ -93,8 +105,10 @@ class NavState:
 
     def to_world(self, p_lidar: NDArray[np.float32]) -> NDArray[np.float64]:
         """Points (N, 3) of the LiDAR frame in the world."""
-        p_imu = p_lidar @ self.R_imu_lidar.T + self.p_imu_lidar
-        p_world: NDArray[np.float64] = p_imu @ self.R_world_imu.T + self.p_world_imu
+        p_world = np.empty(p_lidar.shape)
+        R_world_lidar = self.R_world_imu @ self.R_imu_lidar
+        p_world_lidar = self.R_world_imu @ self.p_imu_lidar + self.p_world_imu
+        _place_into(R_world_lidar, p_world_lidar, np.ascontiguousarray(p_lidar, dtype=np.float32), p_world)
         return p_world
 
     def boxplus(self, delta: NDArray[np.float64]) -> NavState:

@@ -97,10 +97,7 @@ class Estimate:
 
     def points_world(self) -> NDArray[np.float64]:
         """(N, 3) float64, the scan's points registered in the world."""
-        R_world_lidar = self.state.R_world_imu @ self.state.R_imu_lidar
-        p_world_lidar = self.state.R_world_imu @ self.state.p_imu_lidar + self.state.p_world_imu
-        registered: NDArray[np.float64] = self.p_lidar @ R_world_lidar.T + p_world_lidar
-        return registered
+        return self.state.to_world(self.p_lidar)
 
 
 @dataclass(frozen=True, slots=True)
