@@ -76,7 +76,8 @@ class SparseCholesky:
         self._factor = _aligned(fronts.factor_size)
         self._stack = _aligned(fronts.stack_size)
         self._inverse, self._pivots, self._diagonal = np.zeros(size), np.zeros(size), np.zeros(size)
-        self._work = np.zeros(size + int(fronts.table["below"].max()))
+        self._most_below = int(fronts.table["below"].max())
+        self._work, self._below = np.empty(size), np.empty(self._most_below)
         self._factorized = False
         self._selected: SelectedInverse | None = None
 
@@ -165,11 +166,15 @@ class SparseCholesky:
         if b.ndim not in (1, 2) or len(b) != len(self._pivots):
             raise InputError(f"a right-hand side of {len(self._pivots)} rows", f"shape {b.shape}", "give (N,) or (N, k) numbers")
         fronts = self._fronts
+        sides = b.size // max(len(b), 1)
+        if sides * len(b) > len(self._work):
+            self._work, self._below = np.empty(sides * len(b)), np.empty(sides * self._most_below)
         x = np.empty_like(b)
-        if b.ndim == 1:
-            solve_one(fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse, b, x, self._work)
+        panels = (fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse)
+        if sides == 1:
+            solve_one(*panels, b.reshape(-1), self._work, self._below, x.reshape(-1))
         else:
-            solve_many(fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse, b, x, np.empty_like(b))
+            solve_many(*panels, b.reshape(-1), np.uint64(sides), self._work, self._below, x.reshape(-1))
         return x
 
     def inverse_blocks(self, i: ArrayLike, j: ArrayLike) -> list[NDArray[np.float64]]:

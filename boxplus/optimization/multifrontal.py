@@ -20,7 +20,7 @@ _ZERO = np.uint64(0)
 _STORED, _DIAGONAL = np.uint64(STORED), np.uint64(DIAGONAL)
 
 
-@kernel
+@kernel(inline=True)
 def _fill_panel(first: np.uint64, last: np.uint64, ld: np.uint64, entries: Table, values: Buffer, factor: Buffer) -> None:
     """Write the blocks of the matrix that belong to a front."""
     for e in range(first, last):
@@ -40,7 +40,7 @@ def _fill_panel(first: np.uint64, last: np.uint64, ld: np.uint64, entries: Table
                     factor[target + j + i * ld] = values[source + i * columns + j]
 
 
-@kernel
+@kernel(inline=True)
 def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, last: np.uint64, runs: Table, stack: Buffer,
                target: Buffer, target_at: np.uint64, ld: np.uint64, shift: np.uint64) -> None:  # fmt: skip
     """Add the columns `first … split` of runs of a child's update matrix, down to its last run, to a part of the front.

@@ -3,6 +3,8 @@
 A tile covers up to `TILE_ROWS` rows and 6, 3 or 1 columns of a column-major matrix C, whose rows lie in vector registers:
 
 - `update`: C ← C - A Bᵀ, or C ← -A Bᵀ, over `depth` columns of A and B;
+- `transposed`: the same with B stored as its transpose, `depth` rows;
+- `dots`: for a single row of C, contiguous, and of A, with B stored as its transpose: C ← C - A Bᵀ;
 - `solve`: C ← (C - A Bᵀ) L⁻ᵀ, where the lower triangle L follows B in its memory, as it does in a panel that is
   factorised from left to right, and the reciprocals of its diagonal are given;
 - `factor`: the same where C begins with the rows of L itself, which is formed in registers; the pivots (squares of L's
@@ -16,7 +18,7 @@ and a column stride. Where Numba does not compile (NUMBA_DISABLE_JIT), plain Num
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from llvmlite import binding, ir
@@ -67,8 +69,8 @@ class _Emitter:
     def address(self, pointer: Any, index: Any) -> Any:
         return self.builder.gep(pointer, [index])
 
-    def broadcast(self, pointer: Any, index: int) -> Any:
-        return self.splat(self.builder.load(self.address(pointer, _INDEX(index))))
+    def broadcast(self, pointer: Any, index: Any) -> Any:
+        return self.splat(self.builder.load(self.address(pointer, index)))
 
     def load(self, pointer: Any) -> list[Any]:
         found = []
@@ -92,9 +94,12 @@ class _Emitter:
         """x y + z."""
         return self.builder.call(self._fma, [x, y, z])
 
-    def product(self, a: Any, lda: Any, b: Any, ldb: Any, depth: Any, columns: int) -> list[list[Any]]:
-        """`A Bᵀ` of the tile as vectors, `[column][vector]`."""
+    def product(
+        self, a: Any, lda: Any, b: Any, ldb: Any, depth: Any, columns: int, *, transposed: bool = False
+    ) -> list[list[Any]]:
+        """`A Bᵀ` of the tile as vectors, `[column][vector]`; `transposed`: B is stored as its transpose."""
         builder = self.builder
+        places = [builder.mul(ldb, _INDEX(c)) if transposed else _INDEX(c) for c in range(columns)]
         before = builder.block
         loop, done = builder.append_basic_block("depth"), builder.append_basic_block("depth.done")
         builder.cbranch(builder.icmp_unsigned(">", depth, _INDEX(0)), loop, done)
@@ -104,9 +109,13 @@ class _Emitter:
         rows = self.load(a_now)
         new = []
         for c in range(columns):
-            factor = self.broadcast(b_now, c)
+            factor = self.broadcast(b_now, places[c])
             new.append([self.fma(rows[v], factor, sums[c][v]) for v in range(self.vectors)])
-        following, a_next, b_next = builder.add(step, _INDEX(1)), self.address(a_now, lda), self.address(b_now, ldb)
+        following, a_next, b_next = (
+            builder.add(step, _INDEX(1)),
+            self.address(a_now, lda),
+            self.address(b_now, _INDEX(1) if transposed else ldb),
+        )
         end = builder.block
         builder.cbranch(builder.icmp_unsigned("<", following, depth), loop, done)
         for phi, start, again in [(step, _INDEX(0), following), (a_now, a, a_next), (b_now, b, b_next)]:
@@ -140,18 +149,19 @@ def _pointer(context: Any, builder: Any, array: Any, offset: Any) -> Any:
 class _Tile:
     """What the tiles begin with: C, and the product A Bᵀ."""
 
-    def __init__(self, context: Any, builder: Any, args: Any, columns: int, vectors: int) -> None:
+    def __init__(self, context: Any, builder: Any, args: Any, columns: int, vectors: int, *, transposed: bool = False) -> None:
         c, c_at, ldc, a, a_at, lda, b, b_at, ldb, depth, rows = args[:11]
         self.emit = _Emitter(builder, rows, vectors)
         start, b_pointer = _pointer(context, builder, c, c_at), _pointer(context, builder, b, b_at)
-        self.products = self.emit.product(_pointer(context, builder, a, a_at), lda, b_pointer, ldb, depth, columns)
+        a_pointer = _pointer(context, builder, a, a_at)
+        self.products = self.emit.product(a_pointer, lda, b_pointer, ldb, depth, columns, transposed=transposed)
         self.behind_b = self.emit.address(b_pointer, builder.mul(ldb, depth))
         self.places = [self.emit.address(start, builder.mul(ldc, _INDEX(k))) for k in range(columns)]
 
 
-def _compiled_update(columns: int, vectors: int) -> Callable[..., None]:
+def _compiled_update(columns: int, vectors: int, *, transposed: bool) -> Callable[..., None]:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        tile = _Tile(context, builder, args, columns, vectors)
+        tile = _Tile(context, builder, args, columns, vectors, transposed=transposed)
         emit = tile.emit
         for place, products in zip(tile.places, tile.products, strict=True):
             entry, add, store = builder.block, builder.append_basic_block("accumulate"), builder.append_basic_block("store")
@@ -193,7 +203,7 @@ def _compiled_solve(columns: int, vectors: int, *, factor: bool) -> Callable[...
                 builder.store(scale, emit.address(inverse, _INDEX(k)))
                 scales = emit.splat(scale)
             else:
-                scales = emit.broadcast(inverse, k)
+                scales = emit.broadcast(inverse, _INDEX(k))
             x[k] = [builder.fmul(value, scales) for value in x[k]]
             emit.store(x[k], tile.places[k])
             column = emit.address(tile.behind_b, builder.mul(args[8], _INDEX(k)))
@@ -202,7 +212,7 @@ def _compiled_solve(columns: int, vectors: int, *, factor: bool) -> Callable[...
                 if factor:
                     weights = emit.splat(builder.extract_element(x[k][0], ir.IntType(32)(later)))
                 else:
-                    weights = emit.broadcast(column, later)
+                    weights = emit.broadcast(column, _INDEX(later))
                 x[later] = [emit.fma(value, weights, old) for value, old in zip(negative, x[later], strict=True)]
         return context.get_dummy_value()
 
@@ -223,15 +233,56 @@ def _compiled_solve(columns: int, vectors: int, *, factor: bool) -> Callable[...
     return tile_solve  # type: ignore[no-any-return]
 
 
+def _compiled_dots(columns: int) -> Callable[..., None]:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        c, c_at, a, a_at, b, b_at, ldb, depth = args
+        c_pointer, a_pointer, b_pointer = (_pointer(context, builder, x, at) for x, at in ((c, c_at), (a, a_at), (b, b_at)))
+        starts = [builder.gep(b_pointer, [builder.mul(ldb, _INDEX(k))]) for k in range(columns)]
+        zero = ir.Constant(_VECTOR, [0.0] * LANES)
+        before = builder.block
+        loop, done = builder.append_basic_block("rows"), builder.append_basic_block("rows.done")
+        builder.cbranch(builder.icmp_unsigned(">", depth, _INDEX(0)), loop, done)
+        builder.position_at_end(loop)
+        row, sums = builder.phi(_INDEX), [builder.phi(_VECTOR) for _ in range(columns)]
+        emit = _Emitter(builder, builder.sub(depth, row), 1)
+        (weights,) = emit.load(builder.gep(a_pointer, [row]))
+        new = [emit.fma(emit.load(builder.gep(start, [row]))[0], weights, old) for start, old in zip(starts, sums, strict=True)]
+        following = builder.add(row, _INDEX(LANES))
+        builder.cbranch(builder.icmp_unsigned("<", following, depth), loop, done)
+        row.add_incoming(_INDEX(0), before)
+        row.add_incoming(following, loop)
+        builder.position_at_end(done)
+        flags = ("reassoc",)
+        reduce = _function(builder.module, ir.FunctionType(_DOUBLE, [_DOUBLE, _VECTOR]), f"llvm.vector.reduce.fadd.v{LANES}f64")
+        for k in range(columns):
+            sums[k].add_incoming(zero, before)
+            sums[k].add_incoming(new[k], loop)
+            total = builder.phi(_VECTOR)
+            total.add_incoming(zero, before)
+            total.add_incoming(new[k], loop)
+            new[k] = total
+        for k in range(columns):
+            place = builder.gep(c_pointer, [_INDEX(k)])
+            dot = builder.call(reduce, [ir.Constant(_DOUBLE, -0.0), new[k]], fastmath=flags)
+            builder.store(builder.fsub(builder.load(place), dot), place)
+        return context.get_dummy_value()
+
+    @intrinsic  # type: ignore[misc]
+    def tile(typing: Any, c: Any, c_at: Any, a: Any, a_at: Any, b: Any, b_at: Any, ldb: Any, depth: Any) -> Any:
+        return types.void(_BUFFER, _N, _BUFFER, _N, _BUFFER, _N, _N, _N), generate
+
+    return tile  # type: ignore[no-any-return]
+
+
 def _view(buffer: NDArray[np.float64], at: int, ld: int, rows: int, columns: int) -> NDArray[np.float64]:
     return np.lib.stride_tricks.as_strided(buffer[int(at) :], (int(rows), int(columns)), (8, 8 * int(ld)))
 
 
-def _plain_update(columns: int) -> Callable[..., None]:
+def _plain_update(columns: int, *, transposed: bool) -> Callable[..., None]:
     def tile(c, c_at, ldc, a, a_at, lda, b, b_at, ldb, depth, rows, accumulate):  # type: ignore[no-untyped-def]
         target = _view(c, c_at, ldc, rows, columns)
-        product = _view(a, a_at, lda, rows, depth) @ _view(b, b_at, ldb, columns, depth).T
-        target[:] = (target if accumulate else 0.0) - product
+        other = _view(b, b_at, ldb, depth, columns) if transposed else _view(b, b_at, ldb, columns, depth).T
+        target[:] = (target if accumulate else 0.0) - _view(a, a_at, lda, rows, depth) @ other
 
     return tile
 
@@ -250,14 +301,29 @@ def _plain_solve(columns: int, *, factor: bool) -> Callable[..., None]:
     return tile
 
 
-def _tiles(kind: str) -> list[Callable[..., None]]:
+def _plain_dots(columns: int) -> Callable[..., None]:
+    def tile(c, c_at, a, a_at, b, b_at, ldb, depth):  # type: ignore[no-untyped-def]
+        _view(c, c_at, 1, columns, 1)[:, 0] -= _view(b, b_at, ldb, depth, columns).T @ _view(a, a_at, 1, depth, 1)[:, 0]
+
+    return tile
+
+
+def _tiles(kind: Literal["update", "update_transposed", "solve", "factor"]) -> list[Callable[..., None]]:
     """The six shapes of one kind: 6, 3 and 1 columns, each with `TILE_VECTORS` vectors and with one."""
     shapes = [(columns, vectors) for columns in (6, 3, 1) for vectors in (TILE_VECTORS, 1)]
+    transposed, factor = kind == "update_transposed", kind == "factor"
     if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
-        return [_plain_update(c) if kind == "update" else _plain_solve(c, factor=kind == "factor") for c, _ in shapes]
-    return [_compiled_update(c, v) if kind == "update" else _compiled_solve(c, v, factor=kind == "factor") for c, v in shapes]
+        plain = [
+            _plain_update(c, transposed=transposed) if "update" in kind else _plain_solve(c, factor=factor) for c, _ in shapes
+        ]
+        return plain
+    if "update" in kind:
+        return [_compiled_update(c, v, transposed=transposed) for c, v in shapes]
+    return [_compiled_solve(c, v, factor=factor) for c, v in shapes]
 
 
 update_6, update_6_short, update_3, update_3_short, update_1, update_1_short = _tiles("update")
+transposed_6, transposed_6_short, transposed_3, transposed_3_short, transposed_1, transposed_1_short = _tiles("update_transposed")
 solve_6, solve_6_short, solve_3, solve_3_short, solve_1, solve_1_short = _tiles("solve")
 factor_6, factor_6_short, factor_3, factor_3_short, factor_1, factor_1_short = _tiles("factor")
+dots_6, dots_3, dots_1 = ((_plain_dots if numba_config.DISABLE_JIT else _compiled_dots)(c) for c in (6, 3, 1))  # type: ignore[attr-defined]
