@@ -25,8 +25,9 @@ def sample_bilinear(image: NDArray[np.float32], u: float, v: float) -> tuple[boo
     j, i = np.uint64(u), np.uint64(v)
     b, a = u - float(j), v - float(i)
     next_i, next_j = i + np.uint64(1), j + np.uint64(1)
-    p00, p01 = float(image[i, j]), float(image[i, next_j])
-    p10, p11 = float(image[next_i, j]), float(image[next_i, next_j])
+    # Numba's float() keeps a float32.
+    p00, p01 = np.float64(image[i, j]), np.float64(image[i, next_j])
+    p10, p11 = np.float64(image[next_i, j]), np.float64(image[next_i, next_j])
     top, bottom = p01 - p00, p11 - p10
     upper, lower = p00 + b * top, p10 + b * bottom
     value = upper + a * (lower - upper)
