@@ -14,6 +14,7 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"
 SHOWS = {
     "dynamic_kdtree": "after delete_box: 24668 (332 removed)",
     "evaluate_trajectory": "ATE rmse: 1.7",
+    "line_bundle_adjustment": "after : end points are 0.2",
     "odometry_from_arrays": "position error:",
     "read_recording": "19 scans, 401 IMU samples; left out: nothing",
 }
