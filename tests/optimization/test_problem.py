@@ -1,0 +1,209 @@
+"""`Problem`: minima against SciPy, the methods against each other, and what wrong use is told."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from boxplus import SE3, Euclidean, InputError, NotFiniteError, Problem, SE3Left, SingularProblemError, SolverOptions, losses
+from boxplus.residuals import Prior, RelativePose
+from tests.optimization.conftest import make_ring, make_scene
+
+METHODS = ("levenberg_marquardt", "gauss_newton", "dogleg")
+
+
+def scipy_minimum(problem, loss="linear") -> float:
+    """½ Σ r² at the minimum that SciPy finds over the tangents at the start."""
+    start = [block.values for block in problem.blocks]
+    free = [np.flatnonzero(~block.is_fixed) for block in problem.blocks]
+
+    def moved(delta):
+        values, at = [], 0
+        for block, rows, x in zip(problem.blocks, free, start, strict=True):
+            width = len(rows) * block.manifold.dof
+            y = x.copy()
+            y[rows] = block.manifold.boxplus(x[rows], delta[at : at + width].reshape(len(rows), -1))
+            values.append(y)
+            at += width
+        return values
+
+    def residuals(delta):
+        problem.cost(moved(delta))
+        return np.concatenate([group.r.reshape(-1) for group in problem.groups])
+
+    size = sum(len(rows) * block.manifold.dof for rows, block in zip(free, problem.blocks, strict=True))
+    return float(least_squares(residuals, np.zeros(size), method="trf", x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-12).cost)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ring_reaches_the_minimum_that_scipy_finds(ring, method):
+    ring.problem.fix(ring.poses[0])
+    solution = ring.problem.solve(method=method)
+    assert solution.status == "converged"
+    assert solution.cost == pytest.approx(scipy_minimum(ring.problem), rel=1e-8)
+    assert np.abs(SE3.boxminus(solution[ring.poses], ring.truth)).max() < 0.05
+
+
+@pytest.mark.parametrize("linear_solver", ("dense", "sparse", "schur"))
+def test_scene_reaches_the_minimum_that_scipy_finds(linear_solver):
+    scene = make_scene(cameras=4, points=15)
+    solution = scene.problem.solve(linear_solver=linear_solver)
+    assert solution.status == "converged"
+    assert linear_solver.split("_")[0] in solution.linear_solver.lower()
+    assert solution.cost == pytest.approx(scipy_minimum(scene.problem), rel=1e-7)
+
+
+def test_noise_free_problems_are_solved_exactly():
+    ring = make_ring(noise=1e-12, start_noise=0.2)
+    ring.problem.fix(ring.poses[0])
+    np.testing.assert_allclose(SE3.boxminus(ring.problem.solve()[ring.poses], ring.truth), 0.0, atol=1e-9)
+    scene = make_scene(noise=0.0)
+    solution = scene.problem.solve(cost_tolerance=0.0)
+    np.testing.assert_allclose(SE3Left.boxminus(solution[scene.cameras], scene.truth[0]), 0.0, atol=1e-7)
+    np.testing.assert_allclose(solution[scene.points], scene.truth[1], atol=1e-6)
+
+
+def test_fixed_variables_do_not_move_and_can_be_freed(scene):
+    solution = scene.problem.solve()
+    np.testing.assert_array_equal(solution[scene.cameras[:2]], scene.cameras.values[:2])
+    scene.problem.free(scene.cameras[1])
+    scene.problem.add_residuals(Prior(SE3Left, scene.truth[0][1:2], sigma=10.0), scene.cameras[[1]])
+    freed = scene.problem.solve()
+    assert np.abs(freed[scene.cameras[1]] - scene.cameras.values[1]).max() > 0.0
+    assert freed.cost < solution.cost
+
+
+def test_accepted_cost_never_rises_and_history_tells_the_story(scene):
+    solution = scene.problem.solve()
+    costs = [step.cost for step in solution.history]
+    assert all(after <= before for before, after in pairwise(costs))
+    assert solution.history[0].cost == solution.cost_initial
+    assert solution.history[-1].cost == solution.cost == scene.problem.cost(solution)
+    assert [step.number for step in solution.history] == list(range(len(costs)))
+    assert str(solution.iterations) in solution.summary()
+
+
+@pytest.mark.parametrize("linear_solver", ("sparse", "schur"))
+def test_the_number_of_threads_does_not_change_a_bit(linear_solver):
+    results = []
+    for threads in (1, 2, 3):
+        scene = make_scene(cameras=8, points=300)
+        solution = scene.problem.solve(linear_solver=linear_solver, threads=threads, max_iterations=6)
+        results.append([values.tobytes() for values in solution.values])
+    assert results[0] == results[1] == results[2]
+
+
+def test_limits_and_callback_stop_and_say_so(scene):
+    assert "iteration limit of 2" in scene.problem.solve(max_iterations=2, cost_tolerance=0.0).reason
+    assert scene.problem.solve(time_limit_s=1e-9).reason.startswith("time limit")
+    seen = []
+    solution = scene.problem.solve(callback=lambda step: seen.append(step) or step.number == 1)
+    assert solution.status == "stopped" and "callback" in solution.reason
+    assert [step.number for step in seen] == [0, 1]
+
+
+def test_a_second_solve_starts_where_it_is_told(scene):
+    first = scene.problem.solve()
+    again = scene.problem.solve(start=first)
+    assert again.iterations <= 2
+    assert again.timing_s["analysis"] < first.timing_s["analysis"]
+    assert again.cost == pytest.approx(first.cost, rel=1e-9)
+
+
+def test_points_behind_a_camera_are_counted_and_steps_do_not_push_them_there(scene):
+    values = scene.points.values.copy()
+    values[3] = [0.0, 0.0, -5.0]
+    solution = scene.problem.solve(start=[scene.cameras.values, values])
+    seen = int((scene.problem.groups[0].connections[1].rows == 3).sum())
+    assert solution.invalid == {"pixels": seen}
+    assert f"{seen} residuals of group 'pixels' could not be evaluated" in solution.summary()
+    np.testing.assert_array_equal(solution[scene.points[3]][0], values[3])
+
+
+@pytest.mark.parametrize(
+    "loss", [losses.Huber(1.0), losses.Cauchy(1.0), losses.GemanMcClure(2.0), losses.Tukey(4.0), losses.Welsch(2.0)]
+)
+def test_robust_losses_withstand_outliers(loss):
+    rng = np.random.default_rng(1)
+    values = np.concatenate([rng.normal(2.0, 0.1, 60), rng.normal(9.0, 0.5, 15)])[:, None]
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[2.4]])
+    problem.add_residuals(Prior(Euclidean(1), values, sigma=0.1), x[0], loss=loss)
+    solution = problem.solve()
+    assert solution.status == "converged"
+    assert abs(solution[x][0, 0] - 2.0) < 0.1
+    # The gradient of ½ Σ ρ vanishes: differences of the cost on both sides of the minimum.
+    step = 1e-4
+    rise = [problem.cost([solution[x] + sign * step]) - solution.cost for sign in (1.0, -1.0)]
+    assert min(rise) > 0.0 and abs(rise[0] - rise[1]) < 0.2 * max(rise)
+
+
+def test_a_pose_graph_without_gauge_is_explained_before_and_while_solving(ring):
+    assert "nothing ties poses[0], poses[1]" in ring.problem.defects()[0]
+    with pytest.raises(SingularProblemError, match="only to each other"):
+        ring.problem.solve(method="gauss_newton")
+    solution = ring.problem.solve()
+    assert solution.status == "converged"
+    assert any("where the whole lies is arbitrary" in note for note in solution.notes)
+
+
+def test_variables_without_residuals_are_named(ring):
+    ring.problem.fix(ring.poses[0])
+    ring.problem.add_variables(Euclidean(3), np.zeros((2, 3)), name="spare")
+    assert ring.problem.defects() == ["no residual touches spare[0], spare[1]: fix them, remove them, or measure them"]
+
+
+def test_nan_names_group_residual_and_inputs():
+    problem = Problem()
+    x = problem.add_variables(Euclidean(2), np.zeros((3, 2)), name="x")
+
+    class Broken(Prior):
+        def evaluate_into(self, begin, end, x, index, r, valid):
+            super().evaluate_into(begin, end, x, index, r, valid)
+            r[1] = np.nan
+
+        def linearize_into(self, begin, end, x, index, r, jacobians, valid):
+            super().linearize_into(begin, end, x, index, r, jacobians, valid)
+            r[1] = np.nan
+
+    problem.add_residuals(Broken(Euclidean(2), np.zeros((3, 2))), x, name="readings")
+    with pytest.raises(NotFiniteError, match=r"residual of residual 1 of group 'readings' \(3 × Broken\), at .*x\[1\]"):
+        problem.solve()
+
+
+def test_wrong_use_is_refused_with_advice(ring):
+    problem, poses = ring.problem, ring.poses
+    edge = RelativePose(ring.truth[:1])
+    with pytest.raises(InputError, match="the index dangles"):
+        poses[[0, 99]]
+    with pytest.raises(InputError, match="2 connections"):
+        problem.add_residuals(edge, poses[0])
+    with pytest.raises(InputError, match="one for each residual"):
+        problem.add_residuals(edge, poses[0], poses[:3])
+    with pytest.raises(InputError, match="variables of this problem"):
+        problem.add_residuals(edge, poses[0], make_ring().poses[1])
+    with pytest.raises(InputError, match="SE3"):
+        problem.add_residuals(Prior(Euclidean(7), np.zeros((1, 7))), poses[0])
+    with pytest.raises(InputError, match="new name"):
+        problem.add_variables(Euclidean(1), [[0.0]], name="poses")
+    with pytest.raises(InputError, match="at least one group"):
+        Problem().solve()
+    with pytest.raises(InputError, match="options or single settings"):
+        problem.solve(SolverOptions(), max_iterations=3)
+    with pytest.raises(ValueError, match="unknown_option"):
+        problem.solve(unknown_option=1)
+    problem.fix(poses)
+    with pytest.raises(InputError, match="at least one free variable"):
+        problem.solve()
+
+
+def test_the_same_variable_twice_in_a_residual():
+    problem = Problem()
+    x = problem.add_variables(SE3, SE3.identity()[None])
+    problem.add_residuals(RelativePose(SE3.identity()[None]), x[0], x[0])
+    problem.add_residuals(Prior(SE3, SE3.boxplus(SE3.identity(), np.full(6, 0.1))[None]), x[0])
+    solution = problem.solve()
+    np.testing.assert_allclose(SE3.boxminus(solution[x], SE3.identity()), 0.1, atol=1e-8)
