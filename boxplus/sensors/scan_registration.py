@@ -231,8 +231,38 @@ def _normals(points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np
     if len(points) < _NEIGHBOURS:  # a covered sensor sees a single spot
         return np.zeros(len(points), dtype=np.bool_), np.zeros((0, 3))
     _, index = cKDTree(points).query(points, k=_NEIGHBOURS)
-    neighbours = points[index]
-    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    plane = (variance[:, 0] < _THICKEST_PLANE * variance[:, 1]) & (variance[:, 1] > _THINNEST_PLANE * variance[:, 2])
-    return plane, axes[plane][:, :, 0]
+    neighbours = points.T[:, index]
+    x, y, z = neighbours - neighbours.mean(axis=2, keepdims=True)
+    scatter = np.stack([(a * b).sum(axis=1) for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))])
+    variance = _eigenvalues(scatter)
+    plane = (variance[0] < _THICKEST_PLANE * variance[1]) & (variance[1] > _THINNEST_PLANE * variance[2])
+    return plane, _eigenvector(scatter[:, plane], variance[0, plane])
+
+
+def _eigenvalues(A: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, N) rising eigenvalues of symmetric matrices (6, N): xx, yy, zz, xy, xz, yz. Closed form (Smith, CACM 1961)."""
+    xx, yy, zz, xy, xz, yz = A
+    mean = (xx + yy + zz) / 3.0
+    dx, dy, dz = xx - mean, yy - mean, zz - mean
+    scale = np.sqrt((dx * dx + dy * dy + dz * dz + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    determinant = dx * (dy * dz - yz * yz) - xy * (xy * dz - yz * xz) + xz * (xy * yz - dy * xz)
+    angle = np.arccos(np.clip(0.5 * determinant / np.maximum(scale**3, np.finfo(np.float64).tiny), -1.0, 1.0)) / 3.0
+    largest, least = mean + 2.0 * scale * np.cos(angle), mean + 2.0 * scale * np.cos(angle + 2.0 * np.pi / 3.0)
+    return np.stack([least, 3.0 * mean - largest - least, largest])
+
+
+def _eigenvector(A: NDArray[np.float64], eigenvalue: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) unit eigenvectors of an eigenvalue (N,) that is well apart from the others: the longest product of two rows."""
+    xx, yy, zz, xy, xz, yz = A
+    rows = np.array([[xx - eigenvalue, xy, xz], [xy, yy - eigenvalue, yz], [xz, yz, zz - eigenvalue]])
+    products = np.stack([_cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
+    squares = (products * products).sum(axis=1)
+    longest = squares.argmax(axis=0)
+    column = np.arange(len(eigenvalue))
+    axis: NDArray[np.float64] = products[longest, :, column] / np.sqrt(squares[longest, column])[:, None]
+    return axis
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """a × b of vectors (3, N)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

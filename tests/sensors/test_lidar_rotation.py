@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.sensors import scan_registration
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.lidar_rotation import align_rotations, estimate_rotation_extrinsic
@@ -177,3 +178,18 @@ def test_extrinsics_of_real_flights(shared_data: Path, name: str, start_s: float
     R_imu_lidar = np.array(json.loads((shared_data / "recordings" / f"{name}.json").read_text())["R_imu_lidar"])
     assert np.degrees(np.linalg.norm(so3.log(found.R_imu_lidar.T @ R_imu_lidar))) < 1.0
     assert abs(found.time_offset_s) < 0.01 and abs(found.gyro_scale - 1) < 0.05
+
+
+def test_eigenvalues_and_the_normal_in_closed_form() -> None:
+    random = np.random.default_rng(0)
+    factors = random.normal(size=(500, 3, 3)) * 10.0 ** random.uniform(-3.0, 1.0, size=(500, 1, 3))
+    A = np.concatenate([factors @ factors.transpose(0, 2, 1), [np.eye(3), np.zeros((3, 3)), np.diag([0.0, 1.0, 1.0])]])
+    entries = np.stack([A[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
+    expected, axes = np.linalg.eigh(A)
+    found = scan_registration._eigenvalues(entries)
+    assert np.all(np.abs(found.T - expected) <= 1e-7 * expected[:, 2:])
+    apart = (expected[:, 0] < 0.15 * expected[:, 1]) & (expected[:, 1] > 0.02 * expected[:, 2])
+    assert apart.sum() > 100
+    normals = scan_registration._eigenvector(entries[:, apart], found[0, apart])
+    along = np.abs(np.einsum("ni,ni->n", normals, axes[apart][:, :, 0]))
+    np.testing.assert_allclose(along, 1.0, atol=1e-6)
