@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.optimization.dense_kernels import Buffer, factor_panel
 from boxplus.optimization.supernodes import DIAGONAL, STORED
+from boxplus.optimization.vector_tiles import add
 
 Table = NDArray[np.void]
 Indices = NDArray[np.uint64]
@@ -52,13 +53,10 @@ def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, l
         column, there, length = runs[a]["child"], runs[a]["parent"], runs[a]["length"]
         for j in range(length):
             source = source_at + (column + j) * source_ld
-            to = target_at + (there + j - shift) * ld - shift
-            for i in range(j, length):
-                target[to + there + i] += stack[source + column + i]
+            to = target_at + (there + j - shift) * ld
+            add(target, to + there + j - shift, stack, source + column + j, length - j)
             for b in range(a + np.uint64(1), last):
-                row, below, count = runs[b]["child"], runs[b]["parent"], runs[b]["length"]
-                for i in range(count):
-                    target[to + below + i] += stack[source + row + i]
+                add(target, to + runs[b]["parent"] - shift, stack, source + runs[b]["child"], runs[b]["length"])
 
 
 @kernel

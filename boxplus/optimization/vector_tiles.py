@@ -5,6 +5,7 @@ A tile covers up to `TILE_ROWS` rows and 6, 3 or 1 columns of a column-major mat
 - `update`: C ← C - A Bᵀ, or C ← -A Bᵀ, over `depth` columns of A and B;
 - `transposed`: the same with B stored as its transpose, `depth` rows;
 - `dots`: for a single row of C, contiguous, and of A, with B stored as its transpose: C ← C - A Bᵀ;
+- `add`: C ← C + A for one column, short as a rule;
 - `solve`: C ← (C - A Bᵀ) L⁻ᵀ, where the lower triangle L follows B in its memory, as it does in a panel that is
   factorised from left to right, and the reciprocals of its diagonal are given;
 - `factor`: the same where C begins with the rows of L itself, which is formed in registers; the pivots (squares of L's
@@ -274,6 +275,33 @@ def _compiled_dots(columns: int) -> Callable[..., None]:
     return tile  # type: ignore[no-any-return]
 
 
+def _compiled_add() -> Callable[..., None]:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        c, c_at, a, a_at, count = args
+        target, source = _pointer(context, builder, c, c_at), _pointer(context, builder, a, a_at)
+        before = builder.block
+        loop, done = builder.append_basic_block("add"), builder.append_basic_block("add.done")
+        builder.branch(loop)
+        builder.position_at_end(loop)
+        row = builder.phi(_INDEX)
+        emit = _Emitter(builder, builder.sub(count, row), 1)
+        place = emit.address(target, row)
+        (old,), (more,) = emit.load(place), emit.load(emit.address(source, row))
+        emit.store([builder.fadd(old, more)], place)
+        following = builder.add(row, _INDEX(LANES))
+        row.add_incoming(_INDEX(0), before)
+        row.add_incoming(following, loop)
+        builder.cbranch(builder.icmp_unsigned("<", following, count), loop, done)
+        builder.position_at_end(done)
+        return context.get_dummy_value()
+
+    @intrinsic  # type: ignore[misc]
+    def tile(typing: Any, c: Any, c_at: Any, a: Any, a_at: Any, count: Any) -> Any:
+        return types.void(_BUFFER, _N, _BUFFER, _N, _N), generate
+
+    return tile  # type: ignore[no-any-return]
+
+
 def _view(buffer: NDArray[np.float64], at: int, ld: int, rows: int, columns: int) -> NDArray[np.float64]:
     return np.lib.stride_tricks.as_strided(buffer[int(at) :], (int(rows), int(columns)), (8, 8 * int(ld)))
 
@@ -291,12 +319,13 @@ def _plain_solve(columns: int, *, factor: bool) -> Callable[..., None]:
     def tile(c, c_at, ldc, a, a_at, lda, b, b_at, ldb, depth, rows, inverse, inverse_at, pivots=None):  # type: ignore[no-untyped-def]
         x, triangle = _view(c, c_at, ldc, rows, columns), _view(b, b_at + depth * ldb, ldb, columns, columns)
         x -= _view(a, a_at, lda, rows, depth) @ _view(b, b_at, ldb, columns, depth).T
-        for k in range(columns):
-            if factor:
-                pivots[inverse_at + k] = x[k, k]
-                inverse[inverse_at + k] = 1.0 / np.sqrt(x[k, k])
-            x[:, k] *= inverse[inverse_at + k]
-            x[:, k + 1 :] -= np.outer(x[:, k], x[k + 1 : columns, k] if factor else triangle[k + 1 :, k])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for k in range(columns):
+                if factor:
+                    pivots[inverse_at + k] = x[k, k]
+                    inverse[inverse_at + k] = 1.0 / np.sqrt(x[k, k])
+                x[:, k] *= inverse[inverse_at + k]
+                x[:, k + 1 :] -= np.outer(x[:, k], x[k + 1 : columns, k] if factor else triangle[k + 1 :, k])
 
     return tile
 
@@ -327,3 +356,10 @@ transposed_6, transposed_6_short, transposed_3, transposed_3_short, transposed_1
 solve_6, solve_6_short, solve_3, solve_3_short, solve_1, solve_1_short = _tiles("solve")
 factor_6, factor_6_short, factor_3, factor_3_short, factor_1, factor_1_short = _tiles("factor")
 dots_6, dots_3, dots_1 = ((_plain_dots if numba_config.DISABLE_JIT else _compiled_dots)(c) for c in (6, 3, 1))  # type: ignore[attr-defined]
+
+
+def _plain_add(c, c_at, a, a_at, count):  # type: ignore[no-untyped-def]
+    c[int(c_at) : int(c_at) + int(count)] += a[int(a_at) : int(a_at) + int(count)]
+
+
+add = _plain_add if numba_config.DISABLE_JIT else _compiled_add()  # type: ignore[attr-defined]
