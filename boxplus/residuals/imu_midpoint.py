@@ -22,6 +22,7 @@ from boxplus.residuals.matrix3 import (
     add_scaled,
     apply,
     cross_add,
+    mirrored,
     multiply,
     multiply_add,
     polynomial,
@@ -44,10 +45,10 @@ def _store(A: Matrix3, out: NDArray[np.float64], row: int, column: int) -> None:
 
 @kernel(inline=True)
 def _store_diagonal(A: Matrix3, out: NDArray[np.float64], row: int) -> None:
-    """The symmetric part of A into the diagonal block that begins at `row`."""
+    """Symmetric A into the diagonal block that begins at `row`."""
     for i in range(3):
         for j in range(3):
-            out[row + i, row + j] = 0.5 * (A[3 * i + j] + A[3 * j + i])
+            out[row + i, row + j] = A[3 * i + j]
 
 
 @kernel(inline=True)
@@ -177,11 +178,11 @@ def integrate_interval(
         new_bp = multiply_add(cross_add(transposed(p_of_b), L, transposed(p_of_p)), F_bg, transposed(p_noisy))
         new_bb = cross_add(transposed(b_of_b), L, transposed(b_of_p))
         new_bb = multiply_add(new_bb, F_ba, transposed(add_scaled(new_b_ba, q_accel, F_ba)))
-        new_bb = add_scaled(multiply_add(new_bb, F_bg, transposed(b_noisy)), q_flat, IDENTITY)
-        P_pp = multiply_add(p_of_p, p_noisy, transposed(K))
+        new_bb = mirrored(add_scaled(multiply_add(new_bb, F_bg, transposed(b_noisy)), q_flat, IDENTITY))
+        P_pp = mirrored(multiply_add(p_of_p, p_noisy, transposed(K)))
 
         P_aa = add_scaled(P_aa, half, add(add(P_ab, transposed(P_ab)), add(b_of_a, transposed(b_of_a))))
-        P_aa = add_scaled(P_aa, half * half, add(add(P_bb, new_bb), add(b_of_b, transposed(b_of_b))))
+        P_aa = mirrored(add_scaled(P_aa, half * half, add(add(P_bb, new_bb), add(b_of_b, transposed(b_of_b)))))
         P_ap = add_scaled(a_of_p, half, add(transposed(p_of_b), new_bp))
         P_ab = add_scaled(transposed(b_of_a), half, add(transposed(b_of_b), new_bb))
         P_a_ba = add_scaled(P_a_ba, half, add(P_b_ba, new_b_ba))
@@ -208,7 +209,7 @@ def integrate_interval(
             J[3 + i, j], J[3 + i, 3 + j] = 0.0, J_theta_g[n]
             J[6 + i, j], J[6 + i, 3 + j] = J_beta_a[n], J_beta_g[n]
     _store_diagonal(P_aa, P, ALPHA)
-    _store_diagonal(multiply(multiply(Rt, P_pp), R0), P, THETA)
+    _store_diagonal(mirrored(multiply(multiply(Rt, P_pp), R0)), P, THETA)
     _store_diagonal(P_bb, P, BETA)
     _store_diagonal(scaled(var_ba, IDENTITY), P, BIAS_ACCEL)
     _store_diagonal(scaled(var_bg, IDENTITY), P, BIAS_GYRO)

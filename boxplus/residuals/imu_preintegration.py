@@ -252,9 +252,10 @@ def _checked_samples(
         )
     if time.size < 2:
         raise InputError("at least two IMU samples", f"{time.size}", "an interval without motion data gives no factor")
-    steps = np.diff(time.astype(np.int64))
-    if (steps <= 0).any():
-        k = int(np.argmax(steps <= 0)) + 1
+    time = np.ascontiguousarray(time, dtype=np.int64)
+    ordered = time[1:] > time[:-1]
+    if not ordered.all():
+        k = int(np.argmin(ordered)) + 1
         raise InputError(
             "time_ns strictly increasing", f"{time[k]} after {time[k - 1]} at sample {k}", "sort the samples, drop doubles"
         )
@@ -263,11 +264,11 @@ def _checked_samples(
         array = np.ascontiguousarray(values, dtype=np.float64)
         if array.shape != (time.size, 3):
             raise InputError(f"{name} of shape ({time.size}, 3)", f"shape {array.shape}", "give one row for every time stamp")
-        finite = np.isfinite(array).all(axis=1)
-        if not finite.all():
-            raise InputError(f"{name} finite", f"{array[np.argmin(finite)]} at sample {np.argmin(finite)}", "drop that sample")
+        if not np.isfinite(array).all():
+            k = int(np.argmin(np.isfinite(array).all(axis=1)))
+            raise InputError(f"{name} finite", f"{array[k]} at sample {k}", "drop that sample")
         vectors.append(array)
-    return np.ascontiguousarray(time, dtype=np.int64), vectors[0], vectors[1]
+    return time, vectors[0], vectors[1]
 
 
 def _checked_intervals(intervals_ns: object, time: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -55,6 +55,12 @@ def transposed(A: Matrix3) -> Matrix3:
     return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
 
 
+@kernel(inline=True)
+def mirrored(A: Matrix3) -> Matrix3:
+    """The symmetric matrix with the upper triangle of A; what lies below it is then not even computed."""
+    return (A[0], A[1], A[2], A[1], A[4], A[5], A[2], A[5], A[8])
+
+
 @kernel(fastmath=True, inline=True)
 def multiply(A: Matrix3, B: Matrix3) -> Matrix3:
     """A B."""
