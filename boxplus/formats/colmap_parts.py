@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.formats.colmap_model import ColmapModel
 
+_TABLE_PER_ID = 16  # ids are looked up in a table where they are this dense, else by bisection
 _Scalar = TypeVar("_Scalar", np.int64, np.float64, np.uint8)
 
 
@@ -106,15 +107,21 @@ def _index(ids: NDArray[np.int64], names: NDArray[np.int64], kind: str, where: s
     """Where each name stands in `ids`."""
     if not len(names):
         return np.empty(0, np.int64)
-    order = np.argsort(ids, kind="stable")
-    place = (
-        order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)] if len(ids) else np.zeros(len(names), np.intp)
-    )
-    known = ids[place] == names if len(ids) else np.zeros(len(names), np.bool_)
-    if not known.all():
+    lowest, highest = (int(ids.min()), int(ids.max())) if len(ids) else (0, -1)
+    known = (names >= lowest) & (names <= highest)
+    place = np.full(len(names), -1, np.int64)
+    if highest - lowest < _TABLE_PER_ID * len(ids):
+        table = np.full(highest - lowest + 1, -1, np.int64)
+        table[ids - lowest] = np.arange(len(ids))
+        place[known] = table[names[known] - lowest]
+    else:
+        order = np.argsort(ids, kind="stable")
+        candidate = order[np.searchsorted(ids, names[known], sorter=order)]
+        place[known] = np.where(ids[candidate] == names[known], candidate, -1)
+    if (place < 0).any():
         raise InputError(
             f"{kind}s that the model has",
-            f"{kind} {names[np.argmin(known)]} in {where} ({folder})",
+            f"{kind} {names[np.argmax(place < 0)]} in {where} ({folder})",
             "the files are not of the same model: copy all of them again",
         )
-    return place.astype(np.int64)
+    return place
