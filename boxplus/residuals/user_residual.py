@@ -1,0 +1,268 @@
+"""Residuals that a user writes: a function of one residual, compiled on the fly, or a batch function in NumPy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds.manifold import Manifold
+from boxplus.manifolds.tangent_step import tangent_steps
+from boxplus.residuals.residual import Residual
+from boxplus.residuals.user_kernels import Loops, compiled_loops
+from boxplus.residuals.whitening import Whitening
+
+_STEP = 1e-5  # of central differences: truncation and rounding both stay below about 1e-10
+
+
+class UserResidual(Residual):
+    """A residual given by a Python function.
+
+    The function takes the stored numbers of every connected variable, then the entries of every data array, of one residual:
+
+        def relative_pose(T_i, T_j, z):               # rows (7,), (7,) and (7,)
+            ...
+            return w0, w1, w2, v0, v1, v2             # dim numbers: a tuple, or an array (slower)
+
+        UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(measured,), sigma=0.1)
+
+    It is compiled by Numba and called from a compiled loop; it may call kernels of `boxplus.manifolds` and functions of its own
+    that are compiled by `numba.njit`. Where it returns None the residual is singular and left out. With `is_batch` it is called
+    as it is, with (n, size) and (n, …) arrays of n residuals, and returns (n, dim), or that and a mask (n,) of valid ones.
+
+    Args:
+        function: as above; it must not change its arguments.
+        dim: rows of one residual.
+        manifolds: of the connected variables.
+        data: arrays (N,) or (N, …) with the measurements; an entry of (N,) comes as a scalar.
+        count: N, where there are no data.
+        jacobian: takes the arguments of the function and then, for every variable, an array (dim, dof) of zeros to fill with
+            ∂r(x ⊞ δ)/∂δ. In a batch, it returns one array (n, dim, dof) for each variable. Without it, Jacobians are central
+            differences on the manifold; `jacobian_kind` says which.
+        roles: names for the variables, for messages; the function's own argument names otherwise.
+        step: of the differences, in tangent units; one number, or for every variable a number or (dof,). A variable of 1e5
+            needs a larger one than the default 1e-5.
+        sigma, covariance, information: as for `Whitening.of`.
+        fixes_gauge: whether moving all connected variables as one rigid body changes the residual; by default, that of a
+            single variable.
+
+    Attributes:
+        jacobian_kind: "analytic" or "numeric".
+
+    Raises:
+        InputError: shapes that do not fit; a function that does not compile (with the reason Numba gives) or returns
+            another number of values, the latter when it is first called if its type does not tell.
+    """
+
+    jacobian_kind: Literal["analytic", "numeric"]
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *,
+        dim: int,
+        manifolds: Sequence[Manifold],
+        data: Sequence[ArrayLike] = (),
+        count: int | None = None,
+        jacobian: Callable[..., Any] | None = None,
+        is_batch: bool = False,
+        roles: Sequence[str] | None = None,
+        step: float | Sequence[ArrayLike] = _STEP,
+        sigma: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+        fixes_gauge: bool | None = None,
+    ) -> None:
+        connected = tuple(manifolds)
+        if not connected or not all(isinstance(manifold, Manifold) for manifold in connected):
+            raise InputError("manifolds as a tuple of manifolds", repr(manifolds), "write manifolds=(SE3, SE3)")
+        if dim < 1:
+            raise InputError("dim ≥ 1", str(dim), "give the number of rows of one residual")
+        self.data = tuple(_data(k, array) for k, array in enumerate(data))
+        rows = _count(self.data, count)
+        if roles is None:
+            code = getattr(function, "__code__", getattr(getattr(function, "py_func", None), "__code__", None))
+            roles = code.co_varnames[: len(connected)] if code is not None else ()
+        if len(roles) != len(connected):
+            roles = tuple(f"variable {k}" for k in range(len(connected)))
+        super().__init__(
+            dim=dim,
+            count=rows,
+            manifolds=connected,
+            roles=tuple(roles),
+            whitening=Whitening.of(dim, rows, sigma=sigma, covariance=covariance, information=information),
+            fixes_gauge=fixes_gauge,
+        )
+        self.function, self.jacobian, self.is_batch = function, jacobian, is_batch
+        self.jacobian_kind = "numeric" if jacobian is None else "analytic"
+        self._steps = _difference_steps(step, connected)
+        tables = tuple(tangent_steps(manifold) for manifold in connected)
+        self._tables = tables if all(table is not None for table in tables) else None
+        self._loops: Loops | None = None
+        if not is_batch:
+            types = tuple((array.dtype.name, array.ndim) for array in self.data)
+            self._loops = compiled_loops(function, jacobian, dim, connected, types, self._tables is not None)
+
+    def linearize_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        if self._loops is not None and self._loops.linearize is not None:
+            extra = (*self._tables, *self._steps) if self.jacobian is None and self._tables is not None else ()
+            self._check(self._loops.linearize(begin, end, *x, *index, *self.data, *extra, r, *jacobians, valid))
+            return
+        self.evaluate_into(begin, end, x, index, r, valid)
+        if self.jacobian is None:
+            self._differentiate(begin, end, x, index, jacobians, valid)
+        else:
+            self._call_batch_jacobian(self.jacobian, begin, end, self._gather(begin, end, x, index), jacobians)
+        for J in jacobians:
+            J[begin:end][~valid[begin:end]] = 0.0
+        r[begin:end][~valid[begin:end]] = 0.0
+
+    def evaluate_into(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        if self._loops is not None:
+            self._check(self._loops.evaluate(begin, end, *x, *index, *self.data, r, valid))
+        else:
+            r[begin:end], valid[begin:end] = self._call_batch(begin, end, self._gather(begin, end, x, index))
+            r[begin:end][~valid[begin:end]] = 0.0
+
+    def _gather(
+        self, begin: int, end: int, x: tuple[NDArray[np.float64], ...], index: tuple[NDArray[np.uint32], ...]
+    ) -> list[NDArray[np.float64]]:
+        return [values[rows[begin:end]] for values, rows in zip(x, index, strict=True)]
+
+    def _at(self, begin: int, end: int, values: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Residuals and validity of rows [begin, end) with one value (end − begin, size) of every variable each."""
+        if self._loops is None:
+            return self._call_batch(begin, end, values)
+        r, valid = np.zeros((end - begin, self.dim)), np.ones(end - begin, dtype=np.bool_)
+        rows = (np.arange(end - begin, dtype=np.uint32),) * len(values)
+        data = (array[begin:end] for array in self.data)
+        self._check(self._loops.evaluate(0, end - begin, *values, *rows, *data, r, valid))
+        return r, valid
+
+    def _call_batch(
+        self, begin: int, end: int, values: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        returned = self.function(*values, *(array[begin:end] for array in self.data))
+        if not (isinstance(returned, tuple) and len(returned) == 2):
+            returned = returned, np.ones(end - begin, dtype=np.bool_)
+        r, valid = np.asarray(returned[0], dtype=np.float64), np.asarray(returned[1])
+        if r.shape != (end - begin, self.dim) or valid.shape != (end - begin,) or valid.dtype != np.bool_:
+            raise InputError(
+                f"residuals ({end - begin}, {self.dim}) from {self._name}, or those and a mask ({end - begin},) of bool",
+                f"shape {r.shape} with a mask {valid.shape} of {valid.dtype}",
+                "return one row for each residual",
+            )
+        return r, valid
+
+    def _call_batch_jacobian(
+        self,
+        jacobian: Callable[..., Any],
+        begin: int,
+        end: int,
+        values: Sequence[NDArray[np.float64]],
+        jacobians: tuple[NDArray[np.float64], ...],
+    ) -> None:
+        returned = jacobian(*values, *(array[begin:end] for array in self.data))
+        matrices = [np.asarray(J, dtype=np.float64) for J in (returned if isinstance(returned, tuple | list) else (returned,))]
+        shapes = [(end - begin, self.dim, manifold.dof) for manifold in self.manifolds]
+        if [J.shape for J in matrices] != shapes:
+            raise InputError(
+                f"Jacobians of shapes {shapes}",
+                f"{[J.shape for J in matrices]}",
+                "return one (n, dim, dof) array for each variable",
+            )
+        for J, matrix in zip(jacobians, matrices, strict=True):
+            J[begin:end] = matrix
+
+    def _differentiate(
+        self,
+        begin: int,
+        end: int,
+        x: tuple[NDArray[np.float64], ...],
+        index: tuple[NDArray[np.uint32], ...],
+        jacobians: tuple[NDArray[np.float64], ...],
+        valid: NDArray[np.bool_],
+    ) -> None:
+        """Central differences, a whole chunk at a time; a residual with a singular neighbour counts as singular."""
+        values = self._gather(begin, end, x, index)
+        for slot, manifold in enumerate(self.manifolds):
+            moved = list(values)
+            for k in range(manifold.dof):
+                delta = np.zeros(manifold.dof)
+                delta[k] = h = self._steps[slot][k, 0]
+                moved[slot] = manifold.boxplus(values[slot], delta)
+                ahead, valid_ahead = self._at(begin, end, moved)
+                moved[slot] = manifold.boxplus(values[slot], -delta)
+                behind, valid_behind = self._at(begin, end, moved)
+                jacobians[slot][begin:end, :, k] = (ahead - behind) * (0.5 / h)
+                valid[begin:end] &= valid_ahead & valid_behind
+
+    @property
+    def _name(self) -> str:
+        return str(getattr(self.function, "__name__", "the function"))
+
+    def _check(self, status: int) -> None:
+        if status:
+            raise InputError(f"{self.dim} numbers from {self._name}", f"{status - 1}", "return as many as dim says")
+
+
+def _data(number: int, array: ArrayLike) -> NDArray[Any]:
+    values = np.asarray(array)
+    if values.dtype.kind not in "fiub" or values.ndim == 0:
+        raise InputError(
+            f"data[{number}] as numbers (N, …)",
+            f"{values.dtype} of shape {values.shape}",
+            "give one row for each residual; a constant is written into the function or taken from around it",
+        )
+    return np.ascontiguousarray(values, dtype=np.float64 if values.dtype.kind == "f" else np.int64)
+
+
+def _count(data: tuple[NDArray[Any], ...], count: int | None) -> int:
+    lengths = {len(array) for array in data} | ({count} if count is not None else set())
+    if len(lengths) != 1:
+        raise InputError(
+            "data arrays of one length N, or count",
+            f"lengths {[len(array) for array in data]}" + ("" if count is None else f" and count {count}"),
+            "give one row for each residual",
+        )
+    return lengths.pop()
+
+
+def _difference_steps(step: float | Sequence[ArrayLike], manifolds: tuple[Manifold, ...]) -> tuple[NDArray[np.float64], ...]:
+    """For every variable (dof, 3): step h, cos h/2, sin h/2."""
+    given = [step] * len(manifolds) if isinstance(step, int | float) else list(step)
+    if len(given) != len(manifolds):
+        raise InputError(f"one step, or {len(manifolds)}", f"{len(given)}", "give one for each connected variable")
+    tables = []
+    for manifold, one in zip(manifolds, given, strict=True):
+        h = np.asarray(one, dtype=np.float64)
+        if h.shape not in ((), (manifold.dof,)) or not (np.isfinite(h) & (h > 0.0) & (h < math.pi)).all():
+            raise InputError(
+                f"a positive step, or ({manifold.dof},) for {manifold.name}",
+                f"{one!r}",
+                "take about 1e-5 of the variable's scale",
+            )
+        h = np.broadcast_to(h, (manifold.dof,))
+        tables.append(np.column_stack([h, np.cos(0.5 * h), np.sin(0.5 * h)]))
+    return tuple(tables)
