@@ -24,7 +24,7 @@ class NotPositiveDefinite(BoxplusError, ArithmeticError):
     Attributes:
         block: the variable (block row) at which the elimination failed.
         component: its degree of freedom, from 0.
-        pivot: what was left on the diagonal there; not positive, or not finite.
+        pivot: what was left on the diagonal there; not positive, not finite, or below the rounding of its diagonal entry.
     """
 
     def __init__(self, block: int, component: int, pivot: float) -> None:
@@ -75,7 +75,7 @@ class SparseCholesky:
         size = int(pattern.start[-1])
         self._factor = _aligned(fronts.factor_size)
         self._stack = _aligned(fronts.stack_size)
-        self._inverse, self._pivots, self._diagonal = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._inverse, self._pivots, self._diagonal, self._entries = (np.zeros(size) for _ in range(4))
         self._most_below = int(fronts.table["below"].max())
         self._work, self._below = np.empty(size), np.empty(self._most_below)
         self._factorized = False
@@ -117,7 +117,7 @@ class SparseCholesky:
 
         Raises:
             InputError: another number of values.
-            NotPositiveDefinite: naming the variable whose pivot is not positive and finite.
+            NotPositiveDefinite: naming the variable whose pivot is not positive and finite, or only so by rounding.
         """
         values = np.ascontiguousarray(values, np.float64)
         if values.shape != (self.pattern.value_start[-1],):
@@ -147,6 +147,7 @@ class SparseCholesky:
                 factorize(
                     fronts.sequence, begin, end, fronts.table, fronts.children, fronts.runs, fronts.entries,
                     fronts.scalar_order, values, self._diagonal, self._factor, self._stack, self._inverse, self._pivots,
+                    self._entries,
                 )
             )  # fmt: skip
 

@@ -17,6 +17,10 @@ from boxplus.optimization.vector_tiles import add
 Table = NDArray[np.void]
 Indices = NDArray[np.uint64]
 
+SINGULAR = 1e-13
+"""A pivot that has lost all but this share of its diagonal entry is rounding error: the matrix is singular. Scaling a matrix
+does not change the share; it is above 1e-8 on the usual pose graphs."""
+
 _ZERO = np.uint64(0)
 _STORED, _DIAGONAL = np.uint64(STORED), np.uint64(DIAGONAL)
 
@@ -62,16 +66,17 @@ def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, l
 @kernel
 def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table, children: Indices, runs: Table, entries: Table,
               scalar_order: Indices, values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, inverse: Buffer,
-              pivots: Buffer) -> np.uint64:  # fmt: skip
+              pivots: Buffer, entries_of_diagonal: Buffer) -> np.uint64:  # fmt: skip
     """Factorise the fronts `sequence[begin:end]`, whose children come before them or are done.
 
     Args:
         diagonal: (N,) added to the diagonal, in the order of the matrix.
         factor: receives the panels of L.
         inverse, pivots: (N,) receive the reciprocals of L's diagonal and the pivots, in elimination order.
+        entries_of_diagonal: (N,) receives the diagonal before elimination, in elimination order.
 
     Returns:
-        The scalar position whose pivot is not positive and finite, or N.
+        The scalar position whose pivot is not positive and finite, or only so by rounding, or N.
     """
     for place in range(begin, end):
         g = sequence[place]
@@ -82,7 +87,9 @@ def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table,
             factor[k] = 0.0
         _fill_panel(front["entry_start"], following["entry_start"], ld, entries, values, factor)
         for k in range(width):
-            factor[at + k + k * ld] += diagonal[scalar_order[column + k]]
+            entry = factor[at + k + k * ld] + diagonal[scalar_order[column + k]]
+            factor[at + k + k * ld] = entry
+            entries_of_diagonal[column + k] = entry
         for c in range(front["child_start"], following["child_start"]):
             child, behind = table[children[c]], table[children[c] + np.uint64(1)]
             _add_child(
@@ -92,6 +99,9 @@ def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table,
         failed = factor_panel(factor, at, ld, width + below, width, inverse, pivots, column, stack, update_at, update_ld)
         if failed < width:
             return np.uint64(column + failed)
+        for k in range(column, column + width):
+            if pivots[k] <= SINGULAR * entries_of_diagonal[k]:
+                return np.uint64(k)
         for c in range(front["child_start"], following["child_start"]):
             child, behind = table[children[c]], table[children[c] + np.uint64(1)]
             split, last = child["run_split"], behind["run_start"]

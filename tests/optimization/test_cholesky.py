@@ -192,3 +192,20 @@ def test_threads_change_no_bit(threads: int, monkeypatch: pytest.MonkeyPatch) ->
     assert len(SparseCholesky(BlockPattern.from_pairs(*SHAPES["grid"])[0], threads=threads)._fronts.parts) > 3
     with pytest.raises(InputError, match="at least one thread"):
         SparseCholesky(pattern, threads=0)
+
+
+@given(seed=st.integers(0, 10**6), scale=st.sampled_from([1e-12, 1.0, 1e12]))
+def test_a_graph_without_gauge_is_singular(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    i, j = np.concatenate([[range(29), range(1, 30)], rng.integers(0, 30, (2, 40))], axis=1)
+    i, j = i[i != j], j[i != j]
+    pattern, index = BlockPattern.from_pairs([3] * 30, np.concatenate([i, j, i]), np.concatenate([i, j, j]))
+    root = rng.normal(size=(len(i), 3, 3)) * scale
+    square = root @ root.transpose(0, 2, 1)
+    values = np.zeros((len(pattern.row), 3, 3))
+    np.add.at(values, index.block, np.concatenate([square, square, -square]))
+    cholesky = SparseCholesky(pattern)
+    with pytest.raises(NotPositiveDefinite):
+        cholesky.factorize(values.ravel())
+    values[0] += 1e-6 * square[0] + 1e-6 * scale**2 * np.eye(3)
+    cholesky.factorize(values.ravel())
