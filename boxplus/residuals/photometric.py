@@ -37,7 +37,7 @@ DSO_PATTERN = ((0, 0), (0, -2), (-1, -1), (1, -1), (-2, 0), (2, 0), (-1, 1), (0,
 
 _SLOTS: tuple[tuple[str, Manifold], ...] = (
     ("T_21", SE3Left),
-    ("inverse_depth", Euclidean(1)),
+    ("rho", Euclidean(1)),
     ("intrinsics", Euclidean(4)),
     ("brightness", Euclidean(2)),
 )
@@ -48,7 +48,7 @@ class Photometric(Residual):
 
     Variables, in this order, the last three where asked for:
         `T_21` on `SE3Left` (7,): maps points in camera 1 to camera 2;
-        `inverse_depth` (1,): ρ in view 1 [1/m], shared by a patch;
+        `rho` (1,): inverse depth ρ in view 1 [1/m], shared by a patch;
         `intrinsics` (4,): fx, fy, cx, cy of both views [px];
         `brightness` (2,): a, b of image 2.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,8 +16,10 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.jacobian_check import check_jacobian
+from boxplus.optimization.problem import Problem
 from boxplus.residuals.imu import POSE, VELOCITY_BIAS, ImuPreintegration
 from boxplus.residuals.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.prior import Prior
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
 GRAVITY = np.array([0.3, -0.2, -9.7])
@@ -169,3 +173,36 @@ def test_refusals() -> None:
         ImuPreintegration(p, gravity=9.81)
     with pytest.raises(InputError, match='rotation "log" or "vector"'):
         ImuPreintegration(p, rotation="euler")  # type: ignore[arg-type]
+
+
+def test_biases_and_velocities_of_a_flight_from_its_poses(shared_data: Path) -> None:
+    """20 s of EuRoC: poses known to 5 mm and 0.1°, everything else from the IMU, biases from zero with one re-integration."""
+    folder = shared_data / "imu"
+    time_ns = np.loadtxt(folder / "V1_03_difficult.imu.csv", delimiter=",", usecols=0, dtype=np.int64)
+    samples = np.loadtxt(folder / "V1_03_difficult.imu.csv", delimiter=",")[:, 1:]
+    truth_ns = np.loadtxt(folder / "V1_03_difficult.gt.csv", delimiter=",", usecols=0, dtype=np.int64)
+    chosen = np.arange(2000, 6000, 40)
+    times, truth = truth_ns[chosen], np.loadtxt(folder / "V1_03_difficult.gt.csv", delimiter=",")[chosen, 1:]
+    measured = POSE.check("truth", truth[:, [3, 4, 5, 6, 0, 1, 2]])
+    imu = ImuPreintegration(
+        Preintegration.integrate(
+            time_ns,
+            samples[:, :3],
+            samples[:, 3:],
+            noise=ImuNoise(gyro=1.7e-4, accel=2e-3, gyro_walk=1.9e-5, accel_walk=3e-3),
+            intervals_ns=np.stack([times[:-1], times[1:]], axis=1),
+        )
+    )
+    problem = Problem()
+    poses = problem.add_variables(POSE, measured)
+    states = problem.add_variables(VELOCITY_BIAS, np.zeros((len(times), 9)))
+    problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:])
+    problem.add_residuals(Prior(POSE, measured, sigma=np.repeat([2e-3, 5e-3], 3)), poses)
+    first = problem.solve()
+    assert imu.refresh(first[states][:-1]) > 0
+    found = problem.solve()
+    state = found[states]
+    assert imu.refresh(state[:-1]) == 0
+    assert np.linalg.norm(state[:, :3] - truth[:, 7:10], axis=1).mean() < 0.03
+    assert np.abs(state[:, 6:] - truth[:, 10:13]).mean() < 1e-3
+    assert np.abs(state[:, 3:6] - truth[:, 13:16]).mean() < 0.05
