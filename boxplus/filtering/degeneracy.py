@@ -59,8 +59,14 @@ def project_out_weak(
 
 def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
     """The Gauss-Newton step (6,) of the pose alone, without the weak directions; zero if all are weak."""
+    step: NDArray[np.float64] = -strong_covariance(A, directions) @ b[:6]
+    return step
+
+
+def strong_covariance(A: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
+    """(6, 6) covariance of the pose from A alone, zero along the weak directions."""
     scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
     strong = directions.vectors[:, ~directions.weak]
     reduced = strong.T @ (A[:6, :6] * np.outer(scale, scale)) @ strong
-    step: NDArray[np.float64] = -scale * (strong @ np.linalg.solve(reduced, strong.T @ (scale * b[:6])))
-    return step
+    covariance: NDArray[np.float64] = np.outer(scale, scale) * (strong @ np.linalg.solve(reduced, strong.T))
+    return covariance

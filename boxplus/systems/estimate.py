@@ -47,7 +47,10 @@ class Estimate:
         time_ns: the instant the estimate holds for: the last point of the scan, absolute [ns].
         state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
         covariance: (24, 24) float64 of the tangent `[θ, p, v, b_ω, b_a, g, θ_L, p_L]` at `state` (SPEC.md 9.1): rotations
-            perturbed on the right (IMU frame) [rad], position and velocity along the world's axes.
+            perturbed on the right (IMU frame) [rad], position and velocity along the world's axes. It is the filter's, which
+            takes the map for exact: the pose is meant relative to the map around it.
+        pose_covariance: (6, 6) float64 of the pose `[θ, p]`, order and axes as above, relative to the first pose: with what the
+            map has taken over from the errors of earlier poses. It grows with the way (see `filtering.map_datum`).
         status: "ok"; "weak": some directions were predicted only (see `weak_directions`); "lost": no update was possible, or too
             few points fit the map, scan after scan.
         weak_directions: the directions the scan did not determine.
@@ -67,6 +70,7 @@ class Estimate:
     time_ns: int
     state: NavState
     covariance: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
     status: Status
     weak_directions: tuple[WeakDirection, ...]
     lidar_share: NDArray[np.float64]
@@ -89,11 +93,6 @@ class Estimate:
         T[:3, :3] = self.state.R_world_imu
         T[:3, 3] = self.state.p_world_imu
         return T
-
-    @property
-    def pose_covariance(self) -> NDArray[np.float64]:
-        """(6, 6) covariance of the pose, rotation first: [θ about the IMU's axes (rad), p along the world's axes (m)]."""
-        return self.covariance[:6, :6]
 
     def points_world(self) -> NDArray[np.float64]:
         """(N, 3) float64, the scan's points registered in the world."""

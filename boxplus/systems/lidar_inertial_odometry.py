@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import PoseDirections, pose_directions, project_out_weak
 from boxplus.filtering.iterated_update import map_step, move_covariance
+from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, V, boxplus_into
 from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import NODE, propagate_interval
@@ -67,6 +68,7 @@ class LidarInertialOdometry:
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
+        self._datum = MapDatum(NavState.identity().pack(), self._cov)
         self._time_ns = 0
         c = self.config
         self._density = np.array([c.gyro_noise, c.accel_noise, c.gyro_bias_walk, c.accel_bias_walk]) ** 2
@@ -143,6 +145,7 @@ class LidarInertialOdometry:
             return []
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
+        self._datum = MapDatum(self._x, self._cov)
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
@@ -286,9 +289,11 @@ class LidarInertialOdometry:
             self._x[:] = x_prior
             rejected["scan without an update"] = used
             used = 0
+            self._datum.follow(self._x, cov_prior, self._cov)
         else:
             self._cov[:] = posterior
             move_covariance(self._cov, delta)
+            self._datum.follow(self._x, cov_prior, self._cov, A, directions)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
@@ -312,7 +317,7 @@ class LidarInertialOdometry:
         )
 
     def _insert(self, points: NDArray[np.float32]) -> None:
-        self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True)
+        self._datum.insert(self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True).inserted)
 
     def _estimate(
         self,
@@ -349,6 +354,7 @@ class LidarInertialOdometry:
             time_ns=frame.scan.end_ns,
             state=NavState.unpack(self._x),
             covariance=self._cov.copy(),
+            pose_covariance=self._datum.pose_covariance(self._x),
             status=status,
             weak_directions=weak,
             lidar_share=np.zeros(6) if share is None else share,

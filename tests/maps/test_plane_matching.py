@@ -120,7 +120,9 @@ def test_a_ring_around_a_corner_is_not_taken_for_a_floor() -> None:
     match = _match(IkdTree(ring), NavState.identity(), ring.astype(np.float32))
     assert (match.fate != USED).all()
     # A second ring makes planes of both walls.
-    match = _match(IkdTree(np.concatenate([ring, ring + np.array([0.0, 0.0, 0.5])])), NavState.identity(), ring.astype(np.float32))
+    match = _match(
+        IkdTree(np.concatenate([ring, ring + np.array([0.0, 0.0, 0.5])])), NavState.identity(), ring.astype(np.float32)
+    )
     used = match.fate == USED
     assert used.mean() > 0.5
     assert (np.abs(match.planes[used, 2]) < 0.3).all()

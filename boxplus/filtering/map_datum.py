@@ -1,0 +1,110 @@
+"""The covariance of a pose against the start of a run, when the map is made from the estimates themselves.
+
+The filter measures the pose against the map and takes the map for exact: its covariance P is that of the pose relative to
+the *local map*. The map has been placed by earlier estimates and shares their errors, which no later scan can see. Both are
+followed here to first order, with the gain the filter has used (a consider or Schmidt filter, Jazwinski 1970, section 8.4):
+
+    e ← (I − G)(e + w) + G (d + v)        pose error after a scan; G = P Aₓ, Aₓ the scan's information about the pose
+    d ← (1 − f) d + f (e + n)             datum error of the map; f, the share of the local map that the scan has brought
+
+w is the IMU's noise over the scan (prior minus last posterior covariance of the filter), v that of the points (K R Kᵀ =
+P A P), and n that of the map points: f N points, if N are compared in a scan, place what they bring as badly as a scan
+of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has the covariance of the filter.
+
+The local map is what has been taken in within about one lever arm of the points: what lies farther back is not compared any more.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.degeneracy import PoseDirections, strong_covariance
+from boxplus.filtering.nav_state import MEASURED, P, R
+
+_POSE = slice(0, 6)
+_MAP = slice(6, 12)
+
+
+class MapDatum:
+    """Joint covariance (12, 12) of the errors of pose and map, as small motions about the IMU: [θ, p] along the world's axes.
+
+    Args:
+        x: (36,) first state; cov: (24, 24) its covariance. The first scan makes the map at this pose.
+    """
+
+    def __init__(self, x: NDArray[np.float64], cov: NDArray[np.float64]) -> None:
+        self._filter = _along_world(cov[_POSE, _POSE], x)
+        self._joint = np.zeros((12, 12))
+        self._joint[_POSE, _POSE] = self._filter
+        self._p_world_imu = x[P : P + 3].copy()
+        self._local_points = 0.0
+        self._new_share = 0.0
+
+    def follow(
+        self,
+        x: NDArray[np.float64],
+        cov_prior: NDArray[np.float64],
+        cov: NDArray[np.float64],
+        A: NDArray[np.float64] | None = None,
+        directions: PoseDirections | None = None,
+    ) -> None:
+        """The filter has gone on by a scan.
+
+        Args:
+            x: (36,) posterior; cov_prior, cov: (24, 24), covariance of the filter before and after the scan.
+            A: (12, 12) information of the scan as the filter took it, with the directions of the pose it determines; None if
+                the filter took none.
+        """
+        shift = x[P : P + 3] - self._p_world_imu
+        move = np.eye(6)  # a small motion about the last position, as one about this position
+        move[3:, :3] = [[0.0, shift[2], -shift[1]], [-shift[2], 0.0, shift[0]], [shift[1], -shift[0], 0.0]]
+        both = np.kron(np.eye(2), move)
+        joint = both @ self._joint @ both.T
+        prior = _along_world(cov_prior[_POSE, _POSE], x)
+        joint[_POSE, _POSE] += _positive(prior - move @ self._filter @ move.T)
+        if A is not None and directions is not None:
+            joint[_MAP, _MAP] += self._new_share * _along_world(strong_covariance(A, directions), x)
+            self._new_share = 0.0
+            self._local_points *= math.exp(-float(np.linalg.norm(shift)) / directions.lever_arm)
+            gain = cov[_POSE][:, MEASURED] @ A
+            step = np.eye(12)
+            step[_POSE, _MAP] = _along_world(gain[:, _POSE], x)
+            step[_POSE, _POSE] -= step[_POSE, _MAP]
+            joint = step @ joint @ step.T
+            joint[_POSE, _POSE] += _along_world(gain @ cov[MEASURED][:, _POSE], x)
+        self._joint, self._filter, self._p_world_imu = joint, _along_world(cov[_POSE, _POSE], x), x[P : P + 3].copy()
+
+    def insert(self, points: int) -> None:
+        """The map has taken in so many points of the scan."""
+        self._local_points += points
+        self._new_share = points / self._local_points if points else 0.0
+        step = np.eye(12)
+        step[_MAP, _MAP] *= 1.0 - self._new_share
+        step[_MAP, _POSE] = self._new_share * np.eye(6)
+        self._joint = step @ self._joint @ step.T
+
+    def pose_covariance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6, 6) covariance of the pose at x (36,) against the first pose: [θ about the IMU's axes, p along the world's]."""
+        return _turned(self._joint[_POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
+
+
+def _along_world(M: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A (6, 6) over [θ about the IMU's axes, p], with θ about the world's."""
+    return _turned(M, x[R : R + 9].reshape(3, 3))
+
+
+def _turned(M: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    turned = M.copy()
+    turned[:3] = rotation @ turned[:3]
+    turned[:, :3] = turned[:, :3] @ rotation.T
+    return turned
+
+
+def _positive(M: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The positive semidefinite part of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(M)
+    positive: NDArray[np.float64] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return positive

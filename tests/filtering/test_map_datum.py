@@ -1,0 +1,104 @@
+"""The joint covariance of pose and map against the filter's own, and against sampled errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from boxplus.filtering.degeneracy import pose_directions
+from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.nav_state import MEASURED, NavState
+from boxplus.manifolds import so3
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def _state(R_world_imu: np.ndarray, p_world_imu: np.ndarray) -> np.ndarray:
+    zero = np.zeros(3)
+    return NavState(R_world_imu, p_world_imu, zero, zero, zero, zero, np.eye(3), zero).pack()
+
+
+def _information(random: np.random.Generator) -> np.ndarray:
+    """A (12, 12) of forty points, the mounting not estimated."""
+    s, u = random.uniform(-8, 8, (40, 3)), random.normal(size=(40, 3))
+    h = np.hstack([np.cross(s, u), u])
+    A = np.zeros((12, 12))
+    A[:6, :6] = 1e3 * h.T @ h
+    return A
+
+
+def _updated(cov_prior: np.ndarray, A: np.ndarray) -> np.ndarray:
+    information = np.linalg.inv(cov_prior)
+    information[np.ix_(MEASURED, MEASURED)] += A
+    return np.linalg.inv(information)
+
+
+def _scan(datum: MapDatum, random: np.random.Generator, x: np.ndarray, cov: np.ndarray, noise: float) -> np.ndarray:
+    """One scan; returns the filter's covariance after it."""
+    cov_prior = cov + noise**2 * np.eye(24)
+    A = _information(random)
+    posterior = _updated(cov_prior, A)
+    datum.follow(x, cov_prior, posterior, A, pose_directions(A, 8.0, 0.0))
+    return posterior
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_against_an_exact_map_it_is_the_covariance_of_the_filter(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x, cov = _state(so3.exp(random.normal(size=3)), np.zeros(3)), 1e-4 * np.eye(24)
+    datum = MapDatum(x, cov)
+    for _ in range(4):
+        cov = _scan(datum, random, x, cov, 1e-2)
+        np.testing.assert_allclose(datum.pose_covariance(x), cov[:6, :6], rtol=1e-6, atol=1e-12)
+    datum.follow(x, cov + np.eye(24), cov + np.eye(24))  # a scan that was lost
+    np.testing.assert_allclose(datum.pose_covariance(x), cov[:6, :6] + np.eye(6), rtol=1e-6)
+
+
+def test_a_map_that_moves_with_the_sensor_loses_the_start() -> None:
+    """On the spot the covariance settles; on the way it grows, beyond the filter's, which does not."""
+    final = []
+    for step in (0.0, 2.0):
+        random = np.random.default_rng(0)
+        x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
+        datum = MapDatum(x, cov)
+        datum.insert(1000)
+        for k in range(60):
+            x = _state(np.eye(3), np.array([step * k, 0.0, 0.0]))
+            cov = _scan(datum, random, x, cov, 1e-3)
+            datum.insert(1000 if step else 10)
+        sigma = np.sqrt(datum.pose_covariance(x).diagonal())
+        assert (np.linalg.eigvalsh(datum.pose_covariance(x)) > 0).all()
+        assert (sigma >= 0.999 * np.sqrt(cov.diagonal()[:6])).all()
+        final.append(sigma)
+    assert (final[1][:3] > 2.0 * final[0][:3]).all()
+    assert (final[1][4:] > 10.0 * final[0][4:]).all()  # across the way, by the lever of the heading
+
+
+def test_sampled_errors_spread_as_it_says() -> None:
+    """Errors drawn through the equations of `map_datum`, in a world frame that is not the IMU's."""
+    random, runs, share_new = np.random.default_rng(1), 20000, 0.5
+    R = so3.exp(np.array([0.3, -0.2, 1.0]))
+    turn = np.kron(np.diag([1.0, 0.0]), R) + np.kron(np.diag([0.0, 1.0]), np.eye(3))
+    x, cov = _state(R, np.zeros(3)), 1e-4 * np.eye(24)
+    datum = MapDatum(x, cov)
+    e, d = 1e-2 * random.normal(size=(2, runs, 6))
+    e, d, points = e @ turn.T, 0.0 * d, 0.0
+    for _ in range(5):
+        A, cov_prior = _information(random), cov + 1e-4 * np.eye(24)
+        cov = _updated(cov_prior, A)
+        points += 100.0
+        datum.follow(x, cov_prior, cov, A, pose_directions(A, 8.0, 0.0))
+        noise = np.linalg.cholesky(turn @ np.linalg.inv(A[:6, :6]) @ turn.T)
+        if points > 100.0:
+            d += np.sqrt(share_new) * random.normal(size=(runs, 6)) @ noise.T
+        G = turn @ cov[:6, :6] @ A[:6, :6] @ turn.T
+        e = (e + 1e-2 * random.normal(size=(runs, 6))) @ (np.eye(6) - G).T + (d + random.normal(size=(runs, 6)) @ noise.T) @ G.T
+        datum.insert(100)
+        share_new = 100.0 / points
+        d = (1.0 - share_new) * d + share_new * e
+    sampled = turn.T @ np.cov(e.T) @ turn
+    expected = datum.pose_covariance(x)
+    scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    np.testing.assert_allclose(sampled / scale, expected / scale, atol=0.05)
