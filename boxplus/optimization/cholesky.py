@@ -207,8 +207,8 @@ class SparseCholesky:
         if len(known):
             if self._selected is None:
                 self._selected = SelectedInverse(self._fronts, self._factor, self._inverse, self._stack)
-            for k in known:
-                blocks[k] = self._selected.block(int(place[k]), int(i[k]), int(j[k]))
+            for k, block in zip(known, self._selected.blocks(place[known], i[known], j[known]), strict=True):
+                blocks[k] = block
         solved = np.flatnonzero(place < 0)
         start, sizes = self.pattern.start, self.pattern.sizes
         for column in np.unique(j[solved]):

@@ -17,28 +17,40 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.optimization.dense_kernels import Buffer, update
 from boxplus.optimization.multifrontal import Indices, Table
-from boxplus.optimization.supernodes import Fronts
+from boxplus.optimization.supernodes import DIAGONAL, STORED, TRANSPOSED, Fronts
+from boxplus.optimization.triangular_solve import forward
 
 _ZERO, _ONE = np.uint64(0), np.uint64(1)
+_SQUARE = np.uint64(8)
 
 
 @kernel
 def _invert_triangle(factor: Buffer, at: np.uint64, ld: np.uint64, inverse: Buffer, column: np.uint64, width: np.uint64,
                      m: Buffer, negative: Buffer) -> None:  # fmt: skip
-    """M = L₁₁⁻¹, transposed, (width, width), and its negative."""
+    """M = L₁₁⁻¹, row by row, (width, width), and its negative."""
     for k in range(width * width):
         m[k] = 0.0
     for k in range(width):
-        row = k * width
-        for j in range(k):
-            weight = factor[at + k + j * ld]
-            for i in range(j + _ONE):
-                m[row + i] -= weight * m[j * width + i]
-        m[row + k] = 1.0
-        for i in range(k + _ONE):
-            m[row + i] *= inverse[column + k]
+        m[k + k * width] = 1.0
+    forward(factor, at, ld, width, inverse, column, m, _ZERO, width)
     for k in range(width * width):
         negative[k] = -m[k]
+
+
+@kernel
+def _transpose(source: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, columns: np.uint64, target: Buffer, to: np.uint64,
+               to_ld: np.uint64, lower: np.uint64) -> None:  # fmt: skip
+    """Copy a column-major matrix to the place of its transpose, in small squares; with `lower` = 1 only below its diagonal."""
+    for corner in range((columns + _SQUARE - _ONE) // _SQUARE):
+        first = corner * _SQUARE
+        last = min(first + _SQUARE, columns)
+        top = first * lower
+        while top < rows:
+            bottom = min(top + _SQUARE, rows)
+            for j in range(first, last):
+                for i in range(max(top, (j + _ONE) * lower), bottom):
+                    target[to + j + i * to_ld] = source[at + i + j * ld]
+            top = bottom
 
 
 @kernel
@@ -82,14 +94,10 @@ def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffe
         _invert_triangle(factor, at, ld, inverse, front["column"], width, m, negative)
         update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, _ONE, _ZERO)
         if below > _ZERO:
-            for j in range(below):
-                for i in range(j):
-                    stack[below_at + i + j * below_ld] = stack[below_at + j + i * below_ld]
+            _transpose(stack, below_at, below_ld, below, below, stack, below_at, below_ld, _ONE)
             update(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, _ZERO, _ZERO)
             update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, _ZERO, _ZERO)
-            for j in range(width):
-                for i in range(below):
-                    z_transposed[j + i * width] = z[at + width + i + j * ld]
+            _transpose(z, at + width, ld, below, width, z_transposed, _ZERO, width, _ZERO)
             update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, _ONE, _ONE)
         for c in range(front["child_start"], following["child_start"]):
             child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
@@ -122,6 +130,19 @@ def _locate(first: Indices, second: Indices, scalar_of: Indices, front_of: Indic
         place[k] = np.int64(front["panel_at"] + row + low * front["panel_ld"])
 
 
+@kernel
+def _read(panels: Buffer, place: Indices, ld: Indices, rows: NDArray[np.int64], columns: NDArray[np.int64],
+          kind: NDArray[np.int64], found: Buffer) -> None:  # fmt: skip
+    """Blocks from the panels, row-major, one after another; `kind` as for the blocks of the matrix."""
+    at = np.uint64(0)
+    for k in range(np.uint64(len(place))):
+        for i in range(np.uint64(rows[k])):
+            for j in range(np.uint64(columns[k])):
+                low, high = (i, j) if kind[k] == TRANSPOSED or (kind[k] == DIAGONAL and j > i) else (j, i)
+                found[at] = panels[place[k] + high + low * ld[k]]
+                at += _ONE
+
+
 class SelectedInverse:
     """All blocks of the inverse of a factorised matrix that lie on the pattern of its factor.
 
@@ -141,18 +162,19 @@ class SelectedInverse:
             np.empty(triangle), np.empty(triangle), np.empty(rectangle), np.empty(rectangle),
         )  # fmt: skip
 
-    def block(self, place: int, i: int, j: int) -> NDArray[np.float64]:
-        """The block of the variables i and j at a place that `locate_blocks` found."""
+    def blocks(self, place: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """The blocks of the pairs of variables (i, j) at places that `locate_blocks` found."""
         fronts = self._fronts
-        swapped = fronts.scalar_of[i] < fronts.scalar_of[j]
-        low, high = (i, j) if swapped else (j, i)
-        columns, rows = (np.arange(fronts.sizes[variable]) for variable in (low, high))
-        if i == j:
-            rows, columns = np.maximum(rows[:, None], columns), np.minimum(rows[:, None], columns)
-        else:
-            rows = rows[:, None]
-        found: NDArray[np.float64] = self._panels[place + rows + columns * int(fronts.table[fronts.front_of[low]]["panel_ld"])]
-        return found.T if swapped else found
+        rows, columns = fronts.sizes[i], fronts.sizes[j]
+        ends = np.cumsum(rows * columns)
+        found = np.empty(int(ends[-1]) if len(ends) else 0)
+        lower = fronts.scalar_of[i] > fronts.scalar_of[j]
+        ld = fronts.table["panel_ld"][fronts.front_of[np.where(lower, j, i)]]
+        kind = np.where(i == j, DIAGONAL, np.where(lower, STORED, TRANSPOSED))
+        _read(self._panels, place.astype(np.uint64), ld, rows, columns, kind, found)
+        return [
+            found[e - r * c : e].reshape(r, c) for e, r, c in zip(ends.tolist(), rows.tolist(), columns.tolist(), strict=True)
+        ]
 
 
 def locate_blocks(fronts: Fronts, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:

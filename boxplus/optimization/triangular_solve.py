@@ -38,10 +38,9 @@ _SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
 
 
 @kernel
-def _forward(factor: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64, inverse: Buffer, column: np.uint64, x: Buffer,
-             sides: np.uint64) -> None:  # fmt: skip
-    """X₁ ← L₁₁⁻¹ X₁ for the columns of a front, from `column` on."""
-    x_at = column * sides
+def forward(factor: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64, inverse: Buffer, column: np.uint64, x: Buffer,
+            x_at: np.uint64, sides: np.uint64) -> None:  # fmt: skip
+    """X ← L₁₁⁻¹ X for the columns of a front that begin with `column`; X is (width, sides)."""
     j = np.uint64(0)
     while j < width:
         left, b_at, k, s = width - j, at + j, column + j, np.uint64(0)
@@ -133,7 +132,7 @@ def solve_many(table: Table, rows: Indices, order: Indices, factor: Buffer, inve
         front = table[g]
         width, below, at, ld, row = front["width"], front["below"], front["panel_at"], front["panel_ld"], front["row_start"]
         column = front["column"]
-        _forward(factor, at, ld, width, inverse, column, x, sides)
+        forward(factor, at, ld, width, inverse, column, x, column * sides, sides)
         update(y, _ZERO, sides, x, column * sides, sides, factor, at + width, ld, sides, below, width, _ZERO, _ZERO)
         for i in range(below):
             target = rows[row + i] * sides
