@@ -145,3 +145,23 @@ def test_trees_agree_with_brute_force(in_place: int, monkeypatch: pytest.MonkeyP
             suppress_health_check=list(HealthCheck),
         ),
     )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_winners_of_cells_replace_one_another_across_leaves(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ikd_tree, "IN_PLACE", 100)
+    monkeypatch.setattr(ikd_tree, "_BUDGET", 100)
+    monkeypatch.setattr(ikd_tree, "_BUDGET_PER_POINT", 4)
+    rng = np.random.default_rng(11)
+    truth = BruteForceMap(CELL)
+    with IkdTree(cell_size=CELL, rebuild=mode) as tree:
+        for step in range(8 if os.environ.get("NUMBA_DISABLE_JIT", "0") == "0" else 2):
+            # On a grid much finer than the cells, many points equal a split.
+            batch = np.round(rng.uniform((-3 + 0.3 * step, -3, -0.5), (3 + 0.3 * step, 3, 0.5), (400, 3)) / 0.05) * 0.05
+            tree.insert(batch, downsample=True)
+            truth.origin = tree.origin
+            truth.insert_downsampled(batch)
+            if step % 3 == 2:
+                assert tree.delete_box([-1, -1, -1], [0, 0, 1]) == truth.delete_box([-1, -1, -1], [0, 0, 1])
+            tree.check_invariants()
+            np.testing.assert_array_equal(tree.points(), truth.points())
