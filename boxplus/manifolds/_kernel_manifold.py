@@ -82,7 +82,8 @@ def checked_rows(name: str, x: ArrayLike, size: int, manifold: str) -> NDArray[n
     finite = np.isfinite(array).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
-        raise InputError(f"{name} finite", f"{array[row]} in row {row}", "remove the variable or give it a start value")
+        numbers = np.array2string(array[row], precision=4, max_line_width=10_000)
+        raise InputError(f"{name} finite", f"{numbers} in row {row}", "remove the variable or give it a start value")
     return array
 
 

@@ -30,12 +30,12 @@ class Product(KernelManifold):
         self.name = f"Product({', '.join(component.name for component in components)})"
         self.size = sum(component.size for component in components)
         self.dof = sum(component.dof for component in components)
-        counted = [c.name for c in components]
+        counted = [tangent for component in components for tangent in component.tangent_names]
         self.tangent_names = tuple(
-            # A name alone would not tell two components of one kind apart.
-            tangent if counted.count(c.name) == 1 else f"{tangent} of component {number}"
-            for number, c in enumerate(components)
-            for tangent in c.tangent_names
+            # A name that two components share tells them apart by their numbers.
+            tangent if counted.count(tangent) == 1 else f"{tangent} of component {number}"
+            for number, component in enumerate(components)
+            for tangent in component.tangent_names
         )
         starts, tangent_starts = np.cumsum([0, *(c.size for c in components)]), np.cumsum([0, *(c.dof for c in components)])
         self._parts = tuple(
