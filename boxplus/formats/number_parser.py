@@ -29,15 +29,17 @@ LINE = np.dtype(
     align=True,
 )
 
-_LOWEST, _HIGHEST = -342, 308
-_ONE = np.uint64(1)
+LOWEST_POWER, HIGHEST_POWER = -342, 308
+_NONE, _ONE, _THREE = np.uint64(0), np.uint64(1), np.uint64(3)
 _TEN = np.uint64(10)
 _LOW32 = np.uint64(0xFFFFFFFF)
 _S9, _S32, _S52, _S63 = (np.uint64(n) for n in (9, 32, 52, 63))
 _TOP = np.uint64(1 << 63)
 _IMPLICIT = np.uint64(1 << 52)
 _EXACT = np.uint64(1 << 53)
-_UNDECIDED = np.uint64(0x1FF)
+_NINE_BITS = np.uint64(0x1FF)
+_NEARLY_ALL = np.uint64((1 << 64) - 2)
+_LARGEST_EXACT = 27  # 5^27 is the largest power that fits into 64 bits
 _BELOW_IMPLICIT = np.uint64((1 << 52) - 1)
 _LARGEST_INTEGER = np.uint64((1 << 63) - 1)
 _NEWLINE, _SPACE, _HASH = np.uint8(10), np.uint8(32), np.uint8(35)
@@ -47,50 +49,73 @@ _EXPONENT, _EXPONENT_CAPITAL = np.uint8(101), np.uint8(69)
 _MAX_DIGITS = 19  # of an integer that always fits into 64 bits
 _EXPONENT_LIMIT = np.int64(100000)
 _EXACT_POWER = 22
-_EXACT_POWERS = 10.0 ** np.arange(_EXACT_POWER + 1)
+EXACT_POWERS = 10.0 ** np.arange(_EXACT_POWER + 1)
 
 
 @functools.cache
 def powers_of_five() -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """For q from -342 to 308 the 64 leading bits of 5^q, rounded down, and e with 10^q = bits·2^e (bits rounded)."""
+    """For q from -342 to 308 the 128 leading bits of 5^q, rounded down, and e with 10^q ≈ (upper 64 bits)·2^e.
+
+    Returns:
+        (651, 2) uint64, upper and lower bits, and (651,) int64.
+    """
     bits, exponents = [], []
-    for q in range(_LOWEST, _HIGHEST + 1):
+    for q in range(LOWEST_POWER, HIGHEST_POWER + 1):
         power = 5 ** abs(q)
         length = power.bit_length()
         if q >= 0:
-            bits.append(power << 64 - length if length <= 64 else power >> length - 64)
+            leading = power << 128 - length if length <= 128 else power >> length - 128
             exponents.append(length - 64 + q)
         else:
-            bits.append((1 << 63 + length) // power)
+            leading = (1 << 127 + length) // power
             exponents.append(q - 63 - length)
+        bits.append((leading >> 64, leading & (1 << 64) - 1))
     return np.array(bits, np.uint64), np.array(exponents, np.int64)
 
 
 @kernel(inline=True)
-def _float_bits(w: np.uint64, q: np.int64, powers: NDArray[np.uint64], exponents: NDArray[np.int64]) -> np.uint64:
-    """The bits of the float64 nearest to w·10^q (w > 0), or 0 where this method cannot tell."""
-    if q < _LOWEST or q > _HIGHEST:
-        return np.uint64(0)
-    shift = np.uint64(0)
-    for step in (np.uint64(32), np.uint64(16), np.uint64(8), np.uint64(4), np.uint64(2), np.uint64(1)):
-        if w >> (np.uint64(64) - step) == np.uint64(0):
-            w <<= step
-            shift += step
-    slot = np.uint64(q - _LOWEST)
-    factor = powers[slot]
-    # The 128-bit product of two 64-bit numbers in halves.
-    a, b = w >> _S32, w & _LOW32
-    c, d = factor >> _S32, factor & _LOW32
+def product(x: np.uint64, y: np.uint64) -> tuple[np.uint64, np.uint64]:
+    """The high and the low half of the 128-bit product of two 64-bit numbers."""
+    a, b = x >> _S32, x & _LOW32
+    c, d = y >> _S32, y & _LOW32
     low = b * d
     middle = (low >> _S32) + ((a * d) & _LOW32) + ((b * c) & _LOW32)
     high = a * c + ((a * d) >> _S32) + ((b * c) >> _S32) + (middle >> _S32)
-    rest = (middle << _S32) | (low & _LOW32)
-    # The true product lies above by less than w: undecided where that could carry into the kept bits, and at a tie.
-    tail = high & _UNDECIDED
-    if tail == _UNDECIDED or (tail == np.uint64(0) and rest == np.uint64(0)):
+    return high, (middle << _S32) | (low & _LOW32)
+
+
+@kernel(inline=True)
+def long_product(x: np.uint64, power: NDArray[np.uint64]) -> tuple[np.uint64, np.uint64]:
+    """The upper 128 of the 192 bits of x times a row of `powers_of_five()`; the true product is larger by less than 2."""
+    high, rest = product(x, power[0])
+    carry, _ = product(x, power[1])
+    low = rest + carry
+    return high + (_ONE if low < rest else _NONE), low
+
+
+@kernel(inline=True)
+def float_bits(w: np.uint64, q: np.int64, powers: NDArray[np.uint64], exponents: NDArray[np.int64]) -> np.uint64:
+    """The bits of the float64 nearest to w·10^q (w > 0), or 0 where this method cannot tell."""
+    if q < LOWEST_POWER or q > HIGHEST_POWER:
         return np.uint64(0)
+    shift = np.uint64(0)
+    for step in (np.uint64(32), np.uint64(16), np.uint64(8), np.uint64(4), np.uint64(2), np.uint64(1)):
+        if w >> (np.uint64(64) - step) == _NONE:
+            w <<= step
+            shift += step
+    slot = np.uint64(q - LOWEST_POWER)
+    high, rest = product(w, powers[slot, _NONE])
+    if high & _NINE_BITS == _NINE_BITS:
+        # The upper 64 bits of the power alone leave open whether a carry reaches the kept bits.
+        high, rest = long_product(w, powers[slot])
+        if high & _NINE_BITS == _NINE_BITS and rest >= _NEARLY_ALL:
+            return np.uint64(0)
     upper = high >> _S63
-    mantissa = ((high >> (_S9 + upper)) + _ONE) >> _ONE
+    cut = _S9 + upper
+    mantissa = high >> cut  # 54 bits, the last for rounding
+    if rest == _NONE and high == mantissa << cut and 0 <= q <= _LARGEST_EXACT and mantissa & _THREE == _ONE:
+        mantissa -= _ONE  # exactly half way: to the even one
+    mantissa = (mantissa + _ONE) >> _ONE
     # 52 places of the mantissa, 10 + upper cut off above, 64 for the lower half of the product, 1023 the bias
     biased = np.int64(upper) + exponents[slot] - np.int64(shift) + (52 + 10 + 64 + 1023)
     if mantissa == _EXACT:
@@ -232,11 +257,11 @@ def tokenise(
                     kind = REAL
                 elif w <= _EXACT and -_EXACT_POWER <= q <= _EXACT_POWER:
                     value = float(w)
-                    value = value / _EXACT_POWERS[np.uint64(-q)] if q < 0 else value * _EXACT_POWERS[np.uint64(q)]
+                    value = value / EXACT_POWERS[np.uint64(-q)] if q < 0 else value * EXACT_POWERS[np.uint64(q)]
                     values[tokens] = -value if negative else value
                     kind = REAL
                 else:
-                    pattern = _float_bits(w, q, powers, exponents)
+                    pattern = float_bits(w, q, powers, exponents)
                     if pattern != np.uint64(0):
                         bits[tokens] = pattern | _TOP if negative else pattern
                         kind = REAL

@@ -1,0 +1,208 @@
+"""Numbers to text, digit by digit as Python's `repr`: the fewest digits that read back as the same float64.
+
+The 17 leading digits of a float64, and what is behind them, are its product with a power of ten of 128 bits. 15, 16 and 17
+digits are tried in turn, with the parser's own conversion back; the few numbers that stay undecided are left to the caller.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.formats.number_parser import EXACT_POWERS, LOWEST_POWER, float_bits, long_product
+
+LONGEST_NUMBER = 26
+"""Bytes of the longest number, with the space or newline behind it."""
+
+_ZERO64, _ONE, _TEN = np.uint64(0), np.uint64(1), np.uint64(10)
+_S52, _S63 = np.uint64(52), np.uint64(63)
+_NO_SIGN = np.uint64((1 << 63) - 1)
+_FRACTION = np.uint64((1 << 52) - 1)
+_IMPLICIT = np.uint64(1 << 52)
+_EXACT = np.uint64(1 << 53)
+_SEVENTEEN_DIGITS, _EIGHTEEN_DIGITS = np.uint64(10**16), np.uint64(10**17)
+_SPACE, _NEWLINE, _MINUS, _PLUS, _POINT, _ZERO, _E = (np.uint8(ord(c)) for c in " \n-+.0e")
+_DIGITS = np.uint64(20)
+
+
+@kernel(inline=True)
+def _write_digits(w: np.uint64, digits: NDArray[np.uint8]) -> np.uint64:
+    """Write the digits of w at the end of `digits`; returns where they begin."""
+    at = _DIGITS
+    while True:
+        at -= _ONE
+        digits[at] = _ZERO + np.uint8(w % _TEN)
+        w //= _TEN
+        if w == _ZERO64:
+            return at
+
+
+@kernel(inline=True)
+def _read(
+    w: np.uint64, q: np.int64, powers: NDArray[np.uint64], exponents: NDArray[np.int64], number: NDArray[np.float64]
+) -> np.uint64:
+    """The bits of the float64 that the parser makes of w·10^q, 0 where it cannot tell; `number` is memory for one."""
+    if w <= _EXACT and -22 <= q <= 22:
+        value = np.float64(w)
+        number[0] = value / EXACT_POWERS[np.uint64(-q)] if q < 0 else value * EXACT_POWERS[np.uint64(q)]
+        return np.uint64(number.view(np.uint64)[0])
+    return np.uint64(float_bits(w, q, powers, exponents))
+
+
+@kernel
+def _fewest_digits(
+    bits: np.uint64, powers: NDArray[np.uint64], exponents: NDArray[np.int64], number: NDArray[np.float64]
+) -> tuple[np.uint64, np.int64]:
+    """17 digits w, the last of them zeros where fewer will do, and E: w·10^(E − 16) reads back as `bits`.
+
+    w is 0 where that is undecided.
+    """
+    mantissa = ((bits & _FRACTION) | _IMPLICIT) << np.uint64(11)
+    binary = np.int64(bits >> _S52) - 1086  # the number is mantissa·2^binary
+    decimal = ((binary + 63) * 78913) >> 18  # 78913/2^18 ≈ log10(2); at most one too small
+    high, rest, shift, w = _ZERO64, _ZERO64, _ZERO64, _ZERO64
+    for _ in range(2):
+        slot = np.uint64(16 - decimal - LOWEST_POWER)
+        high, rest = long_product(mantissa, powers[slot])
+        shift = np.uint64(-(64 + binary + exponents[slot]))
+        w = high >> shift
+        if w < _EIGHTEEN_DIGITS:
+            break
+        decimal += 1
+    if w < _SEVENTEEN_DIGITS or w >= _EIGHTEEN_DIGITS:
+        return _ZERO64, decimal
+    fraction = high - (w << shift)
+    exact = fraction == _ZERO64 and rest <= _ONE
+    for cut in (np.uint64(100), np.uint64(10), _ONE):
+        shorter = w // cut
+        tail = w - shorter * cut
+        if cut == _ONE:
+            half = _ONE << (shift - _ONE)
+            tie, up = fraction == half and rest <= _ONE, fraction >= half
+        else:
+            half = cut >> _ONE
+            tie, up = tail == half and exact, tail >= half
+        if up:
+            shorter += _ONE
+        found = _read(
+            shorter, decimal - 16 + (2 if cut == np.uint64(100) else 1 if cut == _TEN else 0), powers, exponents, number
+        )
+        if found == bits and not tie:
+            return shorter * cut, decimal
+        if found in (_ZERO64, bits):
+            break
+    return _ZERO64, decimal
+
+
+@kernel
+def _write_number(
+    bits: np.uint64,
+    text: NDArray[np.uint8],
+    at: np.uint64,
+    digits: NDArray[np.uint8],
+    powers: NDArray[np.uint64],
+    exponents: NDArray[np.int64],
+    number: NDArray[np.float64],
+) -> np.uint64:
+    """Write the positive number with these bits at text[at:]; returns the end, or 0 where its digits are undecided."""
+    w, decimal = _fewest_digits(bits, powers, exponents, number)
+    if w == _ZERO64:
+        return _ZERO64
+    if w == _EIGHTEEN_DIGITS:  # rounding has carried
+        w = _SEVENTEEN_DIGITS
+        decimal += 1
+    first = _write_digits(w, digits)
+    last = _DIGITS
+    while digits[last - _ONE] == _ZERO and last > first + _ONE:
+        last -= _ONE
+    if -4 <= decimal < 0:
+        text[at] = _ZERO
+        text[at + _ONE] = _POINT
+        at += np.uint64(2)
+        for _ in range(-decimal - 1):
+            text[at] = _ZERO
+            at += _ONE
+        for k in range(first, last):
+            text[at] = digits[k]
+            at += _ONE
+        return at
+    plain = 0 <= decimal < 16
+    point = first + (np.uint64(decimal) + _ONE if plain else _ONE)
+    end = max(last, point + _ONE) if plain else last
+    for k in range(first, end):
+        if k == point:
+            text[at] = _POINT
+            at += _ONE
+        text[at] = digits[k] if k < last else _ZERO
+        at += _ONE
+    if not plain:
+        text[at] = _E
+        text[at + _ONE] = _MINUS if decimal < 0 else _PLUS
+        at += np.uint64(2)
+        first = _write_digits(np.uint64(abs(decimal)), digits)
+        if first + _ONE == _DIGITS:  # two digits at least
+            text[at] = _ZERO
+            at += _ONE
+        for k in range(first, _DIGITS):
+            text[at] = digits[k]
+            at += _ONE
+    return at
+
+
+@kernel
+def format_rows(
+    begin: np.uint64,
+    prefix: NDArray[np.uint8],
+    whole: NDArray[np.int64],
+    bits: NDArray[np.uint64],
+    powers: NDArray[np.uint64],
+    exponents: NDArray[np.int64],
+    text: NDArray[np.uint8],
+) -> tuple[np.uint64, np.uint64]:
+    """Write the rows from `begin` to `text`, a line each: prefix, (m, a) whole numbers, (m, b) float64 by their bits.
+
+    Returns:
+        The row it stopped at, m or the first with a number that it could not decide, and the bytes written.
+    """
+    digits, number = np.empty(20, np.uint8), np.empty(1)
+    rows, integers, reals = np.uint64(len(whole)), np.uint64(whole.shape[1]), np.uint64(bits.shape[1])
+    at = np.uint64(0)
+    for row in range(begin, rows):
+        line = at
+        for k in range(np.uint64(len(prefix))):
+            text[at] = prefix[k]
+            at += _ONE
+        for k in range(integers):
+            value = whole[row, k]
+            if value < 0:
+                text[at] = _MINUS
+                at += _ONE
+            # the magnitude of the lowest integer does not fit into its own type
+            first = _write_digits(np.uint64(-(value + 1)) + _ONE if value < 0 else np.uint64(value), digits)
+            for m in range(first, _DIGITS):
+                text[at] = digits[m]
+                at += _ONE
+            text[at] = _SPACE
+            at += _ONE
+        for k in range(reals):
+            pattern = bits[row, k] & _NO_SIGN
+            exponent = np.int64(pattern >> _S52) - 1023
+            if bits[row, k] >> _S63 != _ZERO64:
+                text[at] = _MINUS
+                at += _ONE
+            if pattern == _ZERO64:
+                text[at] = text[at + np.uint64(2)] = _ZERO
+                text[at + _ONE] = _POINT
+                at += np.uint64(3)
+            elif -900 < exponent < 900:
+                end = _write_number(pattern, text, at, digits, powers, exponents, number)
+                if end == _ZERO64:
+                    return np.uint64(row), line
+                at = end
+            else:
+                return np.uint64(row), line
+            text[at] = _SPACE
+            at += _ONE
+        text[at - _ONE] = _NEWLINE
+    return rows, at
