@@ -23,7 +23,7 @@ from boxplus.maps.ikd_update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPT
 
 MAX_EXTENT = 100_000.0  # [m] from the origin, per axis: float32 resolves 8 mm there
 DELETE_TOLERANCE = 1e-6  # [m] per axis
-IN_PLACE = 1500  # points; larger subtrees are rebuilt in slices
+IN_PLACE = 3000  # points; larger subtrees are rebuilt in slices
 _CHECK = 6 * BUCKET  # smaller subtrees are not checked for balance: a few leaves cannot always be halved
 _BATCH = 2048  # points inserted in one kernel call
 _BUDGET = 20_000  # point visits of a rebuild a call ...
