@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from boxplus.residuals.bal_reprojection import BalReprojection
+    from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D
     from boxplus.residuals.gicp import Gicp
     from boxplus.residuals.imu import ImuPreintegration
     from boxplus.residuals.inverse_depth import InverseDepthReprojection
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 _HOME = {
     "BalReprojection": "bal_reprojection",
+    "ChordalPose": "chordal_pose",
+    "ChordalPose2D": "chordal_pose",
     "Gicp": "gicp",
     "ImuPreintegration": "imu",
     "InverseDepthIntrinsics": "inverse_depth_intrinsics",
@@ -45,6 +48,8 @@ _HOME = {
 
 __all__ = [
     "BalReprojection",
+    "ChordalPose",
+    "ChordalPose2D",
     "Gicp",
     "ImuPreintegration",
     "InverseDepthIntrinsics",

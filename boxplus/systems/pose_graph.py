@@ -1,4 +1,8 @@
-"""Pose-graph optimisation: the poses that agree best with the relative poses measured between them (SPEC.md 5)."""
+"""Pose-graph optimisation: the poses that agree best with the relative poses measured between them (SPEC.md 5).
+
+Two objectives: `logarithm`, Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j), the statistically right one; and `chordal`, that of SE-Sync
+(Rosen et al., IJRR 2019), κ ‖R_j − R_i R_ij‖² + τ ‖t_j − t_i − R_i t_ij‖², to compare with its certified optima.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +24,14 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import Variables
+from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_weights
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
+from boxplus.residuals.residual import Residual
 from boxplus.systems.pose_graph_start import chordal_start, held_poses, spanning_tree_start
 
 Start = Literal["file", "spanning_tree", "chordal"]
+Objective = Literal["logarithm", "chordal"]
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
 _DAMPING = 1e-9
 
@@ -36,6 +43,9 @@ class PoseGraphConfig(BaseModel):
 
     start: Literal["auto", "file", "spanning_tree", "chordal"] = Field(
         "auto", description="where to start; auto: the cheapest of the file's poses and the chordal relaxation"
+    )
+    objective: Objective = Field(
+        "logarithm", description="logarithm: Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j); chordal: the objective of SE-Sync"
     )
     solver: SolverOptions = Field(
         SolverOptions(initial_damping=_DAMPING), description="see SolverOptions; Levenberg-Marquardt, hardly damped"
@@ -49,7 +59,9 @@ class PoseGraphResult:
     Attributes:
         graph: the input with the optimised poses.
         start: which start was taken.
-        chi2_start, chi2: Σ eᵀ Ω e over the edges, twice the cost of a problem without robust loss.
+        start_costs: the cost at every start that was compared, robust loss included.
+        chi2_start, chi2: the objective over the edges without any robust loss, twice the cost of a problem without one.
+        errors_start, errors: (m,) √ of what every edge adds to chi2: its error in standard deviations.
         held: indices of the poses that were held: those the file fixes, and the first of every component without any.
         solution: with history, covariance, and why it stopped.
         timing_s: seconds of the initialisation and of the optimisation.
@@ -57,8 +69,11 @@ class PoseGraphResult:
 
     graph: PoseGraph
     start: Start
+    start_costs: dict[Start, float]
     chi2_start: float
     chi2: float
+    errors_start: NDArray[np.float64]
+    errors: NDArray[np.float64]
     held: NDArray[np.int64]
     solution: Solution
     timing_s: dict[str, float]
@@ -67,7 +82,7 @@ class PoseGraphResult:
 def optimize_pose_graph(
     graph: PoseGraph, config: PoseGraphConfig | None = None, *, loss: Loss | None = None, callback: Callback | None = None
 ) -> PoseGraphResult:
-    """Minimise ½ Σ ρ(eᵀ Ω e) with e = Log(Z⁻¹ T_i⁻¹ T_j) over the poses.
+    """Minimise ½ Σ ρ(eᵀ Ω e) with e = Log(Z⁻¹ T_i⁻¹ T_j), or the chordal objective, over the poses.
 
     Raises:
         InputError: the start asked for is not in the file; an information matrix is only semi-definite.
@@ -76,25 +91,34 @@ def optimize_pose_graph(
     config = config if config is not None else PoseGraphConfig()
     begin = time.perf_counter()
     held = held_poses(graph)
-    problem, poses = pose_graph_problem(graph, held=held, loss=loss)
+    problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
     candidates = _starts(graph, config.start)
     costs = {name: problem.cost([start]) for name, start in candidates.items()}
     chosen = min(candidates, key=lambda name: costs[name])
     prepared = time.perf_counter()
     solution = problem.solve(config.solver, start=[candidates[chosen]], callback=callback)
+    solved = time.perf_counter()
+    squared_start, squared = (_squared_errors(graph, poses_at, config.objective) for poses_at in (candidates[chosen], solution[poses]))
     return PoseGraphResult(
         graph=replace(graph, poses=solution[poses]),
         start=chosen,
-        chi2_start=chi2(graph, candidates[chosen]),
-        chi2=chi2(graph, solution[poses]),
+        start_costs=costs,
+        chi2_start=float(squared_start.sum()),
+        chi2=float(squared.sum()),
+        errors_start=np.sqrt(squared_start),
+        errors=np.sqrt(squared),
         held=held,
         solution=solution,
-        timing_s={"start": prepared - begin, "optimisation": time.perf_counter() - prepared},
+        timing_s={"start": prepared - begin, "optimisation": solved - prepared},
     )
 
 
 def pose_graph_problem(
-    graph: PoseGraph, *, held: NDArray[np.int64] | None = None, loss: Loss | None = None
+    graph: PoseGraph,
+    *,
+    held: NDArray[np.int64] | None = None,
+    loss: Loss | None = None,
+    objective: Objective = "logarithm",
 ) -> tuple[Problem, Variables]:
     """The least-squares problem of a graph, with its poses as one block of variables.
 
@@ -105,19 +129,31 @@ def pose_graph_problem(
     values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
     poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
     i, j = graph.edges.T
-    problem.add_residuals(_residual(graph), poses[i], poses[j], loss=loss, name="edges")
+    problem.add_residuals(_residual(graph, objective), poses[i], poses[j], loss=loss, name="edges")
     problem.fix(poses[held_poses(graph) if held is None else held])
     return problem, poses
 
 
-def chi2(graph: PoseGraph, poses: NDArray[np.float64]) -> float:
-    """Σ eᵀ Ω e over the edges, for poses laid out as in the graph, without any robust loss."""
+def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "logarithm") -> float:
+    """The objective over the edges, for poses laid out as in the graph, without any robust loss and without ½."""
+    return float(_squared_errors(graph, poses, objective).sum())
+
+
+def _squared_errors(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective) -> NDArray[np.float64]:
+    """(m,) what every edge adds to chi2."""
     i, j = graph.edges.T
-    e = _residual(graph).evaluate(poses[i], poses[j])
-    return float(np.einsum("na,nab,nb->", e, graph.information, e, optimize=True))
+    residual = _residual(graph, objective)
+    e = residual.evaluate(poses[i], poses[j])
+    if objective == "chordal":
+        weighted = np.einsum("nab,nb->na", residual.whitening.factors, e)
+        return np.einsum("na,na->n", weighted, weighted)
+    return np.maximum(np.einsum("na,nab,nb->n", e, graph.information, e, optimize=True), 0.0)
 
 
-def _residual(graph: PoseGraph) -> RelativePose | RelativePose2D:
+def _residual(graph: PoseGraph, objective: Objective) -> Residual:
+    if objective == "chordal":
+        kappa, tau = chordal_weights(graph.information)
+        return (ChordalPose if graph.dimension == 3 else ChordalPose2D)(graph.measurements, kappa=kappa, tau=tau)
     kind = RelativePose if graph.dimension == 3 else RelativePose2D
     return kind(graph.measurements, information=graph.information)
 
