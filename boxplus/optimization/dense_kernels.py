@@ -36,7 +36,8 @@ Buffer = NDArray[np.float64]
 
 _ONE, _THREE, _SIX = np.uint64(1), np.uint64(3), np.uint64(6)
 _SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
-_BLOCK = np.uint64(96)  # columns that are eliminated together: their panel stays in the cache
+_BLOCK = np.uint64(96)  # columns that are eliminated together
+_ROWS = np.uint64(480)  # rows that are updated together: with so many columns they stay in the second-level cache
 
 
 @kernel
@@ -47,37 +48,41 @@ def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint6
 
     `lower` and `accumulate` are 1 or 0. With `lower`, what lies above the diagonal of C is not meaningful.
     """
-    j = np.uint64(0)
-    while j < columns:
-        left = columns - j
-        i = j * lower
-        if left >= _SIX:
-            while i < rows:
-                count, at = min(rows - i, _TALL), c_at + i + j * ldc
-                if count > _SHORT:
-                    update_6(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                else:
-                    update_6_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                i += count
-            j += _SIX
-        elif left >= _THREE:
-            while i < rows:
-                count, at = min(rows - i, _TALL), c_at + i + j * ldc
-                if count > _SHORT:
-                    update_3(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                else:
-                    update_3_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                i += count
-            j += _THREE
-        else:
-            while i < rows:
-                count, at = min(rows - i, _TALL), c_at + i + j * ldc
-                if count > _SHORT:
-                    update_1(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                else:
-                    update_1_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
-                i += count
-            j += _ONE
+    top = np.uint64(0)
+    while top < rows:
+        bottom = min(top + _ROWS, rows)
+        end = min(columns, bottom) if lower else columns
+        j = np.uint64(0)
+        while j < end:
+            left, i = columns - j, max(top, j * lower)
+            if left >= _SIX:
+                while i < bottom:
+                    count, at = min(bottom - i, _TALL), c_at + i + j * ldc
+                    if count > _SHORT:
+                        update_6(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    else:
+                        update_6_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    i += count
+                j += _SIX
+            elif left >= _THREE:
+                while i < bottom:
+                    count, at = min(bottom - i, _TALL), c_at + i + j * ldc
+                    if count > _SHORT:
+                        update_3(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    else:
+                        update_3_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    i += count
+                j += _THREE
+            else:
+                while i < bottom:
+                    count, at = min(bottom - i, _TALL), c_at + i + j * ldc
+                    if count > _SHORT:
+                        update_1(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    else:
+                        update_1_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
+                    i += count
+                j += _ONE
+        top = bottom
 
 
 @kernel
