@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.errors import InputError
 
 _SYMMETRY = 1e-6  # largest asymmetry, of the largest entry, that counts as rounding
+_LEAST_PIVOT = 1e-14  # what is left of a diagonal entry, as a share of it, that does not count as rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +86,6 @@ class Whitening:
         factors[:, np.arange(dim), np.arange(dim)] = diagonal
         return cls(factors, True)
 
-    def rows(self, selected: NDArray[np.intp]) -> Whitening:
-        """The whitening of the residuals `selected` alone."""
-        return self if len(self.factors) == 1 else Whitening(self.factors[selected], self.is_diagonal)
-
 
 def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse: bool) -> NDArray[np.float64]:
     """W (1 or N, d, d) of an information matrix, or of a covariance when `inverse`."""
@@ -114,15 +111,19 @@ def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse:
             f"an asymmetry of {asymmetry[n]:.3g} in residual {n}",
             "check the order in which its entries were read",
         )
-    eigenvalues = np.linalg.eigvalsh(array)
-    positive = eigenvalues[:, 0] > 1e-14 * np.maximum(eigenvalues[:, -1], 0.0)
-    if not positive.all():
-        n = int(np.argmin(positive))
+    try:
+        factor = np.linalg.cholesky(array)
+        pivots = np.einsum("nii->ni", factor) ** 2
+        positive = bool((pivots > _LEAST_PIVOT * np.einsum("nii->ni", array)).all())
+    except np.linalg.LinAlgError:
+        positive = False
+    if not positive:
+        eigenvalues = np.linalg.eigvalsh(array)
+        n = int(np.argmin(eigenvalues[:, 0] / np.maximum(scale, 1e-300)))
         raise InputError(
             f"{name} positive definite",
             f"eigenvalues from {eigenvalues[n, 0]:.3g} to {eigenvalues[n, -1]:.3g} in residual {n}",
             "a direction without information cannot be whitened: leave it out of the residual",
         )
-    factor = np.linalg.cholesky(0.5 * (array + np.swapaxes(array, 1, 2)))
     # Ω = L Lᵀ is whitened by Lᵀ; Σ = C Cᵀ by C⁻¹, which spares the inverse of Σ.
     return np.ascontiguousarray(np.linalg.inv(factor) if inverse else np.swapaxes(factor, 1, 2))
