@@ -24,7 +24,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import UnitQuaternion, exp_scalars, multiply_scalars, rotation_entries
 from boxplus.manifolds.so3 import exp_coefficients, inverse_jacobian_coefficient, log_quaternion
-from boxplus.residuals.imu_preintegration import Preintegration
+from boxplus.residuals.imu_preintegration import Preintegration, rows_of
 from boxplus.residuals.matrix3 import IDENTITY, Matrix3, apply, multiply, polynomial, scaled, transposed
 from boxplus.residuals.residual import Residual
 from boxplus.residuals.whitening import Whitening
@@ -215,12 +215,15 @@ class ImuPreintegration(Residual):
         Residuals and whitening jump a little, so that it is called between solves, not within one.
 
         Args:
-            velocity_bias_i: (N, 9) the present value for every residual.
+            velocity_bias_i: (N, 9) or (9,), the present values for every residual.
 
         Returns:
             intervals integrated anew.
+
+        Raises:
+            InputError: an array of another shape.
         """
-        state = np.broadcast_to(np.asarray(velocity_bias_i, dtype=np.float64), (self.count, 9))
+        state = rows_of("velocity_bias_i", velocity_bias_i, self.count, 9)
         stale = self.preintegration.is_stale(state[:, 3:6], state[:, 6:])
         if stale.any():
             preintegration = self.preintegration.reintegrated(state[:, 3:6], state[:, 6:], stale)

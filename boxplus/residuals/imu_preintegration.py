@@ -222,8 +222,12 @@ class Preintegration:
 
         Returns:
             pose_j (N, 7) and velocity_bias_j (N, 9).
+
+        Raises:
+            InputError: arrays of another shape.
         """
-        pose, state = np.broadcast_to(pose_i, (len(self), 7)), np.broadcast_to(velocity_bias_i, (len(self), 9))
+        pose = rows_of("pose_i", pose_i, len(self), 7)
+        state = rows_of("velocity_bias_i", velocity_bias_i, len(self), 9)
         alpha, gamma, beta = self.corrected(state[:, 3:6], state[:, 6:])
         R = quaternion.to_matrix(pose[:, :4])
         T, g = self.duration_s[:, None], np.asarray(gravity, dtype=np.float64)
@@ -238,6 +242,20 @@ class Preintegration:
             self.noise.variances, self.mode == "merged", self.alpha, self.gamma_wxyz, self.beta, self.covariance,
             self.bias_jacobian, self.steps, self.longest_gap_s,
         )  # fmt: skip
+
+
+def rows_of(name: str, values: ArrayLike, count: int, size: int) -> NDArray[np.float64]:
+    """`values` (size,) or (count, size) as (count, size).
+
+    Raises:
+        InputError: another shape.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape not in ((size,), (count, size)):
+        raise InputError(
+            f"{name} of shape ({size},) or ({count}, {size})", f"shape {array.shape}", "give one row for each interval"
+        )
+    return np.broadcast_to(array, (count, size))
 
 
 def _checked_samples(

@@ -33,7 +33,7 @@ _LEAST_SIGMA = 1e-3  # of the range of grey values in image 1; identical images 
 _FEWEST_PIXELS = 100
 _LEAST_OVERLAP = 0.2  # share of the pixels with depth that land in image 2
 _LEAST_CURVATURE = 1e-9  # smallest over largest eigenvalue of H, translations measured in units of the median depth
-_SEARCH_STEP_DEG, _SEARCH_ITERATIONS = 15.0, 30
+_SEARCH_STEP_DEG, _SEARCH_ITERATIONS = 10.0, 15
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-9, 1e4
 
 Status = Literal["converged", "iteration limit", "little overlap", "unobservable"]
@@ -51,7 +51,7 @@ class Alignment:
         sigma: robust standard deviation of the residuals [grey values].
         mean_error: mean |e| [grey values].
         pixels: of image 1 that count at the finest level; overlap: their share of those with depth.
-        iterations: linearisations at every level, coarsest first.
+        iterations: linearisations at every level, coarsest first; levels with fewer than 100 pixels with depth are left out.
         status: `converged`; `iteration limit` at the finest level; `little overlap`, fewer than 100 pixels or a fifth of
             them land in image 2; `unobservable`, a direction of motion that changes no grey value.
     """
@@ -162,8 +162,8 @@ def align_rgbd(
         loss: of e/σ; by default `Huber(1.345)`.
         max_iterations: linearisations at each level.
         tolerance: a level ends with a step below this [rad; the translation in units of the median depth].
-        search_deg: start at the coarsest level from rotations up to this far from `T_21`, 15 degrees apart, and go on with the
-            best; for turns that a pyramid does not bridge, beyond about 10 degrees. The number of starts grows with its cube.
+        search_deg: start at the coarsest level from rotations up to this far from `T_21`, 10 degrees apart, and go on with the
+            best; for turns beyond 6 to 20 degrees, depending on the scene. The number of starts grows with its cube.
 
     Raises:
         InputError: images or depth of another shape or not finite, too many levels, fewer than 100 pixels with depth.
@@ -272,8 +272,8 @@ def _search(
 
 
 def _pyramid(first: Image, depth: NDArray[np.float32], second: Image, camera: Pinhole, levels: int) -> list[_Level]:
-    """The levels, coarsest first."""
-    result = []
+    """The levels that have pixels enough, coarsest first."""
+    result: list[_Level] = []
     for image_1, image_2 in zip(first.pyramid(levels), second.pyramid(levels), strict=True):
         rows, columns = np.nonzero(depth > 0.0)
         rays, seen = camera.unproject(np.stack([columns, rows], axis=1).astype(np.float64))
@@ -289,7 +289,7 @@ def _pyramid(first: Image, depth: NDArray[np.float32], second: Image, camera: Pi
             )
         )
         depth, camera = _half_depth(depth), half_camera(camera)
-    return result[::-1]
+    return [level for level in result[::-1] if len(level.grey_1) >= _FEWEST_PIXELS]
 
 
 def _half_depth(depth: NDArray[np.float32]) -> NDArray[np.float32]:

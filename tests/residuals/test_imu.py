@@ -171,6 +171,10 @@ def test_refusals() -> None:
     p = preintegration(1)
     with pytest.raises(InputError, match="gravity as three finite numbers"):
         ImuPreintegration(p, gravity=9.81)
+    with pytest.raises(InputError, match=r"velocity_bias_i of shape \(9,\) or \(6, 9\) – got shape \(5, 9\)"):
+        ImuPreintegration(p).refresh(np.zeros((5, 9)))
+    with pytest.raises(InputError, match="pose_i of shape"):
+        p.predict(np.eye(4), np.zeros(9))
     with pytest.raises(InputError, match='rotation "log" or "vector"'):
         ImuPreintegration(p, rotation="euler")  # type: ignore[arg-type]
 
