@@ -11,16 +11,16 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 from numba.core import config as numba_config
 from numba.core import types
-from numba.core.errors import NumbaError
+from numba.core.errors import NumbaError, UnsupportedBytecodeError
 
 from boxplus.errors import InputError
-from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangent_step import copy_into, step_into
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
@@ -43,17 +43,17 @@ def compiled_loops(
     function: Callable[..., Any],
     jacobian: Callable[..., Any] | None,
     dim: int,
-    manifolds: tuple[Manifold, ...],
+    dofs: tuple[int, ...],
     data: tuple[tuple[str, int], ...],
     has_steps: bool,
 ) -> Loops:
-    """Loops for a function and its Jacobian; data are (dtype, number of axes) of every data array.
+    """Loops for a function and its Jacobian; dofs are those of its variables, data (dtype, number of axes) of every data array.
 
     Raises:
         InputError: a function that does not take these arguments, does not compile, or returns something else than
             `dim` numbers.
     """
-    variables = len(manifolds)
+    variables = len(dofs)
     rows: list[types.Type] = [types.Array(types.float64, 1, "C")] * variables
     rows += [_row_type(dtype, axes) for dtype, axes in data]
     _check_arguments("function", function, len(rows), "one row for each variable, then one for each data array")
@@ -68,7 +68,7 @@ def compiled_loops(
         names["jacobian"], _ = _compiled("jacobian", jacobian, (*rows, *matrices))
         source = _analytic_source(variables, len(data), store)
     elif has_steps:
-        source = _numeric_source(variables, len(data), store, tuple(manifold.dof for manifold in manifolds))
+        source = _numeric_source(variables, len(data), store, dofs)
     else:
         return Loops(evaluate, None)
     return Loops(evaluate, _loop("linearize", source, names))
@@ -80,6 +80,12 @@ def _row_type(dtype: str, axes: int) -> types.Type:
 
 
 def _check_arguments(role: str, function: Callable[..., Any], count: int, what: str) -> None:
+    if not (inspect.isfunction(function) or inspect.isfunction(getattr(function, "py_func", None))):
+        raise InputError(
+            f"a plain Python function as {role}",
+            f"{function!r}",
+            "wrap it in a function, or give a batch function, which runs as it is",
+        )
     try:
         inspect.signature(function).bind(*range(count))
     except TypeError as error:
@@ -97,7 +103,7 @@ def _compiled(role: str, function: Callable[..., Any], arguments: tuple[types.Ty
     dispatcher: Any = function if hasattr(function, "py_func") else numba.njit(**_OPTIONS, forceinline=True)(function)
     try:
         dispatcher.compile(arguments)
-    except NumbaError as error:
+    except (NumbaError, UnsupportedBytecodeError) as error:
         raise InputError(
             f"a {role} that Numba can compile",
             f"{function.__name__}: {_summary(error)}",
@@ -116,7 +122,7 @@ def _as_sequence(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _summary(error: NumbaError) -> str:
+def _summary(error: Exception) -> str:
     """What Numba complains about and the line it concerns, out of its page of text."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
     lines = [line.strip() for line in plain.splitlines()]
@@ -124,7 +130,9 @@ def _summary(error: NumbaError) -> str:
     reasons = [line for line in lines if line and not line.startswith(noise)]
     place = re.findall(r'File "([^"]+)", line (\d+)', plain)
     text = reasons[0] if reasons else plain.strip()
-    return f"{text} ({place[-1][0]}, line {place[-1][1]})" if place else text
+    if text.endswith(":") and len(reasons) > 1:
+        text = f"{text} {reasons[1].removeprefix('>>> ')}"
+    return f"{text} ({Path(place[-1][0]).name}, line {place[-1][1]})" if place else text
 
 
 def _is_number_tuple(value: Any, dim: int) -> bool:
@@ -216,13 +224,24 @@ def _numeric_source(variables: int, data: int, store: _Store, dofs: tuple[int, .
         moved.append(f"y{s}[row{s}]")
         differences.append(f"""
         for k in range(np.uint64({dof})):
-            scale = 0.5 / h{s}[k, 0]
             ahead = np.uint64({begin}) + two * k
+            reach = known[ahead] + known[ahead + one]
+            scale = 1.0 / (reach * h{s}[k, 0]) if reach > 0.0 else 0.0
             for c in range(np.uint64({store.dim})):
                 J{s}[n, c, k] = scale * (e_of[ahead, c] - e_of[ahead + one, c])""")
         begin += 2 * dof
-    # Not differentiable where a neighbour has no residual: the whole residual counts as singular there.
     copies = "\n".join(f"            e_of[probe, {c}] = {entry}" for c, entry in enumerate(store.entries("e")))
+    # Beside a neighbour without residual the difference is one-sided, from the residual itself.
+    on_none = "; ".join(
+        [
+            "if probe == np.uint64(0):",
+            "    valid[n] = False",
+            "    break",
+            "known[probe] = 0.0",
+            "e_of[probe] = e_of[0]",
+            "continue",
+        ]
+    )
     call = ", ".join([*moved, *(f"data{k}[n]" for k in range(data))])
     zeros = "\n".join(f"            J{s}[n, :, :] = 0.0" for s in range(variables))
     new_line = "\n"
@@ -232,15 +251,16 @@ def linearize(
     {_names("steps", variables)}{_names("h", variables)}r, {_names("J", variables)}valid
 ):
     one, two = np.uint64(1), np.uint64(2)
-    e_of = np.empty(({begin}, {store.dim}))
+    e_of, known = np.empty(({begin}, {store.dim})), np.ones({begin})
 {new_line.join(scratch)}
     for n in range(np.uint64(begin), np.uint64(end)):
         valid[n] = True{"".join(fill)}
         for probe in range(np.uint64({begin})):
 {new_line.join(rows)}
             e = function({call})
-{_indent(store.guard("e", "valid[n] = False; break"), 12)}
+{_indent(store.guard("e", on_none), 12)}
 {copies}
+            known[probe] = 1.0
         if not valid[n]:
             r[n, :] = 0.0
 {zeros}

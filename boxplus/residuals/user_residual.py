@@ -105,7 +105,9 @@ class UserResidual(Residual):
         self._loops: Loops | None = None
         if not is_batch:
             types = tuple((array.dtype.name, array.ndim) for array in self.data)
-            self._loops = compiled_loops(function, jacobian, dim, connected, types, self._tables is not None)
+            self._loops = compiled_loops(
+                function, jacobian, dim, tuple(manifold.dof for manifold in connected), types, self._tables is not None
+            )
 
     def linearize_into(
         self,
@@ -123,7 +125,7 @@ class UserResidual(Residual):
             return
         self.evaluate_into(begin, end, x, index, r, valid)
         if self.jacobian is None:
-            self._differentiate(begin, end, x, index, jacobians, valid)
+            self._differentiate(begin, end, x, index, r, jacobians)
         else:
             self._call_batch_jacobian(self.jacobian, begin, end, self._gather(begin, end, x, index), jacobians)
         for J in jacobians:
@@ -201,22 +203,23 @@ class UserResidual(Residual):
         end: int,
         x: tuple[NDArray[np.float64], ...],
         index: tuple[NDArray[np.uint32], ...],
+        r: NDArray[np.float64],
         jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
     ) -> None:
-        """Central differences, a whole chunk at a time; a residual with a singular neighbour counts as singular."""
+        """Central differences, a whole chunk at a time; one-sided beside a singular neighbour."""
         values = self._gather(begin, end, x, index)
         for slot, manifold in enumerate(self.manifolds):
             moved = list(values)
             for k in range(manifold.dof):
-                delta = np.zeros(manifold.dof)
-                delta[k] = h = self._steps[slot][k, 0]
-                moved[slot] = manifold.boxplus(values[slot], delta)
-                ahead, valid_ahead = self._at(begin, end, moved)
-                moved[slot] = manifold.boxplus(values[slot], -delta)
-                behind, valid_behind = self._at(begin, end, moved)
-                jacobians[slot][begin:end, :, k] = (ahead - behind) * (0.5 / h)
-                valid[begin:end] &= valid_ahead & valid_behind
+                difference, reach = np.zeros((end - begin, self.dim)), np.zeros((end - begin, 1))
+                for side in (1.0, -1.0):
+                    delta = np.zeros(manifold.dof)
+                    delta[k] = side * self._steps[slot][k, 0]
+                    moved[slot] = manifold.boxplus(values[slot], delta)
+                    neighbour, is_known = self._at(begin, end, moved)
+                    difference += np.where(is_known[:, None], side * (neighbour - r[begin:end]), 0.0)
+                    reach += np.where(is_known, abs(delta[k]), 0.0)[:, None]
+                jacobians[slot][begin:end, :, k] = difference / np.where(reach > 0.0, reach, 1.0)
 
     @property
     def _name(self) -> str:

@@ -1,5 +1,6 @@
 """Residuals given as Python functions: compiled, in a batch, with and without Jacobians."""
 
+import functools
 import itertools
 import math
 
@@ -183,7 +184,7 @@ def test_none_and_masks_mean_singular(is_batch: bool, has_jacobian: bool) -> Non
 
     anchors = np.random.default_rng(7).normal(size=(9, 2))
     p = anchors + np.array([3.0, 4.0])
-    p[4] = anchors[4] + [0.1, 0.2]
+    p[4] = anchors[4] + np.array([0.1, 0.2])
     jacobian = (distances_jacobian if is_batch else distance_jacobian) if has_jacobian else None
     residual = UserResidual(
         distances if is_batch else distance,
@@ -200,10 +201,12 @@ def test_none_and_masks_mean_singular(is_batch: bool, has_jacobian: bool) -> Non
     assert np.allclose(np.delete(linear.jacobians[0], 4, axis=0), [[0.6, 0.8]], atol=1e-9)
     report = check_jacobian(residual, p)
     assert report.passed and report.invalid == 1, report
-    # A residual whose neighbour at the difference step has no value is singular as well.
+    # Beside a neighbour without residual the difference is one-sided: validity is that of the evaluation.
     if not has_jacobian:
-        p[2] = anchors[2] + [1.0, 0.0]
-        assert not residual.linearize(p).valid[2]
+        p[2] = anchors[2] + np.array([1.0, 0.0])
+        linear = residual.linearize(p)
+        assert linear.valid[2]
+        assert np.allclose(linear.jacobians[0][2], [[1.0, 0.0]], atol=1e-5)
 
 
 def test_data_come_as_scalars_rows_and_matrices() -> None:
@@ -256,12 +259,22 @@ def test_wrong_functions_are_explained() -> None:
     def text(T_i, T_j, z):
         return "six"
 
+    def foreign(T_i, T_j, z):
+        return np.linalg.svd(T_i)[0]
+
+    def attribute(T_i, T_j, z):
+        return T_i.rotation
+
     options = {"dim": 6, "manifolds": (SE3, SE3), "data": (measured,)}
     with pytest.raises(
         InputError,
         match=r"expected a function that Numba can compile – got wrong_name: .*'undefined_helper' is not defined – use scalars",
     ):
         UserResidual(wrong_name, **options)
+    with pytest.raises(InputError, match=r"got foreign: No implementation of function .*svd.* found for signature: svd\(array"):
+        UserResidual(foreign, **options)
+    with pytest.raises(InputError, match=r"Unknown attribute 'rotation' of type .* \(test_user_residual.py, line \d+\)"):
+        UserResidual(attribute, **options)
     with pytest.raises(InputError, match="expected a jacobian that Numba can compile – got relative_pose_jacobian"):
         UserResidual(relative_pose, jacobian=relative_pose_jacobian, **options)
     with pytest.raises(InputError, match="expected 6 numbers from five – got a tuple of 5 – return them as a tuple"):
@@ -270,6 +283,8 @@ def test_wrong_functions_are_explained() -> None:
         UserResidual(text, **options)
     with pytest.raises(InputError, match="expected 6 numbers from five_in_an_array – got 5 – return as many as dim says"):
         UserResidual(five_in_an_array, **options).evaluate(T_i, T_j)
+    with pytest.raises(InputError, match=r"expected a plain Python function as function – got functools.partial"):
+        UserResidual(functools.partial(relative_pose), **options)
     with pytest.raises(InputError, match=r"expected a function of 2 arguments .* – got relative_pose\(T_i, T_j, z\): missing"):
         UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), count=12)
     with pytest.raises(InputError, match=r"expected a jacobian of 5 arguments .* – got relative_pose\(T_i, T_j, z\): too many"):
