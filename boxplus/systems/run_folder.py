@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from boxplus.errors import InputError
-from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
+from boxplus.formats.output import TEMPORARY_SUFFIX
+from boxplus.systems.output_folder import SUMMARY, prepare_output_folder
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -28,7 +27,7 @@ class RunFolder:
     @property
     def summary(self) -> Path:
         """Counts, timings, versions, warnings, and the state of the run."""
-        return self.path / "run.json"
+        return self.path / SUMMARY
 
     @property
     def config(self) -> Path:
@@ -92,29 +91,7 @@ def prepare_run_folder(folder: str | Path, *, overwrite: bool = False) -> RunFol
         InputError: the folder holds something else, or an earlier run and `overwrite` is not set.
         OutputError: it cannot be created or cleared.
     """
-    run = RunFolder(make_folder(folder))
-    try:
-        occupied = next(run.path.iterdir(), None) is not None
-        if not occupied:
-            return run
-        if not run.summary.is_file():
-            raise InputError(
-                "a new or empty output folder, or one with an earlier run of boxplus",
-                f"other files in {run.path}",
-                "choose another folder with --output",
-            )
-        if not overwrite:
-            raise InputError(
-                "a new or empty output folder",
-                f"the results of an earlier run in {run.path}",
-                "choose another folder with --output, or add --overwrite to replace them",
-            )
-        # The summary goes last: interrupted here, the folder is still known as a run's.
-        for path in sorted(run.own_files(), key=lambda path: path == run.summary):
-            path.unlink()
-        for path in [*run.tiles.glob("tiles/*"), run.tiles / "tiles", run.tiles, run.plots]:
-            with suppress(OSError):  # a folder with files of others stays
-                path.rmdir()
-    except OSError as error:
-        raise output_error(run.path, error) from error
+    run = RunFolder(Path(folder))
+    inner = (*run.tiles.glob("tiles/*"), run.tiles / "tiles", run.tiles, run.plots)
+    prepare_output_folder(run.path, "boxplus lio", run.own_files(), inner, overwrite=overwrite)
     return run
