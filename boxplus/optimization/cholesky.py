@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus._jit import run_chunks
 from boxplus.errors import BoxplusError, InputError
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.inverse_blocks import SelectedInverse, locate_blocks
-from boxplus.optimization.multifrontal import factorize
+from boxplus.optimization.numeric_factor import NumericFactor
 from boxplus.optimization.ordering import Method, order
-from boxplus.optimization.supernodes import ALIGNMENT, lay_out
+from boxplus.optimization.supernodes import lay_out
 from boxplus.optimization.triangular_solve import solve_many, solve_one
 
 SOLVED_VARIABLES = 8
@@ -38,12 +37,6 @@ class NotPositiveDefinite(BoxplusError, ArithmeticError):
         self.pivot = pivot
 
 
-def _aligned(size: int) -> NDArray[np.float64]:
-    """Zeros from the start of a cache line on, so that panels do not straddle lines."""
-    whole = np.zeros(size + 2 * ALIGNMENT)
-    return whole[(-whole.ctypes.data // 8) % ALIGNMENT :][:size]
-
-
 class SparseCholesky:
     """L Lᵀ = P H Pᵀ for symmetric positive definite H with the given pattern.
 
@@ -53,7 +46,7 @@ class SparseCholesky:
     Args:
         pattern: of H.
         ordering: name of the fill-reducing ordering, or (n,) integers: the variable at each position.
-        threads: that factorise subtrees side by side.
+        threads: that factorise subtrees and large fronts side by side; too small a matrix is left to one.
 
     Raises:
         InputError: an ordering that is no permutation of the variables, or no thread.
@@ -62,7 +55,7 @@ class SparseCholesky:
     def __init__(self, pattern: BlockPattern, *, ordering: Method | NDArray[np.int64] = "auto", threads: int = 1) -> None:
         if threads < 1:
             raise InputError("at least one thread", f"{threads}", "give the number of threads")
-        self.pattern, self._threads = pattern, threads
+        self.pattern = pattern
         if isinstance(ordering, str):
             first = order(pattern.col_start, pattern.row, pattern.sizes, ordering).permutation
         else:
@@ -73,9 +66,7 @@ class SparseCholesky:
                 )
         self._fronts = fronts = lay_out(pattern, first, threads)
         size = int(pattern.start[-1])
-        self._factor = _aligned(fronts.factor_size)
-        self._stack = _aligned(fronts.stack_size)
-        self._inverse, self._pivots, self._diagonal, self._entries = (np.zeros(size) for _ in range(4))
+        self._factor, self._diagonal = NumericFactor(fronts, threads), np.zeros(size)
         self._most_below = int(fronts.table["below"].max())
         self._work, self._below = np.empty(size), np.empty(self._most_below)
         self._factorized = False
@@ -129,32 +120,12 @@ class SparseCholesky:
         fronts = self._fronts
         self._diagonal[:] = diagonal
         self._factorized, self._selected = False, None
-        failed = self._factorize_parts(values)
-        if failed < len(self._pivots):
+        failed = self._factor.factorize(values, self._diagonal)
+        if failed < len(self._factor.pivots):
             row = int(fronts.scalar_order[failed])
             block = int(np.searchsorted(self.pattern.start, row, side="right")) - 1
-            raise NotPositiveDefinite(block, row - int(self.pattern.start[block]), float(self._pivots[failed]))
+            raise NotPositiveDefinite(block, row - int(self.pattern.start[block]), float(self._factor.pivots[failed]))
         self._factorized = True
-
-    def _factorize_parts(self, values: NDArray[np.float64]) -> int:
-        """Subtrees side by side, then the rest; returns the first failed scalar position, or N."""
-        fronts, subtrees = self._fronts, len(self._fronts.parts) - 2
-        failed = [len(self._pivots)] * (subtrees + 1)
-
-        def work(part: int, _begin: int, _end: int) -> None:
-            begin, end = fronts.parts[part : part + 2].astype(np.uint64)
-            failed[part] = int(
-                factorize(
-                    fronts.sequence, begin, end, fronts.table, fronts.children, fronts.runs, fronts.entries,
-                    fronts.scalar_order, values, self._diagonal, self._factor, self._stack, self._inverse, self._pivots,
-                    self._entries,
-                )
-            )  # fmt: skip
-
-        run_chunks(work, subtrees, 1, self._threads)
-        if min(failed) == len(self._pivots):
-            work(subtrees, 0, 0)
-        return min(failed)
 
     def solve(self, b: ArrayLike) -> NDArray[np.float64]:
         """x with H x = b for one right-hand side (N,) or several (N, k).
@@ -164,14 +135,16 @@ class SparseCholesky:
         """
         self._require_factor()
         b = np.ascontiguousarray(b, np.float64)
-        if b.ndim not in (1, 2) or len(b) != len(self._pivots):
-            raise InputError(f"a right-hand side of {len(self._pivots)} rows", f"shape {b.shape}", "give (N,) or (N, k) numbers")
+        if b.ndim not in (1, 2) or len(b) != len(self._factor.pivots):
+            raise InputError(
+                f"a right-hand side of {len(self._factor.pivots)} rows", f"shape {b.shape}", "give (N,) or (N, k) numbers"
+            )
         fronts = self._fronts
         sides = b.size // max(len(b), 1)
         if sides * len(b) > len(self._work):
             self._work, self._below = np.empty(sides * len(b)), np.empty(sides * self._most_below)
         x = np.empty_like(b)
-        panels = (fronts.table, fronts.rows, fronts.scalar_order, self._factor, self._inverse)
+        panels = (fronts.table, fronts.rows, fronts.scalar_order, self._factor.panels, self._factor.inverse)
         if sides == 1:
             solve_one(*panels, b.reshape(-1), self._work, self._below, x.reshape(-1))
         else:
@@ -206,13 +179,13 @@ class SparseCholesky:
         known = np.flatnonzero(place >= 0)
         if len(known):
             if self._selected is None:
-                self._selected = SelectedInverse(self._fronts, self._factor, self._inverse, self._stack)
+                self._selected = SelectedInverse(self._fronts, self._factor.panels, self._factor.inverse, self._factor.stack)
             for k, block in zip(known, self._selected.blocks(place[known], i[known], j[known]), strict=True):
                 blocks[k] = block
         solved = np.flatnonzero(place < 0)
         start, sizes = self.pattern.start, self.pattern.sizes
         for column in np.unique(j[solved]):
-            unit = np.zeros((len(self._pivots), sizes[column]))
+            unit = np.zeros((len(self._factor.pivots), sizes[column]))
             unit[start[column] : start[column + 1]] = np.eye(sizes[column])
             x = self.solve(unit)
             for k in solved[j[solved] == column]:
@@ -226,7 +199,7 @@ class SparseCholesky:
             InputError: nothing is factorised.
         """
         self._require_factor()
-        return float(np.log(self._pivots).sum())
+        return float(np.log(self._factor.pivots).sum())
 
     def _require_factor(self) -> None:
         if not self._factorized:

@@ -36,7 +36,7 @@ Buffer = NDArray[np.float64]
 
 _ONE, _THREE, _SIX = np.uint64(1), np.uint64(3), np.uint64(6)
 _SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
-_BLOCK = np.uint64(96)  # columns that are eliminated together
+BLOCK = np.uint64(96)  # columns that are eliminated together
 _ROWS = np.uint64(480)  # rows that are updated together: with so many columns they stay in the second-level cache
 
 
@@ -86,7 +86,19 @@ def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint6
 
 
 @kernel
-def _factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
+def update_rows(c: Buffer, a: Buffer, c_at: np.uint64, ldc: np.uint64, a_at: np.uint64, lda: np.uint64, columns: np.uint64,
+                depth: np.uint64, accumulate: np.uint64, begin: np.uint64, end: np.uint64) -> None:  # fmt: skip
+    """Rows `begin … end` of `update` with `lower` and B = A."""
+    here, there = c_at + begin, a_at + begin
+    before = min(begin, columns)
+    update(c, here, ldc, a, there, lda, a, a_at, lda, end - begin, before, depth, np.uint64(0), accumulate)
+    if before < columns:
+        here += before * ldc
+        update(c, here, ldc, a, there, lda, a, there, lda, end - begin, min(end, columns) - before, depth, _ONE, accumulate)
+
+
+@kernel
+def factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
                   inverse_at: np.uint64) -> np.uint64:  # fmt: skip
     """Factorise the first `width` columns of a panel of `rows` rows, left-looking; returns the first failed column or width."""
     j = np.uint64(0)
@@ -158,9 +170,9 @@ def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
     """
     k = np.uint64(0)
     while k < width:
-        depth = min(_BLOCK, width - k)
+        depth = min(BLOCK, width - k)
         corner = at + k + k * ld
-        failed = _factor_block(p, corner, ld, rows - k, depth, inverse, pivots, column + k)
+        failed = factor_block(p, corner, ld, rows - k, depth, inverse, pivots, column + k)
         if failed < depth:
             return np.uint64(k + failed)
         behind = k + depth

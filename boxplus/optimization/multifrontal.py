@@ -21,7 +21,7 @@ SINGULAR = 1e-13
 """A pivot that has lost all but this share of its diagonal entry is rounding error: the matrix is singular. Scaling a matrix
 does not change the share; it is above 1e-8 on the usual pose graphs."""
 
-_ZERO = np.uint64(0)
+_ZERO, _ONE = np.uint64(0), np.uint64(1)
 _STORED, _DIAGONAL = np.uint64(STORED), np.uint64(DIAGONAL)
 
 
@@ -37,7 +37,7 @@ def _fill_panel(first: np.uint64, last: np.uint64, ld: np.uint64, entries: Table
                     factor[target + i + j * ld] = values[source + i * columns + j]
         elif kind == _DIAGONAL:
             for i in range(rows):
-                for j in range(i + np.uint64(1)):
+                for j in range(i + _ONE):
                     factor[target + i + j * ld] = values[source + i * columns + j]
         else:
             for i in range(rows):
@@ -46,7 +46,7 @@ def _fill_panel(first: np.uint64, last: np.uint64, ld: np.uint64, entries: Table
 
 
 @kernel(inline=True)
-def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, last: np.uint64, runs: Table, stack: Buffer,
+def _add_child(child: Table, first: np.uint64, split: np.uint64, last: np.uint64, runs: Table, stack: Buffer,
                target: Buffer, target_at: np.uint64, ld: np.uint64, shift: np.uint64) -> None:  # fmt: skip
     """Add the columns `first … split` of runs of a child's update matrix, down to its last run, to a part of the front.
 
@@ -59,8 +59,55 @@ def _add_child(front: Table, child: Table, first: np.uint64, split: np.uint64, l
             source = source_at + (column + j) * source_ld
             to = target_at + (there + j - shift) * ld
             add(target, to + there + j - shift, stack, source + column + j, length - j)
-            for b in range(a + np.uint64(1), last):
+            for b in range(a + _ONE, last):
                 add(target, to + runs[b]["parent"] - shift, stack, source + runs[b]["child"], runs[b]["length"])
+
+
+@kernel(inline=True)
+def _begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
+                 values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, entries_of_diagonal: Buffer) -> None:  # fmt: skip
+    """Fill the panel: blocks of the matrix, damping, and what the children add to it."""
+    front, following = table[g], table[g + _ONE]
+    column, at, ld = front["column"], front["panel_at"], front["panel_ld"]
+    for k in range(at, at + front["width"] * ld):
+        factor[k] = 0.0
+    _fill_panel(front["entry_start"], following["entry_start"], ld, entries, values, factor)
+    for k in range(front["width"]):
+        entry = factor[at + k + k * ld] + diagonal[scalar_order[column + k]]
+        factor[at + k + k * ld] = entry
+        entries_of_diagonal[column + k] = entry
+    for c in range(front["child_start"], following["child_start"]):
+        child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+        _add_child(child, child["run_start"], child["run_split"], last, runs, stack, factor, at, ld, _ZERO)
+
+
+@kernel(inline=True)
+def _end_front(g: np.uint64, table: Table, children: Indices, runs: Table, stack: Buffer, pivots: Buffer,
+               entries_of_diagonal: Buffer) -> np.uint64:  # fmt: skip
+    """Add the rest of the children's update matrices to this one; returns the first singular column, or width."""
+    front, following = table[g], table[g + _ONE]
+    column, width = front["column"], front["width"]
+    for k in range(width):
+        if pivots[column + k] <= SINGULAR * entries_of_diagonal[column + k]:
+            return np.uint64(k)
+    for c in range(front["child_start"], following["child_start"]):
+        child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+        _add_child(child, child["run_split"], last, last, runs, stack, stack, front["update_at"], front["update_ld"], width)
+    return np.uint64(width)
+
+
+@kernel
+def begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices, values: Buffer,
+                diagonal: Buffer, factor: Buffer, stack: Buffer, entries_of_diagonal: Buffer) -> None:  # fmt: skip
+    """See `_begin_front`; for a front that several threads work on."""
+    _begin_front(g, table, children, runs, entries, scalar_order, values, diagonal, factor, stack, entries_of_diagonal)
+
+
+@kernel
+def end_front(g: np.uint64, table: Table, children: Indices, runs: Table, stack: Buffer, pivots: Buffer,
+              entries_of_diagonal: Buffer) -> np.uint64:  # fmt: skip
+    """See `_end_front`; for a front that several threads work on."""
+    return _end_front(g, table, children, runs, stack, pivots, entries_of_diagonal)  # type: ignore[no-any-return]
 
 
 @kernel
@@ -80,30 +127,13 @@ def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table,
     """
     for place in range(begin, end):
         g = sequence[place]
-        front, following = table[g], table[g + np.uint64(1)]
-        column, width, below = front["column"], front["width"], front["below"]
-        at, ld = front["panel_at"], front["panel_ld"]
-        for k in range(at, at + width * ld):
-            factor[k] = 0.0
-        _fill_panel(front["entry_start"], following["entry_start"], ld, entries, values, factor)
-        for k in range(width):
-            entry = factor[at + k + k * ld] + diagonal[scalar_order[column + k]]
-            factor[at + k + k * ld] = entry
-            entries_of_diagonal[column + k] = entry
-        for c in range(front["child_start"], following["child_start"]):
-            child, behind = table[children[c]], table[children[c] + np.uint64(1)]
-            _add_child(
-                front, child, child["run_start"], child["run_split"], behind["run_start"], runs, stack, factor, at, ld, _ZERO
-            )
-        update_at, update_ld = front["update_at"], front["update_ld"]
-        failed = factor_panel(factor, at, ld, width + below, width, inverse, pivots, column, stack, update_at, update_ld)
+        front = table[g]
+        column, width, rows = front["column"], front["width"], front["width"] + front["below"]
+        _begin_front(g, table, children, runs, entries, scalar_order, values, diagonal, factor, stack, entries_of_diagonal)
+        at, ld, update_at, update_ld = front["panel_at"], front["panel_ld"], front["update_at"], front["update_ld"]
+        failed = factor_panel(factor, at, ld, rows, width, inverse, pivots, column, stack, update_at, update_ld)
+        if failed == width:
+            failed = _end_front(g, table, children, runs, stack, pivots, entries_of_diagonal)
         if failed < width:
             return np.uint64(column + failed)
-        for k in range(column, column + width):
-            if pivots[k] <= SINGULAR * entries_of_diagonal[k]:
-                return np.uint64(k)
-        for c in range(front["child_start"], following["child_start"]):
-            child, behind = table[children[c]], table[children[c] + np.uint64(1)]
-            split, last = child["run_split"], behind["run_start"]
-            _add_child(front, child, split, last, last, runs, stack, stack, update_at, update_ld, width)
     return np.uint64(len(inverse))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.optimization import subtrees
+from boxplus.optimization import numeric_factor, subtrees
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 
@@ -178,7 +178,18 @@ def test_blocks_of_the_inverse_follow_the_latest_factorisation() -> None:
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_change_no_bit(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subtrees, "WORTHWHILE", 0.0)
-    for shape in ("grid", "two components", "arrow to the first", "chain", "diagonal", "empty"):
+    monkeypatch.setattr(numeric_factor, "LARGE", 1e5)
+    monkeypatch.setattr(numeric_factor, "ROWS", 40)
+    for shape in (
+        "grid",
+        "dense",
+        "one dense block of 300",
+        "two components",
+        "arrow to the first",
+        "chain",
+        "diagonal",
+        "empty",
+    ):
         pattern, _ = BlockPattern.from_pairs(*SHAPES[shape])
         values, dense = positive_definite(pattern, np.random.default_rng(0))
         alone, together = SparseCholesky(pattern), SparseCholesky(pattern, threads=threads)
@@ -209,3 +220,13 @@ def test_a_graph_without_gauge_is_singular(seed: int, scale: float) -> None:
         cholesky.factorize(values.ravel())
     values[0] += 1e-6 * square[0] + 1e-6 * scale**2 * np.eye(3)
     cholesky.factorize(values.ravel())
+
+
+@pytest.mark.parametrize("position", [10, 150, 299])
+def test_a_large_front_names_its_failure_too(position: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numeric_factor, "LARGE", 0.0)
+    pattern, _ = BlockPattern.from_pairs([300], [], [])
+    values = np.eye(300)
+    values[position, position] = 0.0
+    with pytest.raises(NotPositiveDefinite, match=f"degree of freedom {position} of variable 0"):
+        SparseCholesky(pattern, threads=2).factorize(values.ravel())
