@@ -40,19 +40,31 @@ def _write_digits(w: np.uint64, digits: NDArray[np.uint8]) -> np.uint64:
 
 @kernel(inline=True)
 def _read(
-    w: np.uint64, q: np.int64, powers: NDArray[np.uint64], exponents: NDArray[np.int64], number: NDArray[np.float64]
+    w: np.uint64,
+    q: np.int64,
+    powers: NDArray[np.uint64],
+    exponents: NDArray[np.int64],
+    number: NDArray[np.float64],
+    number_bits: NDArray[np.uint64],
 ) -> np.uint64:
-    """The bits of the float64 that the parser makes of w·10^q, 0 where it cannot tell; `number` is memory for one."""
+    """The bits of the float64 that the parser makes of w·10^q, 0 where it cannot tell.
+
+    `number` is memory for one, and `number_bits` the same memory.
+    """
     if w <= _EXACT and -22 <= q <= 22:
         value = np.float64(w)
         number[0] = value / EXACT_POWERS[np.uint64(-q)] if q < 0 else value * EXACT_POWERS[np.uint64(q)]
-        return np.uint64(number.view(np.uint64)[0])
+        return np.uint64(number_bits[0])
     return np.uint64(float_bits(w, q, powers, exponents))
 
 
 @kernel
 def _fewest_digits(
-    bits: np.uint64, powers: NDArray[np.uint64], exponents: NDArray[np.int64], number: NDArray[np.float64]
+    bits: np.uint64,
+    powers: NDArray[np.uint64],
+    exponents: NDArray[np.int64],
+    number: NDArray[np.float64],
+    number_bits: NDArray[np.uint64],
 ) -> tuple[np.uint64, np.int64]:
     """17 digits w, the last of them zeros where fewer will do, and E: w·10^(E − 16) reads back as `bits`.
 
@@ -73,25 +85,22 @@ def _fewest_digits(
     if w < _SEVENTEEN_DIGITS or w >= _EIGHTEEN_DIGITS:
         return _ZERO64, decimal
     fraction = high - (w << shift)
-    exact = fraction == _ZERO64 and rest <= _ONE
-    for cut in (np.uint64(100), np.uint64(10), _ONE):
+    cut, q = np.uint64(100), decimal - 14
+    while cut > _ZERO64:
         shorter = w // cut
-        tail = w - shorter * cut
-        if cut == _ONE:
-            half = _ONE << (shift - _ONE)
-            tie, up = fraction == half and rest <= _ONE, fraction >= half
+        if cut > _ONE:
+            tail, half, exact = w - shorter * cut, cut >> _ONE, fraction == _ZERO64 and rest <= _ONE
         else:
-            half = cut >> _ONE
-            tie, up = tail == half and exact, tail >= half
-        if up:
+            tail, half, exact = fraction, _ONE << (shift - _ONE), rest <= _ONE
+        if tail >= half:
             shorter += _ONE
-        found = _read(
-            shorter, decimal - 16 + (2 if cut == np.uint64(100) else 1 if cut == _TEN else 0), powers, exponents, number
-        )
-        if found == bits and not tie:
-            return shorter * cut, decimal
-        if found in (_ZERO64, bits):
+        found = _read(shorter, q, powers, exponents, number, number_bits)
+        if found == bits:
+            return (_ZERO64 if tail == half and exact else shorter * cut), decimal
+        if found == _ZERO64:
             break
+        cut //= _TEN
+        q -= 1
     return _ZERO64, decimal
 
 
@@ -104,9 +113,10 @@ def _write_number(
     powers: NDArray[np.uint64],
     exponents: NDArray[np.int64],
     number: NDArray[np.float64],
+    number_bits: NDArray[np.uint64],
 ) -> np.uint64:
     """Write the positive number with these bits at text[at:]; returns the end, or 0 where its digits are undecided."""
-    w, decimal = _fewest_digits(bits, powers, exponents, number)
+    w, decimal = _fewest_digits(bits, powers, exponents, number, number_bits)
     if w == _ZERO64:
         return _ZERO64
     if w == _EIGHTEEN_DIGITS:  # rounding has carried
@@ -159,13 +169,15 @@ def format_rows(
     powers: NDArray[np.uint64],
     exponents: NDArray[np.int64],
     text: NDArray[np.uint8],
+    number: NDArray[np.float64],
+    number_bits: NDArray[np.uint64],
 ) -> tuple[np.uint64, np.uint64]:
     """Write the rows from `begin` to `text`, a line each: prefix, (m, a) whole numbers, (m, b) float64 by their bits.
 
     Returns:
         The row it stopped at, m or the first with a number that it could not decide, and the bytes written.
     """
-    digits, number = np.empty(20, np.uint8), np.empty(1)
+    digits = np.empty(20, np.uint8)
     rows, integers, reals = np.uint64(len(whole)), np.uint64(whole.shape[1]), np.uint64(bits.shape[1])
     at = np.uint64(0)
     for row in range(begin, rows):
@@ -196,7 +208,7 @@ def format_rows(
                 text[at + _ONE] = _POINT
                 at += np.uint64(3)
             elif -900 < exponent < 900:
-                end = _write_number(pattern, text, at, digits, powers, exponents, number)
+                end = _write_number(pattern, text, at, digits, powers, exponents, number, number_bits)
                 if end == _ZERO64:
                     return np.uint64(row), line
                 at = end

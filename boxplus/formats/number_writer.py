@@ -24,12 +24,15 @@ def write_rows(file: BinaryIO, prefix: str, whole: NDArray[np.int64], numbers: N
     block = max(1, _BLOCK_BYTES // longest)
     text = np.empty(block * longest, np.uint8)
     powers, exponents = powers_of_five()
+    number = np.empty(1)
     for begin in range(0, len(whole), block):
         integers = np.ascontiguousarray(whole[begin : begin + block], np.int64)
         reals = np.ascontiguousarray(numbers[begin : begin + block], np.float64)
         done = 0
         while done < len(integers):
-            stop, size = format_rows(np.uint64(done), word, integers, reals.view(np.uint64), powers, exponents, text)
+            stop, size = format_rows(
+                np.uint64(done), word, integers, reals.view(np.uint64), powers, exponents, text, number, number.view(np.uint64)
+            )
             file.write(text[:size].data)
             done = int(stop)
             if done < len(integers):

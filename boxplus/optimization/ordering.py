@@ -127,7 +127,9 @@ def _symmetrise(
 ) -> np.int64:
     """Both triangles of a lower triangle as adjacency lists without loops and repetitions; returns their length."""
     count = np.uint64(len(start) - 1)
-    cursor = np.zeros(count + _ONE, np.int64)
+    cursor, seen = np.empty(count, np.int64), np.empty(count, np.int64)
+    for j in range(count):
+        cursor[j], seen[j] = 0, -1
     for j in range(count):
         for k in range(np.uint64(col_start[j]), np.uint64(col_start[j + _ONE])):
             i = np.uint64(row[k])
@@ -149,7 +151,6 @@ def _symmetrise(
                 neighbours[np.uint64(cursor[j])] = np.int32(i)
                 cursor[j] += 1
     # A repeated entry is one edge.
-    seen = np.full(count, -1, np.int64)
     out = np.uint64(0)
     for j in range(count):
         begin, end = np.uint64(start[j]), np.uint64(start[j + _ONE])
@@ -192,8 +193,13 @@ def _elimination_tree(
 def _postorder(parent: NDArray[np.uint32], permutation: NDArray[np.int64]) -> None:
     """Relabel positions by a postorder of the tree, in place: children before parents, subtrees without gaps."""
     count = np.uint64(len(parent))
-    child = np.full(count + _ONE, _NONE, np.uint32)  # first child; the last entry collects the roots
+    child = np.empty(count + _ONE, np.uint32)  # first child; the last entry collects the roots
     sibling = np.empty(count, np.uint32)
+    before, tree = np.empty(count, np.int64), np.empty(count, np.uint32)
+    child[count] = _NONE
+    for old in range(count):
+        child[old] = _NONE
+        before[old], tree[old] = permutation[old], parent[old]
     for step in range(count):
         k = count - _ONE - step
         slot = count if parent[k] == _NONE else np.uint64(parent[k])
@@ -215,7 +221,6 @@ def _postorder(parent: NDArray[np.uint32], permutation: NDArray[np.int64]) -> No
                 break
             k = parent[k]
         root = sibling[root]
-    before, tree = permutation.copy(), parent.copy()
     for old in range(count):
         permutation[label[old]] = before[old]
         parent[label[old]] = _NONE if tree[old] == _NONE else label[tree[old]]
@@ -239,7 +244,10 @@ def _column_counts(
     count = np.uint64(len(permutation))
     position = np.empty(count, np.uint32)
     ancestor = np.empty(count, np.uint32)
-    first = np.full(count, _NONE, np.uint32)  # first descendant
+    first = np.empty(count, np.uint32)  # first descendant
+    last_leaf = np.empty(count, np.uint32)
+    for k in range(count):
+        first[k] = last_leaf[k] = _NONE
     for k in range(count):
         position[np.uint64(permutation[k])] = np.uint32(k)
         counts[k] = 0
@@ -249,7 +257,6 @@ def _column_counts(
         above = parent[k]
         if above != _NONE and first[above] == _NONE:
             first[above] = first[k]
-    last_leaf = np.full(count, _NONE, np.uint32)
     for k in range(count):
         node = np.uint64(permutation[k])
         for m in range(np.uint64(start[node]), np.uint64(start[node + _ONE])):
