@@ -5,7 +5,8 @@ addition, `Product(UnitQuaternion, Euclidean(3))`. To first order the same motio
 
     δ_left = Ad_T δ_right,    δ_product = diag(I, R) δ_right,
 
-so a Jacobian, which multiplies δ from the left, changes by the same matrices on its right side: J_right = J_left Ad_T.
+so a Jacobian, which multiplies δ from the left, changes by the same matrices on its right side: J_right = J_left Ad_T. Products
+change component by component: a camera on `Product(SE3Left, Euclidean(3))` may move on `Product(SE3, Euclidean(3))`.
 """
 
 from __future__ import annotations
@@ -31,14 +32,28 @@ _RIGHT, _LEFT = 0, 1  # positions in _POSES
 
 @kernel
 def _change(
-    begin: int, end: int, x: NDArray[np.float64], index: NDArray[np.uint32], J: NDArray[np.float64], native: int, actual: int
+    begin: int,
+    end: int,
+    x: NDArray[np.float64],
+    index: NDArray[np.uint32],
+    J: NDArray[np.float64],
+    stored: int,
+    tangent: int,
+    native: int,
+    actual: int,
 ) -> None:
-    """Rows j = [a, b] of J times ∂δ_native/∂δ_actual, by way of δ_right; R from the right of a row is Rᵀ on its column."""
+    """Rows j = [a, b] of J times ∂δ_native/∂δ_actual, by way of δ_right; R from the right of a row is Rᵀ on its column.
+
+    The pose begins at number `stored` of x, its tangent at column `tangent` of J.
+    """
+    s, c = np.uint64(stored), np.uint64(tangent)
     for n in range(np.uint64(begin), np.uint64(end)):
         k = index[n]
-        qw, qx, qy, qz, tx, ty, tz = x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5], x[k, 6]
+        qw, qx, qy, qz = x[k, s], x[k, s + 1], x[k, s + 2], x[k, s + 3]
+        tx, ty, tz = x[k, s + 4], x[k, s + 5], x[k, s + 6]
         for row in range(J.shape[1]):
-            a0, a1, a2, b0, b1, b2 = J[n, row, 0], J[n, row, 1], J[n, row, 2], J[n, row, 3], J[n, row, 4], J[n, row, 5]
+            a0, a1, a2 = J[n, row, c], J[n, row, c + 1], J[n, row, c + 2]
+            b0, b1, b2 = J[n, row, c + 3], J[n, row, c + 4], J[n, row, c + 5]
             if native == _LEFT:  # [a, b] Ad = [(a + b [t]x) R, b R], and b [t]x is the row b × t
                 a0, a1, a2 = a0 + b1 * tz - b2 * ty, a1 + b2 * tx - b0 * tz, a2 + b0 * ty - b1 * tx
                 a0, a1, a2 = rotate(qw, -qx, -qy, -qz, a0, a1, a2)
@@ -49,7 +64,8 @@ def _change(
             if actual == _LEFT:  # [a, b] Ad⁻¹ = [a Rᵀ − b Rᵀ [t]x, b Rᵀ]
                 a0, a1, a2 = rotate(qw, qx, qy, qz, a0, a1, a2)
                 a0, a1, a2 = a0 - (b1 * tz - b2 * ty), a1 - (b2 * tx - b0 * tz), a2 - (b0 * ty - b1 * tx)
-            J[n, row, 0], J[n, row, 1], J[n, row, 2], J[n, row, 3], J[n, row, 4], J[n, row, 5] = a0, a1, a2, b0, b1, b2
+            J[n, row, c], J[n, row, c + 1], J[n, row, c + 2] = a0, a1, a2
+            J[n, row, c + 3], J[n, row, c + 4], J[n, row, c + 5] = b0, b1, b2
 
 
 def tangent_change(native: Manifold, actual: Manifold) -> TangentChange | None:
@@ -57,23 +73,42 @@ def tangent_change(native: Manifold, actual: Manifold) -> TangentChange | None:
 
     Returns:
         None where the two are equal; else a function of (begin, end, x, index, J) that changes rows [begin, end) of
-        J (N, d, 6) in place, residual n being connected to the pose x[index[n]] of x (n, 7).
+        J (N, d, dof) in place, residual n being connected to x[index[n]] of x (n, size).
 
     Raises:
         InputError: the manifolds do not store the same points.
     """
     if native == actual:
         return None
-    if native not in _POSES or actual not in _POSES:
+    parts = _parts(native, actual, 0, 0)
+    if parts is None:
         raise InputError(
-            f"a variable on {native.name}"
-            + ("" if native not in _POSES else f" or another of {', '.join(m.name for m in _POSES)}"),
+            f"a variable on {native.name}",
             f"one on {actual.name}",
-            "only the three updates of a pose change into each other; add the variables on the manifold of the residual",
+            f"only the updates of a pose change into each other ({', '.join(pose.name for pose in _POSES)}); "
+            "add the variables on the manifold of the residual",
         )
-    codes = _POSES.index(native), _POSES.index(actual)
 
     def change(begin: int, end: int, x: NDArray[np.float64], index: NDArray[np.uint32], J: NDArray[np.float64]) -> None:
-        _change(begin, end, x, index, J, *codes)
+        for part in parts:
+            _change(begin, end, x, index, J, *part)
 
     return change
+
+
+def _parts(native: Manifold, actual: Manifold, stored: int, tangent: int) -> list[tuple[int, int, int, int]] | None:
+    """(stored, tangent, native code, actual code) of every pose to change; None where another component differs."""
+    if native == actual:
+        return []
+    if native in _POSES and actual in _POSES:
+        return [(stored, tangent, _POSES.index(native), _POSES.index(actual))]
+    if not (isinstance(native, Product) and isinstance(actual, Product) and len(native.components) == len(actual.components)):
+        return None
+    found = []
+    for own, other in zip(native.components, actual.components, strict=True):
+        parts = _parts(own, other, stored, tangent)
+        if parts is None:
+            return None
+        found += parts
+        stored, tangent = stored + own.size, tangent + own.dof
+    return found

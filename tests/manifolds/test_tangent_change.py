@@ -18,17 +18,24 @@ from boxplus.manifolds.tangent_change import tangent_change
 POSES = [SE3, SE3Left, Product(UnitQuaternion, Euclidean(3))]
 
 
-@pytest.mark.parametrize(("native", "actual"), list(itertools.permutations(POSES, 2)), ids=str)
+PAIRS = [
+    *itertools.permutations(POSES, 2),
+    (Product(SE3Left, Euclidean(3)), Product(SE3, Euclidean(3))),
+    (Product(SE2, SE3, Product(Euclidean(2), SE3Left)), Product(SE2, SE3Left, Product(Euclidean(2), POSES[2]))),
+]
+
+
+@pytest.mark.parametrize(("native", "actual"), PAIRS, ids=str)
 def test_rows_are_those_of_the_other_update(native: Manifold, actual: Manifold) -> None:
     rng = np.random.default_rng(3)
     x = native.random(rng, 5)
     index = rng.integers(0, 5, 8).astype(np.uint32)
     # ∂δ_native/∂δ_actual by central differences: what `actual` does, read off on `native`.
     h = 1e-4
-    steps = h * np.eye(6)
+    steps = h * np.eye(native.dof)
     x_of = x[index][:, None]
     numeric = (native.boxminus(actual.boxplus(x_of, steps), x_of) - native.boxminus(actual.boxplus(x_of, -steps), x_of)) / (2 * h)
-    J = rng.normal(size=(8, 4, 6))
+    J = rng.normal(size=(8, 4, native.dof))
     expected = J @ np.swapaxes(numeric, 1, 2)
     change = tangent_change(native, actual)
     assert change is not None
@@ -49,10 +56,22 @@ def test_equal_manifolds_need_no_change() -> None:
 
 
 @pytest.mark.parametrize(
-    ("native", "actual"), [(SE3, SE2), (UnitQuaternion, SO3), (Euclidean(3), Euclidean(2)), (SE3Left, Euclidean(7))], ids=str
+    ("native", "actual"),
+    [
+        (SE3, SE2),
+        (UnitQuaternion, SO3),
+        (Euclidean(3), Euclidean(2)),
+        (SE3Left, Euclidean(7)),
+        (Product(SE3, Euclidean(3)), Product(SE3Left, Euclidean(2))),
+        (Product(SE3, Euclidean(3)), Product(SE3Left, Euclidean(2), Euclidean(1))),
+    ],
+    ids=str,
 )
 def test_other_manifolds_are_refused_by_name(native: Manifold, actual: Manifold) -> None:
     with pytest.raises(InputError) as error:
         tangent_change(native, actual)
     assert f"expected a variable on {native.name}" in str(error.value)
-    assert f"got one on {actual.name} – only the three updates of a pose change into each other" in str(error.value)
+    assert (
+        f"got one on {actual.name} – only the updates of a pose change into each other (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)))"
+        in str(error.value)
+    )
