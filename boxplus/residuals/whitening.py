@@ -86,6 +86,10 @@ class Whitening:
         factors[:, np.arange(dim), np.arange(dim)] = diagonal
         return cls(factors, True)
 
+    def rows(self, selected: NDArray[np.intp]) -> Whitening:
+        """The whitening of the residuals `selected` alone."""
+        return self if len(self.factors) == 1 else Whitening(self.factors[selected], self.is_diagonal)
+
 
 def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse: bool) -> NDArray[np.float64]:
     """W (1 or N, d, d) of an information matrix, or of a covariance when `inverse`."""
