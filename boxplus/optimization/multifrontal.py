@@ -65,7 +65,8 @@ def _add_child(child: Table, first: np.uint64, split: np.uint64, last: np.uint64
 
 @kernel(inline=True)
 def _begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
-                 values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, entries_of_diagonal: Buffer) -> None:  # fmt: skip
+                 values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer,
+                 entries_of_diagonal: Buffer) -> None:  # fmt: skip
     """Fill the panel: blocks of the matrix, damping, and what the children add to it."""
     front, following = table[g], table[g + _ONE]
     column, at, ld = front["column"], front["panel_at"], front["panel_ld"]

@@ -70,7 +70,7 @@ def split_tree(parent: Indices, width: Indices, below: Indices, threads: int) ->
         for _ in range(SPLITS):
             subtrees = _join([g for _, g in heap], first, whole, limit)
             time = rest + _makespan([t for t, _, _ in subtrees], threads)
-            if time < best[0]:
+            if len(subtrees) > 1 and time < best[0]:
                 best = (time, subtrees)
             if not heap:
                 break

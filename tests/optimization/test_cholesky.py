@@ -1,5 +1,8 @@
 """The sparse Cholesky factorisation against dense linear algebra and scipy."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -230,3 +233,10 @@ def test_a_large_front_names_its_failure_too(position: int, monkeypatch: pytest.
     values[position, position] = 0.0
     with pytest.raises(NotPositiveDefinite, match=f"degree of freedom {position} of variable 0"):
         SparseCholesky(pattern, threads=2).factorize(values.ravel())
+
+
+def test_the_example_of_the_documentation_runs() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "sparse_cholesky.md"
+    scope: dict[str, NDArray[np.float64]] = {}
+    exec(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)[0], scope)
+    np.testing.assert_allclose(scope["x"], 0.5)
