@@ -18,7 +18,10 @@ NO_POINT_TIME = "none"
 
 
 class RecordingOptions(BaseModel):
-    """How to read a recording. None means: find it from the data, and refuse when two readings fit. The command line's options are these fields."""
+    """How to read a recording. None means: find it from the data, and refuse when two readings fit.
+
+    The command line's options are these fields.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
