@@ -21,7 +21,7 @@ BLOCK = 1 << 22
 """Bytes of points3D.bin that are read at a time."""
 
 _COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<iiQQ")
+_CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
@@ -31,6 +31,8 @@ _LENGTH_AT = np.uint64(_POINT.itemsize - 8)
 _ONE, _EIGHT = np.uint64(1), np.uint64(8)
 _POINTS_AT_ONCE = 1 << 16
 _LONGEST_NAME = 4096
+_LARGEST_IMAGE = 1 << 31
+_COPY = "the file is cut, or not one of COLMAP: copy it again"
 _NAMES = tuple(CAMERA_MODELS)
 
 
@@ -56,7 +58,7 @@ class _File:
         return int(count)
 
     def cut(self, what: str) -> NoReturn:
-        raise InputError(what, f"the end of the file ({self.path})", "the file is cut, or not one of COLMAP: copy it again")
+        raise InputError(what, f"the end of the file ({self.path})", _COPY)
 
     def finish(self) -> None:
         if self.left:
@@ -94,6 +96,10 @@ def _read_cameras(file: _File, parts: ColmapParts) -> None:
                 f"a camera model from 0 to {len(_NAMES) - 1}",
                 f"{model}, camera {name} ({file.path})",
                 "convert it to a known one",
+            )
+        if max(width, height) > _LARGEST_IMAGE:
+            raise InputError(
+                f"an image of at most {_LARGEST_IMAGE} pixels a side", f"{width} × {height}, camera {name} ({file.path})", _COPY
             )
         size = 8 * CAMERA_MODELS[_NAMES[model]]
         parts.camera_ids.append(name)

@@ -103,6 +103,9 @@ class ColmapModel:
             names, times = np.unique(ids, return_counts=True)
             if (times > 1).any():
                 self._refuse(f"each {kind} once", f"{kind} {names[np.argmax(times)]} again", "remove one of the two")
+            largest = (1 << 63) - 1 if kind == "point" else (1 << 32) - 1
+            if len(names) and not 0 <= names[0] <= names[-1] <= largest:
+                self._refuse(f"{kind} ids from 0 to {largest}", f"{names[0]} to {names[-1]}", "number them anew")
         for name, index, lowest, count in (
             ("camera", self.camera_of, 0, cameras),
             ("image", self.image_of, 0, images),
@@ -118,6 +121,10 @@ class ColmapModel:
         self._check_values()
 
     def _check_cameras(self) -> None:
+        bad = np.flatnonzero((self.camera_sizes < 0).any(axis=1))
+        if bad.size:
+            got = f"{self.camera_sizes[bad[0]].tolist()}, camera {self.camera_ids[bad[0]]}"
+            self._refuse("widths and heights that are not negative", got, "check the order of the columns")
         for name, params, camera in zip(self.camera_models, self.camera_params, self.camera_ids, strict=True):
             if name not in CAMERA_MODELS:
                 self._refuse("a camera model out of " + ", ".join(CAMERA_MODELS), f"{name!r}, camera {camera}", "use one of them")
@@ -136,7 +143,8 @@ class ColmapModel:
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if bad.size:
                 self._refuse(f"a finite {name}", f"{values[bad[0]].tolist()}, {what} {names[bad[0]]}", f"remove the {what}")
-        length = np.linalg.norm(self.T_camera_world[:, :4], axis=1)
+        with np.errstate(over="ignore"):
+            length = np.linalg.norm(self.T_camera_world[:, :4], axis=1)
         bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
         if bad.size:
             got = f"length {length[bad[0]]:.6g}, image {self.image_ids[bad[0]]}"

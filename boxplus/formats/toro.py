@@ -79,7 +79,8 @@ def _plane_in(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def _space_in(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """[x, y, z, roll, pitch, yaw] to [qw, qx, qy, qz, x, y, z]."""
     half = 0.5 * rows[:, 3:]
-    cosine, sine = np.cos(half), np.sin(half)
+    with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN, which the graph refuses with its line
+        cosine, sine = np.cos(half), np.sin(half)
     zero = np.zeros(len(rows))
     roll = np.column_stack([cosine[:, 0], sine[:, 0], zero, zero])
     pitch = np.column_stack([cosine[:, 1], zero, sine[:, 1], zero])

@@ -199,6 +199,13 @@ def test_an_unknown_camera_model_is_refused(tmp_path: Path) -> None:
         read_colmap(tmp_path)
 
 
+def test_an_impossible_image_size_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, random_model(0), "binary")
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 1) + struct.pack("<IiQQ3d", 7, 0, 2**63, 480, 1, 2, 3))
+    with pytest.raises(InputError, match=r"at most 2147483648 pixels a side – got 9223372036854775808 × 480, camera 7"):
+        read_colmap(tmp_path)
+
+
 def test_tracks_must_agree_with_observations(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 500 320 240\n")
     (tmp_path / "images.txt").write_text("3 1 0 0 0 1 2 3 1 a\n1 2 8 3 4 9\n")
@@ -218,10 +225,12 @@ def test_tracks_must_agree_with_observations(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"points": np.zeros((5, 3))}, r"points of shape \(6, 3\) – got \(5, 3\) \(COLMAP model\)"),
+        ({"camera_sizes": np.full((3, 2), -1)}, r"widths and heights that are not negative – got \[-1, -1\], camera"),
         ({"image_names": ("a",)}, r"4 image_names – got 1"),
         ({"camera_models": ("CUBE", "PINHOLE", "PINHOLE")}, r"a camera model out of .* – got 'CUBE', camera"),
         ({"camera_params": (np.zeros(2),) * 3}, r"\d+ parameters of .* – got shape \(2,\), camera"),
         ({"image_ids": np.array([1, 2, 2, 3])}, r"each image once – got image 2 again"),
+        ({"image_ids": np.array([1, 2, 3, 2**32])}, r"image ids from 0 to 4294967295 – got 1 to 4294967296"),
         ({"camera_of": np.array([0, 1, 2, 3])}, r"camera indices from 0 to 2 – got 3 at 3"),
         ({"point_of": np.full(20, -2)}, r"point indices from -1 to 5 – got -2 at 0"),
         ({"image_of": np.arange(20)[::-1] // 5}, r"observations image by image – got image_of that decreases"),

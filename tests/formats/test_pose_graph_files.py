@@ -242,6 +242,9 @@ def test_bad_toro_lines_are_refused(tmp_path: Path) -> None:
         InputError, match=r"EDGE2 with two ids, x y theta and the information I11 I12 I22 I33 I13 I23 – got .*line 3"
     ):
         read_toro(path)
+    path.write_text("VERTEX3 0 0 0 0 inf 0 0\nVERTEX3 1 0 0 0 0 0 0\n" + f"EDGE3 0 1 {ROW[:-2]} {UNIT}\n")
+    with pytest.raises(InputError, match=r"a finite pose – got .*nan.*line 1"):
+        read_toro(path)
     path.write_text("VERTEX_SE2 0 0 0 0\n")
     with pytest.raises(InputError, match=r"begins with VERTEX2, EDGE2, VERTEX3 or EDGE3 – got 'VERTEX_SE2"):
         read_toro(path)
