@@ -15,7 +15,7 @@ from boxplus._jit import kernel
 from boxplus.manifolds._batch import map_batch
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.so3 import log_quaternion, quaternion_into, right_jacobian_into, right_jacobian_inverse_into
+from boxplus.manifolds.so3 import SERIES_SWITCH, log_quaternion, quaternion_into, right_jacobian_into, right_jacobian_inverse_into
 
 
 @kernel(inline=True)
@@ -62,12 +62,24 @@ def rotation_entries(
 
 
 @kernel(inline=True)
+def half_angle(angle_sq: float) -> tuple[float, float]:
+    """cos(θ/2) and sin(θ/2)/θ from θ²; by their series below the switch of the other coefficients (SPEC.md 1.1)."""
+    if angle_sq < SERIES_SWITCH:
+        t = 0.25 * angle_sq
+        c = 1.0 - t / 2.0 * (
+            1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0 * (1.0 - t / 132.0 * (1.0 - t / 182.0)))))
+        )
+        s = 0.5 - t / 12.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0 * (1.0 - t / 156.0)))))
+        return c, s
+    angle = math.sqrt(angle_sq)
+    return math.cos(0.5 * angle), math.sin(0.5 * angle) / angle
+
+
+@kernel(inline=True)
 def exp_scalars(wx: float, wy: float, wz: float) -> tuple[float, float, float, float]:
     """Exp_q of a rotation vector as (w, x, y, z): [cos θ/2, sin(θ/2) axis] (SPEC.md 1.3)."""
-    half_sq = 0.25 * (wx * wx + wy * wy + wz * wz)
-    half = math.sqrt(half_sq)
-    factor = 0.5 * (1.0 - half_sq / 6.0) if half_sq < 1e-10 else 0.5 * math.sin(half) / half
-    return math.cos(half), factor * wx, factor * wy, factor * wz
+    c, s = half_angle(wx * wx + wy * wy + wz * wz)
+    return c, s * wx, s * wy, s * wz
 
 
 @kernel(inline=True)

@@ -15,7 +15,7 @@ from boxplus._jit import kernel
 from boxplus.manifolds._batch import map_batch, map_pairs
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.quaternion import exp_scalars, multiply_scalars, normalized_scalars, rotate, rotation_entries
+from boxplus.manifolds.quaternion import half_angle, multiply_scalars, normalized_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3_jacobians import (
     inverse_jacobian_coefficients,
     left_jacobian,
@@ -27,7 +27,7 @@ from boxplus.manifolds.se3_jacobians import (
     right_jacobian_inverse,
     right_jacobian_inverse_into,
 )
-from boxplus.manifolds.so3 import exp_coefficients, log_quaternion
+from boxplus.manifolds.so3 import SERIES_SWITCH, exp_coefficients, log_quaternion
 
 __all__ = [
     "SE3",
@@ -60,8 +60,13 @@ __all__ = [
 @kernel(inline=True)
 def exp_into(wx: float, wy: float, wz: float, vx: float, vy: float, vz: float, T: NDArray[np.float64]) -> None:
     """T = Exp(w, v), (7,): rotation Exp(w), translation J_l(w) v."""
-    _, b, c = exp_coefficients(wx * wx + wy * wy + wz * wz)
-    T[0], T[1], T[2], T[3] = exp_scalars(wx, wy, wz)
+    t = wx * wx + wy * wy + wz * wz
+    cos_half, s = half_angle(t)
+    if t < SERIES_SWITCH:
+        _, b, c = exp_coefficients(t)
+    else:  # B and C by sin θ = 2 sin(θ/2) cos(θ/2), which are there already
+        b, c = 2.0 * s * s, (1.0 - 2.0 * s * cos_half) / t
+    T[0], T[1], T[2], T[3] = cos_half, s * wx, s * wy, s * wz
     # J_l v = v + b w × v + c w × (w × v)
     ux, uy, uz = wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx
     T[4] = vx + b * ux + c * (wy * uz - wz * uy)

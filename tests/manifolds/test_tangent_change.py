@@ -71,7 +71,4 @@ def test_other_manifolds_are_refused_by_name(native: Manifold, actual: Manifold)
     with pytest.raises(InputError) as error:
         tangent_change(native, actual)
     assert f"expected a variable on {native.name}" in str(error.value)
-    assert (
-        f"got one on {actual.name} – only the updates of a pose change into each other (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)))"
-        in str(error.value)
-    )
+    assert f"got one on {actual.name} – only the updates of a pose change into each other (SE3, SE3Left, " in str(error.value)
