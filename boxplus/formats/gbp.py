@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.bal_text import read_bal_text
+from boxplus.formats.number_writer import write_rows
+from boxplus.formats.output import atomic_file
+from boxplus.manifolds import quaternion, so3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,3 +52,19 @@ def _quaternions(rotation_vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Exp_q of (m, 3) rotation vectors (SPEC.md 1.3), wxyz."""
     half = 0.5 * np.linalg.norm(rotation_vectors, axis=1, keepdims=True)
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation_vectors])
+
+
+def write_gbp(path: str | Path, problem: GbpProblem) -> None:
+    """Write such a file, without comments; it appears only when it is whole.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rotation = so3.log(quaternion.to_matrix(np.ascontiguousarray(problem.T_camera_world[:, :4])))
+    with atomic_file(path) as file:
+        file.write(f"{len(problem.T_camera_world)} {len(problem.points)} {len(problem.pixels)}\n".encode())
+        write_rows(file, "", np.empty((1, 0), np.int64), problem.intrinsics[None])
+        write_rows(file, "", np.column_stack([problem.camera_of, problem.point_of]), problem.pixels)
+        for block in (np.hstack([problem.T_camera_world[:, 4:], rotation]), problem.points):
+            numbers = block.reshape(-1, 1)
+            write_rows(file, "", np.empty((len(numbers), 0), np.int64), numbers)

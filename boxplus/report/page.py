@@ -2,62 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from string import Template
 
-import plotly.graph_objects as go
-from plotly.offline import get_plotlyjs
-
-from boxplus.formats.output import atomic_file
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
+from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.systems.run_summary import Gap, Matrix
-
-_STYLE = """
-:root { --ink: #22303c; --faint: #6b7a8f; --line: #e4e8ec; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #f5f7f9; color: var(--ink); font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 28px 24px 60px; }
-h1 { font-size: 24px; margin: 0; } h2 { font-size: 17px; margin: 0 0 2px; }
-.lead { color: var(--faint); margin: 4px 0 18px; }
-section { background: white; border: 1px solid var(--line); border-radius: 8px; padding: 16px 18px; margin: 16px 0; }
-section > p { color: var(--faint); margin: 0 0 8px; font-size: 14px; }
-.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(160px, 1fr)); gap: 12px; margin: 18px 0 0; }
-.figures div { background: white; border: 1px solid var(--line); border-radius: 8px; padding: 12px 14px; }
-.figures b { display: block; font-size: 21px; font-weight: 600; } .figures span { color: var(--faint); font-size: 13px; }
-.state { display: inline-block; border-radius: 5px; padding: 1px 9px; color: white; background: #2f7d5b; font-size: 14px; }
-.state.interrupted, .state.running { background: #b97a1a; } .state.failed { background: #c1443c; }
-.warnings { border-left: 4px solid #e09f3e; } .warnings ul { margin: 6px 0 0; padding-left: 20px; }
-table { border-collapse: collapse; width: 100%; font-size: 14px; }
-td, th { text-align: left; vertical-align: top; padding: 4px 12px 4px 0; border-bottom: 1px solid var(--line); }
-th { color: var(--faint); font-weight: 500; } td.key { color: var(--faint); white-space: nowrap; width: 1%; padding-right: 24px; }
-td.warning { color: #a8690c; } td.error { color: #c1443c; }
-code, pre { font: 13px ui-monospace, Menlo, Consolas, monospace; } pre { margin: 0; }
-details { margin-top: 8px; } summary { cursor: pointer; color: var(--faint); }
-@media print { body { background: white; } section { break-inside: avoid; } }
-"""
-
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title>
-<style>$style</style>
-<script>$plotly</script>
-</head>
-<body>
-<main>
-$body
-</main>
-</body>
-</html>
-""")
-
-_CONFIG = {"displaylogo": False, "responsive": True, "displayModeBar": False}
-_CONFIG_3D = {"displaylogo": False, "responsive": True, "displayModeBar": True, "scrollZoom": True}
 
 
 def write_page(data: RunData) -> Path:
@@ -66,12 +17,7 @@ def write_page(data: RunData) -> Path:
     Raises:
         OutputError: it cannot be written.
     """
-    text = _PAGE.substitute(
-        title=f"{escape(Path(data.summary.recording.path).name)} – boxplus", style=_STYLE, plotly=get_plotlyjs(), body=_body(data)
-    )
-    with atomic_file(data.folder.report) as file:
-        file.write(text.encode())
-    return data.folder.report
+    return write_html(data.folder.report, Path(data.summary.recording.path).name, _body(data))
 
 
 def _body(data: RunData) -> str:
@@ -82,14 +28,14 @@ def _body(data: RunData) -> str:
         else "The run kept no map; the trajectory is coloured by status."
     )
     parts.append(
-        _figure(
+        figure_section(
             "Map and trajectory",
             f"{about_map} Drag to turn, scroll to zoom, click in the legend to hide.",
             figures.map_and_trajectory(data),
         )
     )
     parts.append(
-        _figure(
+        figure_section(
             "Status and information",
             "ok: all six axes measured; weak: some directions only predicted from the IMU; lost: no update. Below, for every "
             "axis of the pose (rotation about the IMU's axes, position along the world's), the share of its information that "
@@ -98,16 +44,16 @@ def _body(data: RunData) -> str:
             _weak_table(data),
         )
     )
-    parts.append(_figure("Timing", _timing_text(data), figures.timing(data), _stage_table(data)))
-    parts.append(_figure("Velocity", "Of the IMU, along the world's axes.", figures.velocity(data)))
-    parts.append(_figure("Uncertainty", "Standard deviations of the pose.", figures.sigmas(data)))
-    parts.append(_figure("Biases", "With one standard deviation.", figures.biases(data)))
+    parts.append(figure_section("Timing", _timing_text(data), figures.timing(data), _stage_table(data)))
+    parts.append(figure_section("Velocity", "Of the IMU, along the world's axes.", figures.velocity(data)))
+    parts.append(figure_section("Uncertainty", "Standard deviations of the pose.", figures.sigmas(data)))
+    parts.append(figure_section("Biases", "With one standard deviation.", figures.biases(data)))
     parts.append(
-        _figure("Gravity", "Magnitude, and the change of its direction since the first estimate.", figures.gravity(data))
+        figure_section("Gravity", "Magnitude, and the change of its direction since the first estimate.", figures.gravity(data))
     )
     parts.append(_extrinsic(data))
     text = "Points of a scan after the voxel filter, and the root mean square distance of the used ones from their planes."
-    parts.append(_figure("Points", text, figures.points(data)))
+    parts.append(figure_section("Points", text, figures.points(data)))
     parts.append(_input(data))
     parts.append(_facts(data))
     return "\n".join(parts)
@@ -124,7 +70,6 @@ def _head(data: RunData) -> str:
         (f"{summary.timing.real_time_factor:.1f} ×", "real time, reading included"),
         (f"{summary.map.stored_points:,}", "map points"),
     ]
-    tiles = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for value, name in numbers)
     color = summary.state if summary.contradiction is None else "failed"
     told = summary.describe_state().removeprefix(summary.state).lstrip(": ")
     return (
@@ -132,7 +77,7 @@ def _head(data: RunData) -> str:
         f'<p class="lead"><span class="state {color}">{summary.state}</span> {escape(told)} · '
         f"{escape(summary.recording.format)} · boxplus {escape(summary.versions['boxplus'])} · "
         f"{summary.started:%Y-%m-%d %H:%M} UTC</p>"
-        f'<div class="figures">{tiles}</div>'
+        f"{tiles(numbers)}"
     )
 
 
@@ -141,25 +86,9 @@ def _warnings(data: RunData) -> str:
     for warning in data.summary.warnings:
         when = "" if warning.first_s is None else f", first at {warning.first_s:.1f} s"
         times = f" <small>({warning.count} times{when})</small>" if warning.count > 1 else ""
-        lines.append(f"<li>{escape(warning.text)}{times}</li>")
-    lines += [f"<li>map: {escape(remark)}</li>" for remark in data.map_remarks]
-    if not lines:
-        return '<section><h2>Warnings</h2><p style="margin:0">None.</p></section>'
-    return f'<section class="warnings"><h2>Warnings</h2><ul>{"".join(lines)}</ul></section>'
-
-
-def _figure(title: str, text: str, figure: go.Figure, below: str = "") -> str:
-    config = _CONFIG_3D if figure.layout.scene.camera.eye.x is not None else _CONFIG
-    drawn = figure.to_html(full_html=False, include_plotlyjs=False, config=config, default_width="100%")
-    return f"<section><h2>{escape(title)}</h2><p>{escape(text)}</p>{drawn}{below}</section>"
-
-
-def _table(rows: Iterable[tuple[str, ...]], heading: tuple[str, ...] = ()) -> str:
-    head = f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in heading)}</tr>" if heading else ""
-    body = "".join(
-        f'<tr><td class="key">{escape(row[0])}</td>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>' for row in rows
-    )
-    return f"<table>{head}{body}</table>" if body else ""
+        lines.append(f"{escape(warning.text)}{times}")
+    lines += [f"map: {escape(remark)}" for remark in data.map_remarks]
+    return warnings_section(lines)
 
 
 def _weak_table(data: RunData) -> str:
@@ -167,7 +96,7 @@ def _weak_table(data: RunData) -> str:
     if not intervals:
         return ""
     rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.scans}", i.text) for i in intervals[:200]]
-    table = _table(rows, ("time", "status", "scans", "at its beginning"))
+    table = html_table(rows, ("time", "status", "scans", "at its beginning"))
     return f"<details><summary>Intervals that were not ok: {len(intervals)}</summary>{table}</details>"
 
 
@@ -187,7 +116,7 @@ def _stage_table(data: RunData) -> str:
     timing = data.summary.timing
     stages = dict(timing.stages_ms) | ({"all stages": timing.scan_ms} if timing.scan_ms is not None else {})
     rows = [(name, f"{d.median:.2f}", f"{d.p99:.2f}", f"{d.max:.2f}") for name, d in stages.items()]
-    return _table(rows, ("stage", "median [ms]", "99th percentile", "largest"))
+    return html_table(rows, ("stage", "median [ms]", "99th percentile", "largest"))
 
 
 def _extrinsic(data: RunData) -> str:
@@ -201,7 +130,7 @@ def _extrinsic(data: RunData) -> str:
     text = f"Pose of the LiDAR in the IMU frame (p_imu = T_imu_lidar p_lidar): {what}. {facts.text}"
     if facts.estimation == "off":
         return f"<section><h2>Extrinsic</h2><p>{escape(text)}</p>{table.replace('<th>at the end</th>', '')}</section>"
-    return _figure("Extrinsic", text, figures.extrinsic(data), table)
+    return figure_section("Extrinsic", text, figures.extrinsic(data), table)
 
 
 def _matrix(T: Matrix) -> str:
@@ -215,9 +144,9 @@ def _input(data: RunData) -> str:
         f"three times the usual one: {_gap_text(summary.imu_gaps)} of the IMU, {_gap_text(summary.scan_gaps)} of the scans."
     )
     rows = [(place, reason, f"{count:,}") for place, counts in summary.rejected.items() for reason, count in counts.items()]
-    table = _table(rows, ("where", "rejected because", "count")) or "<p>Nothing was rejected.</p>"
+    table = html_table(rows, ("where", "rejected because", "count")) or "<p>Nothing was rejected.</p>"
     if summary.imu_gaps or summary.scan_gaps:
-        return _figure("Gaps and rejections", text, figures.gaps(data), table)
+        return figure_section("Gaps and rejections", text, figures.gaps(data), table)
     return f"<section><h2>Gaps and rejections</h2><p>{escape(text)}</p>{table}</section>"
 
 
@@ -245,7 +174,7 @@ def _facts(data: RunData) -> str:
     head = "<tr><th>reading</th><th>found</th><th></th><th>evidence</th></tr>"
     settings = escape(data.folder.config.read_text(encoding="utf-8")) if data.folder.config.is_file() else ""
     return (
-        f"<section><h2>Run</h2>{_table(rows)}</section>"
+        f"<section><h2>Run</h2>{html_table(rows)}</section>"
         f"<section><h2>How the recording was read</h2><table>{head}{evidence}</table>"
         f"<details><summary>config.yaml</summary><pre>{settings}</pre></details></section>"
     )

@@ -16,6 +16,7 @@ from boxplus.errors import InputError
 from boxplus.formats.bal import BalProblem
 from boxplus.formats.colmap_model import ColmapModel
 from boxplus.formats.gbp import GbpProblem
+from boxplus.formats.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3Left
@@ -27,9 +28,18 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import Variables
 from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
 from boxplus.residuals.reprojection import Reprojection
-from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
+from boxplus.residuals.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
 
-Reconstruction = BalProblem | GbpProblem | ColmapModel
+# The scale of a COLMAP model is arbitrary: only what lies behind a camera is behind it.
+_Z_MIN = 1e-9
+# Which of COLMAP's parameters stands where in `Pinhole.parameters`; −1: a coefficient that is zero.
+_COLMAP_LAYOUT = {
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1),
+    "RADIAL": (0, 0, 1, 2, 3, 4),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+}
 
 
 class BundleAdjustmentConfig(BaseModel):
@@ -41,6 +51,9 @@ class BundleAdjustmentConfig(BaseModel):
     intrinsics: Literal["held", "refined"] = Field(
         "held", description="of COLMAP's cameras; those of a BAL file are always refined, as its cameras carry them"
     )
+    principal_point: Literal["held", "refined"] = Field(
+        "held", description="of COLMAP's cameras where the intrinsics are refined; few scenes determine it well"
+    )
     solver: SolverOptions = Field(SolverOptions(), description="see SolverOptions")
 
 
@@ -51,6 +64,8 @@ class BundleAdjustmentResult:
     Attributes:
         reconstruction: of the same kind as the input, with adjusted cameras and points.
         errors_start, errors: (k,) distance of every observation from its projection [px], NaN where it cannot be projected.
+            k leaves out those of COLMAP's observations that belong to no point.
+        camera_of, point_of: (k,) the camera (of COLMAP the image) and the point of each.
         solution: with history, covariance, and why it stopped.
         cameras, points: the variables of `solution`.
         time_s: seconds, set-up included.
@@ -59,6 +74,8 @@ class BundleAdjustmentResult:
     reconstruction: Reconstruction
     errors_start: NDArray[np.float64]
     errors: NDArray[np.float64]
+    camera_of: NDArray[np.int64]
+    point_of: NDArray[np.int64]
     solution: Solution
     cameras: Variables
     points: Variables
@@ -92,10 +109,16 @@ def adjust_bundle(
     start = [block.values for block in problem.blocks]
     errors_start = _errors(problem, start)
     solution = problem.solve(config.solver, callback=callback)
+    errors = _errors(problem, list(solution.values))
+    camera_of, point_of = (
+        np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
+    )
     return BundleAdjustmentResult(
-        reconstruction=_with_values(reconstruction, problem, solution, cameras, points),
+        reconstruction=_with_values(reconstruction, config, problem, solution, cameras, points, errors, point_of),
         errors_start=errors_start,
-        errors=_errors(problem, list(solution.values)),
+        errors=errors,
+        camera_of=camera_of,
+        point_of=point_of,
         solution=solution,
         cameras=cameras,
         points=points,
@@ -138,36 +161,52 @@ def _add_colmap(
             held = Reprojection(camera, model.pixels[chosen], sigma=config.sigma_px)
             problem.add_residuals(held, *connections, loss=loss, name=label)
             continue
-        if model.camera_models[number].startswith("SIMPLE") or model.camera_models[number] == "RADIAL":
-            raise InputError(
-                "cameras with two focal lengths (PINHOLE, OPENCV) to refine intrinsics",
-                f"camera {name} of model {model.camera_models[number]} ({model.source})",
-                "convert the camera, or hold the intrinsics",
-            )
-        refined = ReprojectionIntrinsics(camera, model.pixels[chosen], sigma=config.sigma_px)
-        intrinsics = problem.add_variables(refined.manifolds[2], camera.parameters, name=f"intrinsics of camera {name}")
+        free, offset, basis = _free_parameters(model, number, config)
+        refined = ReprojectionTiedIntrinsics(camera, model.pixels[chosen], offset, basis, sigma=config.sigma_px)
+        start = model.camera_params[number][free]
+        intrinsics = problem.add_variables(refined.manifolds[2], start, name=_intrinsics_name(name))
         problem.add_residuals(refined, *connections, intrinsics, loss=loss, name=label)
+    if not problem.groups:
+        raise InputError("images that see points", f"not a single observation of a point ({model.source})", "triangulate first")
     return images, points
+
+
+def _intrinsics_name(camera_id: int) -> str:
+    return f"intrinsics of camera {camera_id}"
+
+
+def _layout(model: ColmapModel, number: int) -> NDArray[np.float64]:
+    """(n, m) matrix that turns COLMAP's parameters of a camera into those of `Pinhole`."""
+    name = model.camera_models[number]
+    if name not in _COLMAP_LAYOUT:
+        raise InputError(
+            f"a camera of model {', '.join(_COLMAP_LAYOUT)}",
+            f"{name}, camera {model.camera_ids[number]} ({model.source})",
+            "undistort the images, or convert the camera",
+        )
+    layout = np.zeros((len(_COLMAP_LAYOUT[name]), len(model.camera_params[number])))
+    for row, column in enumerate(_COLMAP_LAYOUT[name]):
+        if column >= 0:
+            layout[row, column] = 1.0
+    return layout
 
 
 def _pinhole(model: ColmapModel, number: int) -> Pinhole:
     """The camera, in pixels of COLMAP: its centres at half pixels only shift cx and cy."""
-    name, p = model.camera_models[number], [float(v) for v in model.camera_params[number]]
-    if name == "SIMPLE_PINHOLE":
-        return Pinhole(p[0], p[0], p[1], p[2])
-    if name == "PINHOLE":
-        return Pinhole(p[0], p[1], p[2], p[3])
-    if name == "SIMPLE_RADIAL":
-        return Pinhole(p[0], p[0], p[1], p[2], Radial(p[3], 0.0))
-    if name == "RADIAL":
-        return Pinhole(p[0], p[0], p[1], p[2], Radial(p[3], p[4]))
-    if name == "OPENCV":
-        return Pinhole(p[0], p[1], p[2], p[3], RadialTangential(p[4], p[5], p[6], p[7]))
-    raise InputError(
-        "a camera of model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
-        f"{name}, camera {model.camera_ids[number]} ({model.source})",
-        "undistort the images, or convert the camera",
-    )
+    c = [float(value) for value in _layout(model, number) @ model.camera_params[number]]
+    distortion = None if len(c) == 4 else Radial(c[4], c[5]) if len(c) == 6 else RadialTangential(c[4], c[5], c[6], c[7])
+    return Pinhole(c[0], c[1], c[2], c[3], distortion, _Z_MIN)
+
+
+def _free_parameters(
+    model: ColmapModel, number: int, config: BundleAdjustmentConfig
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Which of COLMAP's parameters are refined, and offset and basis of `ReprojectionTiedIntrinsics` for them."""
+    layout = _layout(model, number)
+    free = np.ones(layout.shape[1], dtype=np.bool_)
+    if config.principal_point == "held":
+        free[list(_COLMAP_LAYOUT[model.camera_models[number]][2:4])] = False
+    return free, layout[:, ~free] @ model.camera_params[number][~free], layout[:, free]
 
 
 def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -181,8 +220,23 @@ def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.f
     return np.concatenate(distances)
 
 
+def mean_error_of_points(count: int, errors: NDArray[np.float64], point_of: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(count,) mean distance of every point's observations from its projections [px]; NaN where none can be projected."""
+    seen = np.isfinite(errors)
+    total = np.bincount(point_of[seen], errors[seen], count)
+    times = np.bincount(point_of[seen], minlength=count)
+    return np.where(times > 0, total / np.maximum(times, 1), np.nan)
+
+
 def _with_values(
-    reconstruction: Reconstruction, problem: Problem, solution: Solution, cameras: Variables, points: Variables
+    reconstruction: Reconstruction,
+    config: BundleAdjustmentConfig,
+    problem: Problem,
+    solution: Solution,
+    cameras: Variables,
+    points: Variables,
+    errors: NDArray[np.float64],
+    point_of: NDArray[np.int64],
 ) -> Reconstruction:
     T, p_world = solution[cameras], solution[points]
     if isinstance(reconstruction, BalProblem):
@@ -190,9 +244,12 @@ def _with_values(
         return replace(reconstruction, cameras=np.hstack([vectors, T[:, 4:]]), points=p_world)
     if isinstance(reconstruction, GbpProblem):
         return replace(reconstruction, T_camera_world=T, points=p_world)
-    params = list(reconstruction.camera_params)
-    names = {f"intrinsics of camera {name}": number for number, name in enumerate(reconstruction.camera_ids)}
+    params = [array.copy() for array in reconstruction.camera_params]
+    names = {_intrinsics_name(name): number for number, name in enumerate(reconstruction.camera_ids)}
     for block in problem.blocks:
         if block.name in names:
-            params[names[block.name]] = solution[block][0]
-    return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params))
+            number = names[block.name]
+            params[number][_free_parameters(reconstruction, number, config)[0]] = solution[block][0]
+    mean = mean_error_of_points(len(p_world), errors, point_of)
+    known = np.where(np.isfinite(mean), mean, -1.0)
+    return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params), errors=known)

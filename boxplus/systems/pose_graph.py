@@ -98,7 +98,9 @@ def optimize_pose_graph(
     prepared = time.perf_counter()
     solution = problem.solve(config.solver, start=[candidates[chosen]], callback=callback)
     solved = time.perf_counter()
-    squared_start, squared = (_squared_errors(graph, poses_at, config.objective) for poses_at in (candidates[chosen], solution[poses]))
+    squared_start, squared = (
+        _squared_errors(graph, poses_at, config.objective) for poses_at in (candidates[chosen], solution[poses])
+    )
     return PoseGraphResult(
         graph=replace(graph, poses=solution[poses]),
         start=chosen,
@@ -146,8 +148,8 @@ def _squared_errors(graph: PoseGraph, poses: NDArray[np.float64], objective: Obj
     e = residual.evaluate(poses[i], poses[j])
     if objective == "chordal":
         weighted = np.einsum("nab,nb->na", residual.whitening.factors, e)
-        return np.einsum("na,na->n", weighted, weighted)
-    return np.maximum(np.einsum("na,nab,nb->n", e, graph.information, e, optimize=True), 0.0)
+        return np.asarray(np.einsum("na,na->n", weighted, weighted))
+    return np.asarray(np.maximum(np.einsum("na,nab,nb->n", e, graph.information, e, optimize=True), 0.0))
 
 
 def _residual(graph: PoseGraph, objective: Objective) -> Residual:

@@ -1,0 +1,78 @@
+"""Reconstructions (cameras, points, observations) in any format that is read, told apart by what is in the file."""
+
+from __future__ import annotations
+
+import bz2
+from pathlib import Path
+from typing import Literal
+
+from boxplus.errors import InputError
+from boxplus.formats.bal import BalProblem, read_bal, write_bal
+from boxplus.formats.colmap import read_colmap, write_colmap
+from boxplus.formats.colmap_model import ColmapModel
+from boxplus.formats.gbp import GbpProblem, read_gbp, write_gbp
+
+Reconstruction = BalProblem | GbpProblem | ColmapModel
+ReconstructionFormat = Literal["auto", "bal", "gbp", "colmap"]
+
+_COLMAP_NAMES = ("cameras", "images", "points3D")
+
+
+def read_reconstruction(path: str | Path, format: ReconstructionFormat = "auto") -> Reconstruction:
+    """Read a BAL file (plain or bzip2), one of "Bundle Adjustment on a Graph Processor" or a COLMAP model (text or binary).
+
+    Args:
+        path: the file, or the folder of a COLMAP model.
+        format: auto takes a folder, and cameras, images or points3D in one, for COLMAP's; and a file whose second line is not
+            an observation, which begins with two whole numbers, for the graph processor's.
+
+    Raises:
+        InputError: no such file, or as the reader of the format.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise InputError("a bundle adjustment file or the folder of a COLMAP model", f"{source}: no such file", "check the path")
+    if format == "auto":
+        if source.is_dir() or source.stem in _COLMAP_NAMES:
+            format = "colmap"
+        else:
+            format = "gbp" if _has_intrinsics(source) else "bal"
+    if format == "colmap":
+        return read_colmap(source)
+    return read_gbp(source) if format == "gbp" else read_bal(source)
+
+
+def _has_intrinsics(source: Path) -> bool:
+    """Whether the second line of numbers is `fx fy cx cy`, and not an observation."""
+    seen = 0
+    try:
+        with bz2.open(source, "rt", errors="replace") if source.suffix == ".bz2" else source.open(errors="replace") as file:
+            for line in file:
+                words = line.split("#")[0].split()
+                seen += bool(words)
+                if seen == 2:
+                    return len(words) == 4 and not all(word.lstrip("+-").isdigit() for word in words[:2])
+    except OSError as error:
+        raise InputError("a readable file", f"{source}: {error}", "check the path and its permissions") from error
+    return False
+
+
+def reconstruction_file_name(reconstruction: Reconstruction, source: str | Path, stem: str) -> str:
+    """`stem` with the ending that `write_reconstruction` needs to write as the source was written; a COLMAP model is a folder."""
+    if isinstance(reconstruction, ColmapModel):
+        return stem
+    return f"{stem}.txt.bz2" if Path(source).suffix == ".bz2" and isinstance(reconstruction, BalProblem) else f"{stem}.txt"
+
+
+def write_reconstruction(path: str | Path, reconstruction: Reconstruction) -> None:
+    """Write in the format it was read from: BAL compressed where the name ends in .bz2, COLMAP as text or binary as it came.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    if isinstance(reconstruction, ColmapModel):
+        write_colmap(path, reconstruction)
+    elif isinstance(reconstruction, GbpProblem):
+        write_gbp(path, reconstruction)
+    else:
+        write_bal(path, reconstruction)
