@@ -6,12 +6,14 @@ The matrix of a graph is that of Gauss-Newton at a configuration that fits every
 pattern is the graph's, its values come from the edges' measurements and information.
 Timed is the numeric factorisation alone, on one thread, after each one's own ordering and analysis; the three take turns, and
 the fastest of all rounds counts, as the machine is shared. SuperLU has no separate analysis: its time is that of `splu` in
-symmetric mode. CHOLMOD is left out, with a message, where cvxopt is not installed; set OPENBLAS_NUM_THREADS=1 for it.
+symmetric mode. CHOLMOD is left out, with a message, where cvxopt is not installed. One thread is timed by processor time, two by
+the wall clock.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -67,6 +69,7 @@ def normal_matrix(file: Path) -> tuple[BlockPattern, NDArray[np.float64]]:
 
 def cholmod(matrix: csc_matrix) -> Callable[[], object] | None:
     """A numeric factorisation by CHOLMOD, analysed already; None without cvxopt."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when cvxopt loads its own
     try:
         from cvxopt import cholmod as module
         from cvxopt import spmatrix
@@ -86,9 +89,10 @@ def compete(runs: dict[str, Callable[[], object]], rounds: int) -> dict[str, flo
         for name, run in runs.items():
             if name == "SuperLU" and least[name] > 200.0 and np.isfinite(least[name]):
                 continue  # twice is enough for what takes so long
-            start = time.perf_counter()
+            clock = time.perf_counter if name == "two threads" else time.process_time
+            start = clock()
             run()
-            least[name] = min(least[name], 1e3 * (time.perf_counter() - start))
+            least[name] = min(least[name], 1e3 * (clock() - start))
     return least
 
 
@@ -131,7 +135,12 @@ def measure(options: argparse.Namespace) -> list[Metric]:
         metrics += [
             Metric(name + "vs SuperLU", least["ours"], "ms", "lower", to_superlu, "SuperLU", least["SuperLU"]),
             Metric(
-                name + "two threads", least["two threads"], "ms", opponent="one thread", opponent_value=least["ours"], gated=False
+                name + "two threads",
+                least["two threads"],
+                "ms",
+                opponent="one thread, processor time",
+                opponent_value=least["ours"],
+                gated=False,
             ),
             Metric(name + "analysis", analysis, "ms", gated=False),
             Metric(name + "solve", least["solve"], "ms", gated=False),

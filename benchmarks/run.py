@@ -2,9 +2,9 @@
 
     python benchmarks/run.py [NAME ...] [--json FILE] [--gate | --update-baseline] [--quick]
 
-Names: knn_static map_dynamic scan recordings memory map_growth; all of them when none is given. Each runs in a process of its
-own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, `--update-baseline` takes
-the figures of this run for those to come, deliberately. `--quick` is a smoke run: its figures mean nothing.
+Names: knn_static map_dynamic scan recordings memory map_growth cholesky; all of them when none is given. Each runs in a process
+of its own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, `--update-baseline`
+takes the figures of this run for those to come, deliberately. `--quick` is a smoke run: its figures mean nothing.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ BENCHMARKS = {
     "recordings": Benchmark(("--rounds", "1", "--only", "v103_velodyne")),
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
     "memory": Benchmark(("--minutes", "3")),
+    "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),
 }
 
 

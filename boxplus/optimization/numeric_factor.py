@@ -10,7 +10,7 @@ from boxplus.optimization.dense_kernels import BLOCK, factor_block, update_rows
 from boxplus.optimization.multifrontal import begin_front, end_front, factorize
 from boxplus.optimization.supernodes import ALIGNMENT, Fronts
 
-LARGE = 5e7
+LARGE = 3e8
 """Operations from which on a front is worth several threads."""
 
 ROWS = 256
