@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.colmap_model import CAMERA_MODELS, ColmapModel
 from boxplus.formats.colmap_parts import ColmapParts
 from boxplus.formats.number_lines import NumberLines, read_number_lines, rest_of_line
 from boxplus.formats.number_parser import INTEGER, OTHER
+from boxplus.formats.number_writer import rows_to_text
 from boxplus.formats.output import atomic_file
 
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
@@ -21,6 +22,7 @@ _IMAGE = "an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _OBSERVATIONS = "the observations of an image: POINTS2D[] as (X, Y, POINT3D_ID)"
 _POINT = "a point: POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)"
 _ADVICE = "correct the line"
+_POINTS_AT_ONCE = 1 << 13
 
 
 def read_colmap_text(folder: Path) -> ColmapModel:
@@ -80,7 +82,7 @@ def _read_image(chunk: NumberLines, row: int, parts: ColmapParts) -> None:
     parts.image_ids.append(int(chunk.integers[first]))
     parts.poses.append(chunk.values[first + 1 : first + 8].copy())
     parts.image_cameras.append(int(chunk.integers[first + 8]))
-    parts.image_names.append(rest_of_line(chunk.text, int(chunk.begins[first + 9])).rstrip())
+    parts.image_names.append(rest_of_line(chunk.text, int(chunk.begins[first + 9]), "surrogateescape").rstrip())
 
 
 def _read_observations(chunk: NumberLines, row: int, parts: ColmapParts) -> None:
@@ -134,46 +136,59 @@ def write_colmap_text(folder: Path, model: ColmapModel) -> None:
             raise InputError(
                 "image names without line breaks and outer spaces", repr(name), "write the binary files, or rename it"
             )
-    for name, lines in zip(FILES, (_camera_lines(model), _image_lines(model), _point_lines(model)), strict=True):
-        with atomic_file(folder / name) as file:
-            file.writelines(line.encode() for line in lines)
-
-
-def _words(values: NDArray[np.float64]) -> str:
-    return " ".join(map(repr, values.tolist()))
+    with atomic_file(folder / FILES[0]) as file:
+        file.writelines(line.encode() for line in _camera_lines(model))
+    with atomic_file(folder / FILES[1]) as file:
+        _write_images(file, model)
+    with atomic_file(folder / FILES[2]) as file:
+        _write_points(file, model)
 
 
 def _camera_lines(model: ColmapModel) -> Iterator[str]:
     yield "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     for i, params in enumerate(model.camera_params):
         width, height = model.camera_sizes[i].tolist()
-        yield f"{model.camera_ids[i]} {model.camera_models[i]} {width} {height} {_words(params)}\n"
+        yield f"{model.camera_ids[i]} {model.camera_models[i]} {width} {height} {' '.join(map(repr, params.tolist()))}\n"
 
 
-def _image_lines(model: ColmapModel) -> Iterator[str]:
-    yield (
-        "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)\n"
+def _write_images(file: BinaryIO, model: ColmapModel) -> None:
+    file.write(
+        b"# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+        b"#   POINTS2D[] as (X, Y, POINT3D_ID)\n"
     )
     starts = model.observation_starts()
-    names = np.where(model.point_of >= 0, model.point_ids[model.point_of], -1) if len(model.point_ids) else model.point_of
+    cameras = model.camera_ids[model.camera_of]
+    heads, ends = rows_to_text([model.image_ids[:, None], model.T_camera_world, cameras[:, None]], separator=" ")
     for i, name in enumerate(model.image_names):
-        yield f"{model.image_ids[i]} {_words(model.T_camera_world[i])} {model.camera_ids[model.camera_of[i]]} {name}\n"
+        file.write(heads[ends[i - 1] if i else 0 : ends[i]])
+        file.write(name.encode(errors="surrogateescape") + b"\n")
         own = slice(starts[i], starts[i + 1])
-        pixels = model.pixels[own].tolist()
-        yield " ".join(f"{x!r} {y!r} {point}" for (x, y), point in zip(pixels, names[own].tolist(), strict=True)) + "\n"
+        points = model.point_of[own].copy()
+        points[points >= 0] = model.point_ids[points[points >= 0]]
+        text, _ = rows_to_text([model.pixels[own], points[:, None]], separator=" ")
+        file.write(text[:-1])
+        file.write(b"\n")
 
 
-def _point_lines(model: ColmapModel) -> Iterator[str]:
-    yield (
-        "# 3D point list with one line of data per point:\n"
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+def _write_points(file: BinaryIO, model: ColmapModel) -> None:
+    file.write(
+        b"# 3D point list with one line of data per point:\n"
+        b"#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
     )
     starts, track = model.tracks()
     image = model.image_of[track]
-    elements = np.column_stack([model.image_ids[image], track - model.observation_starts()[image]]).reshape(-1).tolist()
-    bounds = (2 * starts).tolist()
-    rows = zip(model.point_ids.tolist(), model.points.tolist(), model.colors.tolist(), model.errors.tolist(), strict=True)
-    for j, (name, (x, y, z), (red, green, blue), error) in enumerate(rows):
-        seen = "".join(f" {number}" for number in elements[bounds[j] : bounds[j + 1]])
-        yield f"{name} {x!r} {y!r} {z!r} {red} {green} {blue} {error!r}{seen}\n"
+    elements = np.column_stack([model.image_ids[image], track - model.observation_starts()[image]])
+    for begin in range(0, len(model.point_ids), _POINTS_AT_ONCE):
+        block = slice(begin, begin + _POINTS_AT_ONCE)
+        own = starts[begin : begin + _POINTS_AT_ONCE + 1]
+        colors = model.colors[block].astype(np.int64)
+        heads, head_ends = rows_to_text(
+            [model.point_ids[block, None], model.points[block], colors, model.errors[block, None]], separator=" "
+        )
+        tracks, track_ends = rows_to_text([elements[own[0] : own[-1]]], separator=" ")
+        bounds = np.concatenate([[0], track_ends])[own - own[0]].tolist()
+        at = 0
+        for j, end in enumerate(head_ends.tolist()):
+            line = bytes(heads[at:end]) + bytes(tracks[bounds[j] : bounds[j + 1]])
+            file.write(line[:-1] + b"\n")
+            at = end

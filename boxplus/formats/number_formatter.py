@@ -22,7 +22,7 @@ _FRACTION = np.uint64((1 << 52) - 1)
 _IMPLICIT = np.uint64(1 << 52)
 _EXACT = np.uint64(1 << 53)
 _SEVENTEEN_DIGITS, _EIGHTEEN_DIGITS = np.uint64(10**16), np.uint64(10**17)
-_SPACE, _NEWLINE, _MINUS, _PLUS, _POINT, _ZERO, _E = (np.uint8(ord(c)) for c in " \n-+.0e")
+_SPACE, _MINUS, _PLUS, _POINT, _ZERO, _E = (np.uint8(ord(c)) for c in " -+.0e")
 _DIGITS = np.uint64(20)
 
 
@@ -162,59 +162,63 @@ def _write_number(
 
 @kernel
 def format_rows(
-    begin: np.uint64,
+    row: np.uint64,
+    at: np.uint64,
     prefix: NDArray[np.uint8],
-    whole: NDArray[np.int64],
-    bits: NDArray[np.uint64],
+    cells: NDArray[np.uint64],
+    is_whole: NDArray[np.bool_],
+    separator: np.uint8,
     powers: NDArray[np.uint64],
     exponents: NDArray[np.int64],
     text: NDArray[np.uint8],
+    ends: NDArray[np.int64],
     number: NDArray[np.float64],
     number_bits: NDArray[np.uint64],
 ) -> tuple[np.uint64, np.uint64]:
-    """Write the rows from `begin` to `text`, a line each: prefix, (m, a) whole numbers, (m, b) float64 by their bits.
+    """Write the rows from `row` to text[at:], each as prefix, numbers and `separator`.
+
+    Args:
+        cells: (m, c) the bits of int64 in the columns that are whole, of float64 in the others.
+        ends: (m,) receives where each row ends.
+        number, number_bits: the same memory, of one number.
 
     Returns:
-        The row it stopped at, m or the first with a number that it could not decide, and the bytes written.
+        The row it stopped at, m or the first with a number that it could not decide, and where that one is to begin.
     """
     digits = np.empty(20, np.uint8)
-    rows, integers, reals = np.uint64(len(whole)), np.uint64(whole.shape[1]), np.uint64(bits.shape[1])
-    at = np.uint64(0)
-    for row in range(begin, rows):
-        line = at
+    rows, columns = np.uint64(cells.shape[0]), np.uint64(cells.shape[1])
+    for i in range(row, rows):
+        begin = at
         for k in range(np.uint64(len(prefix))):
             text[at] = prefix[k]
             at += _ONE
-        for k in range(integers):
-            value = whole[row, k]
-            if value < 0:
+        for k in range(columns):
+            cell = cells[i, k]
+            negative = cell >> _S63 != _ZERO64
+            if negative:
                 text[at] = _MINUS
                 at += _ONE
-            # the magnitude of the lowest integer does not fit into its own type
-            first = _write_digits(np.uint64(-(value + 1)) + _ONE if value < 0 else np.uint64(value), digits)
-            for m in range(first, _DIGITS):
-                text[at] = digits[m]
-                at += _ONE
-            text[at] = _SPACE
-            at += _ONE
-        for k in range(reals):
-            pattern = bits[row, k] & _NO_SIGN
-            exponent = np.int64(pattern >> _S52) - 1023
-            if bits[row, k] >> _S63 != _ZERO64:
-                text[at] = _MINUS
-                at += _ONE
-            if pattern == _ZERO64:
-                text[at] = text[at + np.uint64(2)] = _ZERO
-                text[at + _ONE] = _POINT
-                at += np.uint64(3)
-            elif -900 < exponent < 900:
-                end = _write_number(pattern, text, at, digits, powers, exponents, number, number_bits)
-                if end == _ZERO64:
-                    return np.uint64(row), line
-                at = end
+            if is_whole[k]:
+                first = _write_digits(~cell + _ONE if negative else cell, digits)
+                for m in range(first, _DIGITS):
+                    text[at] = digits[m]
+                    at += _ONE
             else:
-                return np.uint64(row), line
+                pattern = cell & _NO_SIGN
+                exponent = np.int64(pattern >> _S52) - 1023
+                if pattern == _ZERO64:
+                    text[at] = text[at + np.uint64(2)] = _ZERO
+                    text[at + _ONE] = _POINT
+                    at += np.uint64(3)
+                elif -900 < exponent < 900:
+                    end = _write_number(pattern, text, at, digits, powers, exponents, number, number_bits)
+                    if end == _ZERO64:
+                        return np.uint64(i), begin
+                    at = end
+                else:
+                    return np.uint64(i), begin
             text[at] = _SPACE
             at += _ONE
-        text[at - _ONE] = _NEWLINE
+        text[at - _ONE] = separator
+        ends[i] = np.int64(at)
     return rows, at

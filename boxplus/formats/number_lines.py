@@ -93,12 +93,12 @@ class NumberLines:
         return self.integers[self.first[rows].astype(np.int64) + column]
 
 
-def rest_of_line(text: memoryview, begin: int) -> str:
-    """The text from an offset to the end of its line."""
+def rest_of_line(text: memoryview, begin: int, errors: str = "replace") -> str:
+    """The text from an offset to the end of its line; `errors` as for `bytes.decode`."""
     end = begin
     while end < len(text) and text[end] != 10:
         end += 1
-    return bytes(text[begin:end]).decode("utf-8", errors="replace").rstrip("\r")
+    return bytes(text[begin:end]).decode("utf-8", errors).rstrip("\r")
 
 
 def read_number_lines(path: str | Path, tags: Sequence[str] = ()) -> Iterator[NumberLines]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -10,7 +11,55 @@ from numpy.typing import NDArray
 from boxplus.formats.number_formatter import LONGEST_NUMBER, format_rows
 from boxplus.formats.number_parser import powers_of_five
 
-_BLOCK_BYTES = 1 << 20
+_BLOCK = 8192
+
+
+def rows_to_text(
+    columns: Sequence[NDArray[np.int64] | NDArray[np.float64]], prefix: str = "", separator: str = "\n"
+) -> tuple[memoryview, NDArray[np.int64]]:
+    """The text of m rows: prefix, numbers with spaces between them, separator.
+
+    Args:
+        columns: (m, any) int64 or float64 each, side by side; one column at least.
+        separator: one character.
+
+    Returns:
+        The text, and (m,) int64 where in it each row ends.
+    """
+    count = len(columns[0])
+    parts = [np.ascontiguousarray(part, np.int64 if part.dtype.kind in "iu" else np.float64) for part in columns]
+    is_whole = np.repeat([part.dtype.kind == "i" for part in parts], [part.shape[1] for part in parts])
+    cells = np.hstack([part.view(np.uint64) for part in parts])
+    word, mark = prefix.encode(), separator.encode()
+    text = np.empty(count * (len(word) + LONGEST_NUMBER * len(is_whole)), np.uint8)
+    ends = np.empty(count, np.int64)
+    powers, exponents = powers_of_five()
+    number = np.empty(1)
+    row, at = 0, 0
+    while True:
+        row, at = format_rows(
+            np.uint64(row),
+            np.uint64(at),
+            np.frombuffer(word, np.uint8),
+            cells,
+            is_whole,
+            np.uint8(mark[0]),
+            powers,
+            exponents,
+            text,
+            ends,
+            number,
+            number.view(np.uint64),
+        )
+        if row == count:
+            return text[:at].data, ends
+        # A number whose digits the kernel leaves open.
+        values = [value for part in parts for value in part[row].tolist()]
+        line = word + " ".join(map(repr, values)).encode() + mark
+        text[at : at + len(line)] = np.frombuffer(line, np.uint8)
+        at += len(line)
+        ends[row] = at
+        row += 1
 
 
 def write_rows(file: BinaryIO, prefix: str, whole: NDArray[np.int64], numbers: NDArray[np.float64]) -> None:
@@ -19,23 +68,6 @@ def write_rows(file: BinaryIO, prefix: str, whole: NDArray[np.int64], numbers: N
     Raises:
         OSError: the file cannot be written.
     """
-    word = np.frombuffer(prefix.encode(), np.uint8)
-    longest = len(word) + LONGEST_NUMBER * (whole.shape[1] + numbers.shape[1])
-    block = max(1, _BLOCK_BYTES // longest)
-    text = np.empty(block * longest, np.uint8)
-    powers, exponents = powers_of_five()
-    number = np.empty(1)
-    for begin in range(0, len(whole), block):
-        integers = np.ascontiguousarray(whole[begin : begin + block], np.int64)
-        reals = np.ascontiguousarray(numbers[begin : begin + block], np.float64)
-        done = 0
-        while done < len(integers):
-            stop, size = format_rows(
-                np.uint64(done), word, integers, reals.view(np.uint64), powers, exponents, text, number, number.view(np.uint64)
-            )
-            file.write(text[:size].data)
-            done = int(stop)
-            if done < len(integers):
-                values = [*map(str, integers[done].tolist()), *map(repr, reals[done].tolist())]
-                file.write((prefix + " ".join(values) + "\n").encode())
-                done += 1
+    for begin in range(0, len(whole), _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        file.write(rows_to_text([whole[rows], numbers[rows]], prefix)[0])

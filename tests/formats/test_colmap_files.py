@@ -97,6 +97,15 @@ def test_text_is_as_documented(tmp_path: Path) -> None:
     starts, track = model.tracks()
     assert starts.tolist() == [0, 2] and track.tolist() == [0, 2]
     assert model.observation_starts().tolist() == [0, 2, 2, 3]
+    write_colmap(tmp_path / "again", model)
+    lines = (tmp_path / "again" / "images.txt").read_text().splitlines()[3:]
+    assert lines[:4] == [
+        "3 0.8 0.0 0.0 0.6 1.0 2.0 3.0 7 a b.png",
+        "1.5 2.5 63 3.5 4.5 -1",
+        "5 1.0 0.0 0.0 0.0 4.0 5.0 6.0 1 0002.png",
+        "",
+    ]
+    assert (tmp_path / "again" / "points3D.txt").read_text().splitlines()[2:] == ["63 1.0 2.0 3.0 255 128 0 0.5 3 0 6 0"]
 
 
 def test_binary_is_as_documented(tmp_path: Path) -> None:
@@ -241,6 +250,13 @@ def test_tracks_must_agree_with_observations(tmp_path: Path) -> None:
 def test_bad_arrays_are_refused(change: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(random_model(0), **change)
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_names_keep_their_bytes_in_any_encoding(tmp_path: Path, form: str) -> None:
+    names = ("Bäume/ö 1.jpg", b"\xff\xe4.jpg".decode(errors="surrogateescape"))
+    write_colmap(tmp_path, replace(random_model(0, images=2), image_names=names), form)
+    assert read_colmap(tmp_path).image_names == names
 
 
 def test_names_that_a_file_cannot_hold(tmp_path: Path) -> None:
