@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from boxplus import residuals
+    from boxplus import formats, residuals
+    from boxplus.cameras.distortion import Radial, RadialTangential
     from boxplus.cameras.pinhole import Pinhole
     from boxplus.errors import (
         AmbiguityError,
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from boxplus.evaluation.evaluation import Evaluation, evaluate
     from boxplus.filtering.nav_state import NavState
     from boxplus.formats.pose_graph import PoseGraph
+    from boxplus.formats.pose_graph_file import read_pose_graph
+    from boxplus.formats.reconstruction import read_reconstruction
     from boxplus.formats.trajectory import Trajectory, read_trajectory
     from boxplus.manifolds.euclidean import Euclidean
     from boxplus.manifolds.lines import Line3D
@@ -42,9 +45,12 @@ if TYPE_CHECKING:
     from boxplus.recordings.doctor import Diagnosis, diagnose
     from boxplus.recordings.options import RecordingOptions
     from boxplus.recordings.recording import Recording, open_recording
+    from boxplus.sensors.image import Image
     from boxplus.sensors.imu import ImuSamples
     from boxplus.sensors.scan import Scan
     from boxplus.simulation.simulation import Simulation, simulate
+    from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
+    from boxplus.systems.direct_alignment import Alignment, align_rgbd
     from boxplus.systems.estimate import Estimate
     from boxplus.systems.lidar_inertial_odometry import LidarInertialOdometry
     from boxplus.systems.lio_config import LioConfig
@@ -53,13 +59,16 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Alignment": "systems.direct_alignment",
     "AmbiguityError": "errors",
     "BoxplusError": "errors",
+    "BundleAdjustmentConfig": "systems.bundle_adjustment",
     "Diagnosis": "recordings.doctor",
     "Estimate": "systems.estimate",
     "Euclidean": "manifolds.euclidean",
     "Evaluation": "evaluation.evaluation",
     "IkdTree": "maps.ikd_tree",
+    "Image": "sensors.image",
     "ImuSamples": "sensors.imu",
     "InputError": "errors",
     "LidarInertialOdometry": "systems.lidar_inertial_odometry",
@@ -74,6 +83,8 @@ _HOME = {
     "PoseGraphConfig": "systems.pose_graph",
     "Problem": "optimization.problem",
     "Product": "manifolds.product",
+    "Radial": "cameras.distortion",
+    "RadialTangential": "cameras.distortion",
     "Recording": "recordings.recording",
     "RecordingError": "errors",
     "RecordingOptions": "recordings.options",
@@ -89,28 +100,35 @@ _HOME = {
     "SparseCholesky": "optimization.cholesky",
     "Trajectory": "formats.trajectory",
     "UnitQuaternion": "manifolds.quaternion",
+    "adjust_bundle": "systems.bundle_adjustment",
+    "align_rgbd": "systems.direct_alignment",
     "check_jacobian": "optimization.jacobian_check",
     "diagnose": "recordings.doctor",
     "evaluate": "evaluation.evaluation",
     "open_recording": "recordings.recording",
     "optimize_pose_graph": "systems.pose_graph",
+    "read_pose_graph": "formats.pose_graph_file",
+    "read_reconstruction": "formats.reconstruction",
     "read_trajectory": "formats.trajectory",
     "simulate": "simulation.simulation",
 }
 
-_MODULES = {"losses": "optimization.losses", "residuals": "residuals"}
+_MODULES = {"formats": "formats", "losses": "optimization.losses", "residuals": "residuals"}
 
 __all__ = [
     "SE2",
     "SE3",
     "SO3",
+    "Alignment",
     "AmbiguityError",
     "BoxplusError",
+    "BundleAdjustmentConfig",
     "Diagnosis",
     "Estimate",
     "Euclidean",
     "Evaluation",
     "IkdTree",
+    "Image",
     "ImuSamples",
     "InputError",
     "LidarInertialOdometry",
@@ -125,6 +143,8 @@ __all__ = [
     "PoseGraphConfig",
     "Problem",
     "Product",
+    "Radial",
+    "RadialTangential",
     "Recording",
     "RecordingError",
     "RecordingOptions",
@@ -138,12 +158,17 @@ __all__ = [
     "Trajectory",
     "UnitQuaternion",
     "__version__",
+    "adjust_bundle",
+    "align_rgbd",
     "check_jacobian",
     "diagnose",
     "evaluate",
+    "formats",
     "losses",
     "open_recording",
     "optimize_pose_graph",
+    "read_pose_graph",
+    "read_reconstruction",
     "read_trajectory",
     "residuals",
     "simulate",

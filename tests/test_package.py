@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.metadata
 import re
 import subprocess
@@ -20,6 +21,9 @@ HEAVY = ["numba", "scipy", "matplotlib", "plotly", "rosbags", "pydantic", "typer
 # From the lowest room to the highest: each imports only from those before it.
 ROOMS = [
     "manifolds",
+    "cameras",
+    "residuals",
+    "optimization",
     "formats",
     "filtering",
     "maps",
@@ -65,7 +69,7 @@ def test_public_names_are_what_they_are_in_their_homes() -> None:
     for name in boxplus.__all__:
         assert getattr(boxplus, name) is not None
     assert set(boxplus.__all__) <= set(dir(boxplus))
-    assert boxplus.__all__ == sorted(boxplus.__all__)
+    assert len(boxplus.__all__) == len(set(boxplus.__all__))
     from boxplus.maps.ikd_tree import IkdTree
 
     assert boxplus.IkdTree is IkdTree
@@ -78,11 +82,34 @@ def test_type_checkers_see_the_same_names_as_programs() -> None:
     typed = {
         alias.name: node.module
         for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.split(".")[0] == "boxplus"
+        for alias in node.names
+    }
+    modules = {name: f"boxplus.{home}".rpartition(".")[0] for name, home in boxplus._MODULES.items()}
+    assert typed == {name: f"boxplus.{home}" for name, home in boxplus._HOME.items()} | modules
+    assert set(boxplus.__all__) == {*typed, "__version__"}
+
+
+@pytest.mark.parametrize("package", ["formats", "residuals"])
+def test_names_of_a_package_are_what_they_are_in_their_homes(package: str) -> None:
+    module = importlib.import_module(f"boxplus.{package}")
+    tree = ast.parse((ROOT / "boxplus" / package / "__init__.py").read_text(encoding="utf-8"))
+    typed = {
+        alias.name: node.module
+        for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("boxplus.")
         for alias in node.names
     }
-    assert typed == {name: f"boxplus.{home}" for name, home in boxplus._HOME.items()}
-    assert set(boxplus.__all__) == {*typed, "__version__"}
+    assert typed == {name: f"boxplus.{package}.{home}" for name, home in module._HOME.items()}
+    assert set(module.__all__) == set(typed) and len(module.__all__) == len(typed)
+    for name in module.__all__:
+        assert getattr(module, name) is getattr(importlib.import_module(typed[name]), name)
+    with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
+        module.Nothing  # noqa: B018
+
+
+def test_packages_of_names_pull_in_nothing_heavy() -> None:
+    assert not modules_after("import boxplus.formats, boxplus.residuals") & set(HEAVY)
 
 
 def test_version_is_that_of_the_changelog() -> None:
