@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from boxplus.errors import InputError
 from boxplus.formats.number_lines import NumberLines
 from boxplus.formats.number_parser import UNKNOWN_TAG
 from boxplus.formats.pose_graph import PoseGraph
+
+_Scalar = TypeVar("_Scalar", np.int64, np.float64)
 
 
 class GraphBuilder:
@@ -30,7 +32,10 @@ class GraphBuilder:
         self._unknown: dict[str, tuple[int, int]] = {}  # word: how often, first line
         self._dimensions: dict[int, int] = {}  # dimension: first line
         self._poses: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]] = []
-        self._edges: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]] = []
+        self._edge_ids: list[NDArray[np.int64]] = []
+        self._measurements: list[NDArray[np.float64]] = []
+        self._information: list[NDArray[np.float64]] = []
+        self._edge_lines: list[NDArray[np.int64]] = []
         self._fixed: list[tuple[int, int]] = []  # id, line
 
     def add_poses(self, dimension: int, ids: NDArray[np.int64], poses: NDArray[np.float64], lines: NDArray[np.int64]) -> None:
@@ -48,7 +53,10 @@ class GraphBuilder:
     ) -> None:
         """(k, 2) ids, measurements in the layout of `PoseGraph`, information in the order of the file."""
         self._dimensions.setdefault(dimension, int(lines[0]))
-        self._edges.append((ids, measurements, information, lines))
+        self._edge_ids.append(ids)
+        self._measurements.append(measurements)
+        self._information.append(information)
+        self._edge_lines.append(lines)
 
     def add_fixed(self, name: int, line: int) -> None:
         """The id of a pose that is held fixed."""
@@ -83,16 +91,13 @@ class GraphBuilder:
                 f"both ({self._source}, 2D first in line {self._dimensions[2]}, 3D first in line {self._dimensions[3]})",
                 "split the file",
             )
-        if not self._edges:
+        if not self._edge_ids:
             raise InputError("a pose graph with at least one edge", f"none ({self._source})", "check that the file is complete")
         return 3 if 3 in self._dimensions else 2
 
     def edges(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Ids, measurements, information and lines of all edges, in the order of the file; to be called once."""
-        parts = tuple(zip(*self._edges, strict=True))
-        self._edges = []
-        ids, measurements, information, lines = (np.concatenate(part) for part in parts)
-        return ids, measurements, information, lines
+        return _take(self._edge_ids), _take(self._measurements), _take(self._information), _take(self._edge_lines)
 
     def build(
         self,
@@ -144,6 +149,13 @@ class GraphBuilder:
             pose_lines=pose_lines,
             edge_lines=lines,
         )
+
+
+def _take(parts: list[NDArray[_Scalar]]) -> NDArray[_Scalar]:
+    """The parts in one array; they are given up, as a large file has no room for both."""
+    joined = np.concatenate(parts)
+    parts.clear()
+    return joined
 
 
 def _lookup(
