@@ -32,6 +32,7 @@ class LeastSquares:
         self.cost = GroupCost(0.0, 0.0, 0, 0)
         self.timing_s = {"residuals and Jacobians": 0.0, "normal equations": 0.0, "linear solve": 0.0}
         self._threads = threads
+        self._linearized: Values = ()
 
     def start(self, values: Values) -> None:
         """Linearise at `values` and accept them.
@@ -51,6 +52,7 @@ class LeastSquares:
     def linearize(self, values: Values) -> GroupCost:
         """Linearise every group at `values`, without accepting them: the linear system keeps the accepted point."""
         begin = time.perf_counter()
+        self._linearized = values
         total = GroupCost(0.0, 0.0, 0, 0)
         for group in self.groups:
             total = total + group.linearize(values, self._threads)
@@ -72,6 +74,8 @@ class LeastSquares:
         Raises:
             NotPositiveDefinite: see `LinearSystem.factorize`.
         """
+        if self.system.reads_jacobians and self._linearized is not self.values:
+            self.linearize(self.values)  # after a rejected step
         begin = time.perf_counter()
         try:
             self.system.factorize(damping)

@@ -21,8 +21,10 @@ class LinearSystem(ABC):
         description: which elimination and factorisation, and why, in a sentence.
         gradient: g = Jᵀr (dof,).
         diagonal: of H (dof,).
+        reads_jacobians: `factorize` reads the Jacobians of the groups, which must be those that were assembled.
     """
 
+    reads_jacobians = False
     description: str
     gradient: NDArray[np.float64]
     diagonal: NDArray[np.float64]

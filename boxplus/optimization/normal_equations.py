@@ -6,8 +6,7 @@ the bits do not depend on their number.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ from boxplus._jit import kernel, run_chunks
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
+from boxplus.optimization.product_tiles import add_sums, tile_of
 
 _CHUNK = 512  # blocks of H that a thread gathers in one go
 
@@ -48,72 +48,35 @@ class Gather:
         return cls(group, a, b, target, np.append(begin, len(place)), residual[order].astype(np.uint32))
 
 
-@functools.cache
-def product_kernel(dim: int, width_a: int, width_b: int) -> Callable[..., None]:
-    """A kernel values[target[k]:] += Σ Jₐᵀ J_b over the residuals of each place k, for Jacobians of these sizes."""
-
-    @kernel(fastmath=True)
-    def accumulate_products(
-        first: int,
-        last: int,
-        target: NDArray[np.int64],
-        begin: NDArray[np.int64],
-        residual: NDArray[np.uint32],
-        Ja: NDArray[np.float64],
-        Jb: NDArray[np.float64],
-        values: NDArray[np.float64],
-    ) -> None:
-        for k in range(first, last):
-            at = np.uint64(target[k])
-            for e in range(begin[k], begin[k + 1]):
-                n = np.uint64(residual[e])
-                A, B = Ja[n], Jb[n]
-                for p in range(width_a):
-                    row = values[at + np.uint64(p * width_b) : at + np.uint64((p + 1) * width_b)]
-                    for i in range(dim):
-                        factor = A[i, p]
-                        for q in range(width_b):
-                            row[q] += factor * B[i, q]
-
-    return accumulate_products  # type: ignore[no-any-return]
-
-
-@functools.cache
-def gradient_kernel(dim: int, width: int) -> Callable[..., None]:
-    """A kernel gradient[target[k]:] += Σ Jᵀ r over the residuals of each place k, for Jacobians of this size."""
-
-    @kernel(fastmath=True)
-    def accumulate_gradient(
-        first: int,
-        last: int,
-        target: NDArray[np.int64],
-        begin: NDArray[np.int64],
-        residual: NDArray[np.uint32],
-        J: NDArray[np.float64],
-        r: NDArray[np.float64],
-        gradient: NDArray[np.float64],
-    ) -> None:
-        for k in range(first, last):
-            at = np.uint64(target[k])
-            part = gradient[at : at + np.uint64(width)]
-            for e in range(begin[k], begin[k + 1]):
-                n = np.uint64(residual[e])
-                for i in range(dim):
-                    factor = r[n, i]
-                    for q in range(width):
-                        part[q] += J[n, i, q] * factor
-
-    return accumulate_gradient  # type: ignore[no-any-return]
+@kernel
+def _accumulate_gradient(
+    first: int,
+    last: int,
+    target: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    residual: NDArray[np.uint32],
+    J: NDArray[np.float64],
+    r: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    """gradient[target[k]:] += Σ Jᵀ r over the residuals of each place k in [first, last)."""
+    for k in range(first, last):
+        at = np.uint64(target[k])
+        for e in range(begin[k], begin[k + 1]):
+            n = np.uint64(residual[e])
+            for i in range(np.uint64(J.shape[1])):
+                factor = r[n, i]
+                for q in range(np.uint64(J.shape[2])):
+                    gradient[at + q] += J[n, i, q] * factor
 
 
 def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> None:
     """values[place:] += Σ Jₐᵀ J_b, row-major, for every place of `gather`."""
-    group = gather.group
-    Ja, Jb = group.jacobians[gather.a], group.jacobians[gather.b]
-    run = product_kernel(group.residual.dim, Ja.shape[2], Jb.shape[2])
+    Ja, Jb = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
+    tile = tile_of(Ja.shape[1], Ja.shape[2], Jb.shape[2])
 
     def work(_: int, first: int, last: int) -> None:
-        run(first, last, gather.target, gather.begin, gather.residual, Ja, Jb, values)
+        add_sums(tile, 1.0, first, last, gather.target, gather.begin, gather.residual, gather.residual, Ja, Jb, values)
 
     run_chunks(work, len(gather.target), _CHUNK, threads)
 
@@ -122,10 +85,9 @@ def add_gradient(gather: Gather, gradient: NDArray[np.float64], threads: int) ->
     """gradient[place:] += Σ Jₐᵀ r for every place of `gather`."""
     group = gather.group
     J = group.jacobians[gather.a]
-    run = gradient_kernel(group.residual.dim, J.shape[2])
 
     def work(_: int, first: int, last: int) -> None:
-        run(first, last, gather.target, gather.begin, gather.residual, J, group.r, gradient)
+        _accumulate_gradient(first, last, gather.target, gather.begin, gather.residual, J, group.r, gradient)
 
     run_chunks(work, len(gather.target), _CHUNK, threads)
 

@@ -6,7 +6,8 @@ block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F �
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +18,26 @@ from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import LinearSystem
 from boxplus.optimization.normal_equations import Gather, NormalEquations, add_gradient, add_products
+from boxplus.optimization.product_tiles import add_sums, tile_of
 from boxplus.optimization.schur_kernels import (
-    cross_kernel,
     factorize_eliminated,
-    products_kernel,
-    reduce_kernel,
+    reduce_entries,
     solve_eliminated,
+    substitute_entries,
     subtract_from_eliminated,
-    subtract_from_rest,
+    subtract_from_kept,
 )
-from boxplus.optimization.schur_structure import Entries, build_entries, build_products, eliminated_numbers
+from boxplus.optimization.schur_structure import Entries, Products, build_entries, build_products, eliminated_numbers
 from boxplus.optimization.variables import Variables
 
 # Items that a thread takes in one go.
-_VARIABLES, _ENTRIES, _BLOCKS = 2048, 1024, 16
+_VARIABLES, _ENTRIES, _BLOCKS, _KEPT = 2048, 1024, 16, 4
 
 
 class SchurSystem(LinearSystem):
     """H with one block of variables eliminated, the rest factorised by the supernodal Cholesky."""
+
+    reads_jacobians = True
 
     def __init__(self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int) -> None:
         self._layout, self._threads = layout, threads
@@ -68,23 +71,10 @@ class SchurSystem(LinearSystem):
             add_products(gather, self._C.reshape(-1), self._threads)
         for gather in self._slopes:
             add_gradient(gather, self._b.reshape(-1), self._threads)
-        for entries in self._entries:
-            entries.W[:] = 0.0
-            for gather in entries.gathers:
-                self._add_cross(gather, entries)
         self.gradient[self._own] = self._b.reshape(-1)
         self.gradient[self._others] = self._equations.gradient
         self.diagonal[self._own] = np.einsum("nii->ni", self._C).reshape(-1)
         self.diagonal[self._others] = self._equations.diagonal
-
-    def _add_cross(self, gather: Gather, entries: Entries) -> None:
-        Je, Jf = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
-        run = cross_kernel(gather.group.residual.dim, Je.shape[2], entries.dof)
-
-        def work(_: int, begin: int, end: int) -> None:
-            run(begin, end, gather.target, gather.begin, gather.residual, Je, Jf, entries.W)
-
-        run_chunks(work, len(gather.target), _ENTRIES, self._threads)
 
     def factorize(self, damping: NDArray[np.float64] | None) -> None:
         """See `LinearSystem.factorize`."""
@@ -97,7 +87,7 @@ class SchurSystem(LinearSystem):
             raise NotPositiveDefinite(number, error.component, error.pivot) from error
 
     def _eliminate(self, damping: NDArray[np.float64]) -> None:
-        """C + D = L Lᵀ and Z = W L⁻ᵀ."""
+        """C + D = L Lᵀ and Z = W L⁻ᵀ, W straight from the Jacobians: it is never stored."""
         failed = np.full(max(1, -(-len(self._C) // _VARIABLES)), -1, dtype=np.int64)
 
         def invert(chunk: int, begin: int, end: int) -> None:
@@ -108,39 +98,67 @@ class SchurSystem(LinearSystem):
             row = int(failed[failed >= 0][0])
             raise NotPositiveDefinite(self._first + row, 0, float(np.linalg.eigvalsh(self._C[row])[0]))
         for entries in self._entries:
-            run = reduce_kernel(entries.Z.shape[1], entries.Z.shape[2])
+            if len(entries.gathers) == 1:
+                self._reduce_entries(entries, entries.gathers[0])
+            else:
+                self._add_and_substitute(entries)
 
-            def reduce(_: int, begin: int, end: int, run=run, entries=entries) -> None:  # type: ignore[no-untyped-def]
-                run(begin, end, entries.eliminated, self._L, entries.W, entries.Z)
+    def _reduce_entries(self, entries: Entries, gather: Gather) -> None:
+        """Z of entries that all come from one group."""
+        Je, Jf = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
+        tile = tile_of(Je.shape[1], Je.shape[2], Jf.shape[2])
 
-            run_chunks(reduce, len(entries.eliminated), _ENTRIES, self._threads)
+        run_chunks(
+            lambda _, first, last: reduce_entries(
+                tile, first, last, entries.order, gather.begin, gather.residual, Je, Jf, entries.eliminated, self._L, entries.Z
+            ),
+            len(entries.eliminated), _ENTRIES, self._threads,
+        )  # fmt: skip
+
+    def _add_and_substitute(self, entries: Entries) -> None:
+        """Z of entries to which several groups add."""
+        size = entries.Z.shape[1] * entries.Z.shape[2]
+        entries.Z[:] = 0.0
+        for gather in entries.gathers:
+            add_products(replace(gather, target=gather.target * size), entries.Z.reshape(-1), self._threads)
+        self._run(len(entries.eliminated), _ENTRIES, substitute_entries, entries.eliminated, self._L, entries.Z)
 
     def _reduce(self) -> None:
         """S = F − Z Zᵀ."""
         self._values[:] = 0.0
         self._values[self._places] = self._equations.values
         for products in self._products:
-            run = products_kernel(products.a.Z.shape[1], products.a.dof, products.b.dof)
+            self._subtract(products)
 
-            def subtract(_: int, begin: int, end: int, run=run, k=products) -> None:  # type: ignore[no-untyped-def]
-                run(begin, end, k.target, k.begin, k.entry_a, k.entry_b, k.a.Z, k.b.Z, self._values)
+    def _subtract(self, k: Products) -> None:
+        tile = tile_of(k.a.Z.shape[1], k.a.dof, k.b.dof)
 
-            run_chunks(subtract, len(products.target), _BLOCKS, self._threads)
+        def work(_: int, first: int, last: int) -> None:
+            add_sums(tile, -1.0, first, last, k.target, k.begin, k.entry_a, k.entry_b, k.a.Z, k.b.Z, self._values)
+
+        run_chunks(work, len(k.target), _BLOCKS, self._threads)
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `LinearSystem.solve`."""
         y, reduced = self._y, right[self._others]
         y[:] = right[self._own].reshape(y.shape)
-        solve_eliminated(self._L, False, y)
+        self._substitute(y, transposed=False)
         for k in self._entries:
-            subtract_from_rest(k.start, k.begin, k.eliminated, k.Z, k.dof, y, reduced)
-        rest = self._cholesky.solve(reduced)
+            self._run(len(k.start), _KEPT, subtract_from_kept, k.start, k.begin, k.eliminated, k.Z, y, reduced)
+        kept = self._cholesky.solve(reduced)
         for k in self._entries:
-            subtract_from_eliminated(k.of_eliminated, k.order, k.start_of_entry, k.Z, k.dof, rest, y)
-        solve_eliminated(self._L, True, y)
+            self._run(len(y), _VARIABLES, subtract_from_eliminated, k.of_eliminated, k.order, k.start_of_entry, k.Z, kept, y)
+        self._substitute(y, transposed=True)
         x = np.empty_like(right)
-        x[self._own], x[self._others] = y.reshape(-1), rest
+        x[self._own], x[self._others] = y.reshape(-1), kept
         return x
+
+    def _substitute(self, y: NDArray[np.float64], *, transposed: bool) -> None:
+        self._run(len(y), _VARIABLES, solve_eliminated, self._L, transposed, y)
+
+    def _run(self, items: int, chunk: int, run: Callable[..., None], *arguments: object) -> None:
+        """Call a kernel over chunks of `items`."""
+        run_chunks(lambda _, first, last: run(first, last, *arguments), items, chunk, self._threads)
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """See `LinearSystem.inverse_blocks`.
@@ -175,7 +193,7 @@ class SchurSystem(LinearSystem):
         reached = []
         for k in self._entries:
             for n in k.order[k.of_eliminated[own] : k.of_eliminated[own + 1]]:
-                reached.append((int(k.kept[n]), -root @ k.Z[n, :, : k.dof]))
+                reached.append((int(k.kept[n]), -root @ k.Z[n]))
         return reached
 
 

@@ -13,7 +13,6 @@ from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.optimization.normal_equations import Gather
 from boxplus.optimization.schur_kernels import count_pairs, list_pairs
-from boxplus.optimization.schur_padding import padded
 from boxplus.optimization.variables import Variables
 
 
@@ -26,7 +25,7 @@ class Entries:
         start: (n_f,) where each of the kept variables begins in their tangent vector.
         begin: (n_f + 1,) where the entries of each begin.
         kept, eliminated: (m,) the two variables of each entry; the kept one by its number in the layout without E.
-        W, Z: (m, e, padded dof), Wᵀ and Zᵀ = L⁻¹ Wᵀ; zero beyond the dof.
+        Z: (m, e, dof), Zᵀ = L⁻¹ Wᵀ.
         of_eliminated, order: (n_e + 1,), (m,): E variable p has the entries order[of_eliminated[p]:of_eliminated[p + 1]].
         start_of_entry: (m,) where the kept variable of each entry begins.
         gathers: the residuals that add to W.
@@ -37,7 +36,6 @@ class Entries:
     begin: NDArray[np.int64]
     kept: NDArray[np.int64]
     eliminated: NDArray[np.uint32]
-    W: NDArray[np.float64]
     Z: NDArray[np.float64]
     of_eliminated: NDArray[np.int64]
     order: NDArray[np.uint32]
@@ -110,15 +108,13 @@ def _entries_of(
     for group, slot, other, selected, *_ in parts:
         end += len(selected)
         gathers.append(Gather.sorted_by(group, slot, other, entry[end - len(selected) : end], selected))
-    shape = (len(unique), e, padded(dof))
     return Entries(
         dof=dof,
         start=rest.start[variables],
         begin=np.append(begin, len(unique)),
         kept=kept,
         eliminated=of.astype(np.uint32),
-        W=np.zeros(shape),
-        Z=np.zeros(shape),
+        Z=np.zeros((len(unique), e, dof)),
         of_eliminated=np.searchsorted(of[order], np.arange(count + 1)),
         order=order.astype(np.uint32),
         start_of_entry=rest.start[kept],
