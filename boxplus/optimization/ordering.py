@@ -53,7 +53,7 @@ def order(col_start: ArrayLike, row: ArrayLike, sizes: ArrayLike, method: Method
         col_start: (n + 1,) integers, block column j has the block rows `row[col_start[j]:col_start[j + 1]]`.
         row: (m,) integers, block rows of the lower triangle, in any order; the diagonal may be there or not.
         sizes: (n,) positive integers, scalar rows of each block.
-        method: one of the two orders, the order as given (`natural`), or the better of the two (`auto`).
+        method: one of the two orders, the better of the two (`auto`), or the order as given up to a postorder (`natural`).
 
     Raises:
         InputError: arrays that do not describe a lower triangle, sizes that are not positive, an unknown method.
