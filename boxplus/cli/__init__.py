@@ -15,6 +15,8 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
+    "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),
+    "pgo": ("boxplus.cli.pgo:pgo", "Optimise the poses of a g2o or TORO pose graph."),
     "inspect": ("boxplus.cli.inspect:inspect", "Examine a recording: topics, rates, gaps, times, units, extrinsic."),
     "eval": ("boxplus.cli.eval:evaluate_command", "Compare a trajectory with the ground truth: ATE, RPE."),
     "map": ("boxplus.cli.map:map_app", "Look into a map folder, or merge its tiles into one file."),
@@ -70,7 +72,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # brackets in help texts are units and extras, not markup
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="boxplus: LiDAR-inertial odometry and its tools.",
+    help="boxplus: LiDAR-inertial odometry, bundle adjustment, pose graphs, and their tools.",
 )
 
 

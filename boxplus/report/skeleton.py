@@ -85,7 +85,7 @@ def warnings_section(lines: Iterable[str]) -> str:
 
 def figure_section(title: str, text: str, figure: go.Figure, below: str = "") -> str:
     """A section with an interactive figure, and HTML below it."""
-    is_3d = next(iter(figure.select_scenes()), None) is not None
+    is_3d = any(trace.type.endswith("3d") for trace in figure.data)
     drawn = figure.to_html(full_html=False, include_plotlyjs=False, config=_CONFIG_3D if is_3d else _CONFIG, default_width="100%")
     return f"<section><h2>{escape(title)}</h2><p>{escape(text)}</p>{drawn}{below}</section>"
 

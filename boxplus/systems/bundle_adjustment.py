@@ -66,6 +66,7 @@ class BundleAdjustmentResult:
         errors_start, errors: (k,) distance of every observation from its projection [px], NaN where it cannot be projected.
             k leaves out those of COLMAP's observations that belong to no point.
         camera_of, point_of: (k,) the camera (of COLMAP the image) and the point of each.
+        notes: what a user should know of the structure, one sentence each.
         solution: with history, covariance, and why it stopped.
         cameras, points: the variables of `solution`.
         time_s: seconds, set-up included.
@@ -76,6 +77,7 @@ class BundleAdjustmentResult:
     errors: NDArray[np.float64]
     camera_of: NDArray[np.int64]
     point_of: NDArray[np.int64]
+    notes: tuple[str, ...]
     solution: Solution
     cameras: Variables
     points: Variables
@@ -119,6 +121,7 @@ def adjust_bundle(
         errors=errors,
         camera_of=camera_of,
         point_of=point_of,
+        notes=_notes(len(points), camera_of, point_of, solution),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -218,6 +221,26 @@ def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.f
         group.residual.evaluate_into(0, group.residual.count, x, tuple(c.rows for c in group.connections), r, valid)
         distances.append(np.where(valid, np.linalg.norm(r, axis=1), np.nan))
     return np.concatenate(distances)
+
+
+def _notes(point_count: int, camera_of: NDArray[np.int64], point_of: NDArray[np.int64], solution: Solution) -> tuple[str, ...]:
+    """Sentences on the structure; that images alone do not tell where the whole scene lies is no news."""
+    gauge = [note for note in solution.notes if note.startswith("nothing ties ")]
+    notes = [note for note in solution.notes if note not in gauge]
+    if len(gauge) > 1:
+        notes.append(
+            f"the reconstruction falls into {len(gauge)} pieces that share no point: how they lie to each other, and their "
+            "relative scale, are not determined"
+        )
+    times = np.bincount(point_of, minlength=point_count)
+    once = int(np.count_nonzero(times == 1))
+    if once:
+        notes.append(f"{once} points are seen only once: their depth is not determined and stays near the start")
+    few = np.bincount(camera_of)
+    few_cameras = int(np.count_nonzero((few > 0) & (few < 4)))
+    if few_cameras:
+        notes.append(f"{few_cameras} cameras see fewer than 4 points: their pose is not determined and stays near the start")
+    return tuple(notes)
 
 
 def mean_error_of_points(count: int, errors: NDArray[np.float64], point_of: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -28,12 +28,13 @@ from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_w
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
 from boxplus.residuals.residual import Residual
-from boxplus.systems.pose_graph_start import chordal_start, held_poses, spanning_tree_start
+from boxplus.systems.pose_graph_start import chordal_start, components, held_poses, spanning_tree_start
 
 Start = Literal["file", "spanning_tree", "chordal"]
 Objective = Literal["logarithm", "chordal"]
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
 _DAMPING = 1e-9
+_LISTED = 5  # poses named before the rest is left out
 
 
 class PoseGraphConfig(BaseModel):
@@ -58,23 +59,28 @@ class PoseGraphResult:
 
     Attributes:
         graph: the input with the optimised poses.
-        start: which start was taken.
+        start: which start was taken, and `start_reason` why, in a sentence.
+        poses_start: the poses there.
         start_costs: the cost at every start that was compared, robust loss included.
         chi2_start, chi2: the objective over the edges without any robust loss, twice the cost of a problem without one.
         errors_start, errors: (m,) √ of what every edge adds to chi2: its error in standard deviations.
         held: indices of the poses that were held: those the file fixes, and the first of every component without any.
+        notes: what a user should know of the structure, one sentence each.
         solution: with history, covariance, and why it stopped.
         timing_s: seconds of the initialisation and of the optimisation.
     """
 
     graph: PoseGraph
     start: Start
+    start_reason: str
+    poses_start: NDArray[np.float64]
     start_costs: dict[Start, float]
     chi2_start: float
     chi2: float
     errors_start: NDArray[np.float64]
     errors: NDArray[np.float64]
     held: NDArray[np.int64]
+    notes: tuple[str, ...]
     solution: Solution
     timing_s: dict[str, float]
 
@@ -104,12 +110,15 @@ def optimize_pose_graph(
     return PoseGraphResult(
         graph=replace(graph, poses=solution[poses]),
         start=chosen,
+        start_reason=_reason(graph, config.start, chosen, costs),
+        poses_start=candidates[chosen],
         start_costs=costs,
         chi2_start=float(squared_start.sum()),
         chi2=float(squared.sum()),
         errors_start=np.sqrt(squared_start),
         errors=np.sqrt(squared),
         held=held,
+        notes=_notes(graph, held, solution),
         solution=solution,
         timing_s={"start": prepared - begin, "optimisation": solved - prepared},
     )
@@ -173,3 +182,33 @@ def _starts(graph: PoseGraph, wanted: Literal["auto", "file", "spanning_tree", "
     if wanted == "spanning_tree":
         starts["spanning_tree"] = spanning_tree_start(graph)
     return starts
+
+
+def _reason(graph: PoseGraph, wanted: str, chosen: Start, costs: dict[Start, float]) -> str:
+    """Why a start was taken."""
+    name = chosen.replace("_", " ")
+    if wanted != "auto":
+        return f"{name}, as asked for; cost {costs[chosen]:.6g}"
+    if len(costs) == 1:
+        return f"{name}, as {graph.source} has no poses; cost {costs[chosen]:.6g}"
+    others = ", ".join(f"{cost:.6g} ({other})" for other, cost in costs.items() if other != chosen)
+    return f"{name}, with cost {costs[chosen]:.6g} cheaper than {others}"
+
+
+def _notes(graph: PoseGraph, held: NDArray[np.int64], solution: Solution) -> tuple[str, ...]:
+    """Sentences on pieces without edges between them, on poses without any edge, and the solver's own."""
+    label = components(graph)
+    sizes = np.bincount(label)
+    notes = []
+    if len(sizes) > 1:
+        free = np.setdiff1d(held, graph.fixed)
+        named = ", ".join(str(graph.ids[pose]) for pose in free[:_LISTED]) + (" …" if len(free) > _LISTED else "")
+        notes.append(
+            f"the graph falls into {len(sizes)} pieces without edges between them"
+            + (f"; poses {named}, the first of those that the file does not fix anywhere, are held" if len(free) else "")
+        )
+    alone = np.flatnonzero(sizes[label] == 1)
+    if len(alone):
+        named = ", ".join(str(graph.ids[pose]) for pose in alone[:_LISTED]) + (" …" if len(alone) > _LISTED else "")
+        notes.append(f"{len(alone)} poses have no edge and stay where they are: {named}")
+    return (*notes, *solution.notes)

@@ -24,13 +24,13 @@ _POLAR_ITERATIONS = 30
 
 def held_poses(graph: PoseGraph) -> NDArray[np.int64]:
     """(k,) the poses that hold the graph in the world: those the file fixes, and the first of every component without any."""
-    label = _components(graph)
+    label = components(graph)
     anchored = np.unique(label[graph.fixed])
-    components, first = np.unique(label, return_index=True)
-    return np.union1d(graph.fixed, first[~np.isin(components, anchored)]).astype(np.int64)
+    pieces, first = np.unique(label, return_index=True)
+    return np.union1d(graph.fixed, first[~np.isin(pieces, anchored)]).astype(np.int64)
 
 
-def _components(graph: PoseGraph) -> NDArray[np.int64]:
+def components(graph: PoseGraph) -> NDArray[np.int64]:
     """(n,) number of the connected component of every pose."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -57,7 +57,7 @@ def spanning_tree_start(graph: PoseGraph) -> NDArray[np.float64]:
     links = (links + links.T).tocsr()
     held = held_poses(graph)
     poses = _at_held(graph, held)
-    roots = held[np.unique(_components(graph)[held], return_index=True)[1]]
+    roots = held[np.unique(components(graph)[held], return_index=True)[1]]
     for root in roots:
         order, parent = breadth_first_order(links, int(root), directed=False, return_predecessors=True)
         children = order[1:].astype(np.int64)

@@ -1,0 +1,187 @@
+"""`boxplus ba`: a reconstruction in, an adjusted one and a report out."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.optimization_terminal import LOSS_HELP, LinearSolverChoice, MethodChoice
+
+if TYPE_CHECKING:
+    from boxplus.formats.reconstruction import Reconstruction
+    from boxplus.optimization.losses import Loss
+    from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, BundleAdjustmentResult
+    from boxplus.systems.optimization_summary import OptimizationSummary
+
+
+class FormatChoice(StrEnum):
+    """Formats of reconstructions."""
+
+    auto = "auto"
+    bal = "bal"
+    colmap = "colmap"
+    gbp = "gbp"
+
+
+def ba(
+    file: Annotated[Path, typer.Argument(help="BAL file (plain or .bz2), or the folder of a COLMAP model (text or binary).")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")
+    ] = None,
+    loss: Annotated[str, typer.Option("--loss", help=f"Robust loss: {LOSS_HELP}")] = "none",
+    sigma: Annotated[float, typer.Option("--sigma", min=1e-9, help="Standard deviation of a pixel measurement [px].")] = 1.0,
+    refine_intrinsics: Annotated[
+        bool, typer.Option("--refine-intrinsics", help="Of COLMAP's cameras: focal lengths and distortion; BAL's always are.")
+    ] = False,
+    refine_principal_point: Annotated[
+        bool, typer.Option("--refine-principal-point", help="Of COLMAP's cameras, with --refine-intrinsics.")
+    ] = False,
+    method: Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")] = MethodChoice.levenberg_marquardt,
+    linear_solver: Annotated[
+        LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
+    ] = LinearSolverChoice.auto,
+    max_iterations: Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")] = 100,
+    time_limit: Annotated[
+        float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+    ] = None,
+    format: Annotated[FormatChoice, typer.Option("--format", help="Of the file; auto looks into it.")] = FormatChoice.auto,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+) -> None:
+    """Adjust cameras and points so that they explain best where the points were seen.
+
+    The result is written in the format of the input, and as scene.ply (points and camera centres). Exit codes: 0 done, 1 the
+    problem does not determine its variables or the results could not be written, 2 bad input, 130 interrupted (results up to
+    there are complete).
+    """
+    from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
+    from boxplus.cli.run_terminal import stop_on_interrupt
+    from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
+    from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
+    from boxplus.systems.output_folder import prepare_output_folder
+
+    started, terminal = datetime.now(UTC), OptimizationTerminal()
+    robust = parse_loss(loss)
+    config = BundleAdjustmentConfig(sigma_px=sigma)
+    config = config.model_copy(
+        update={
+            "intrinsics": "refined" if refine_intrinsics or refine_principal_point else "held",
+            "principal_point": "refined" if refine_principal_point else "held",
+            "solver": solver_options(config.solver, method, linear_solver, max_iterations, time_limit, threads),
+        }
+    )
+    with terminal.console.status("reading"):
+        start = read_reconstruction(file, format.value)
+    folder = output or Path(f"{file.resolve().name.removesuffix('.bz2').removesuffix('.txt')}_boxplus")
+    prepare_output_folder(folder, "boxplus ba", *_own_files(folder), overwrite=overwrite)
+    name = reconstruction_file_name(start, file, "adjusted")
+    terminal.facts(file.name, {"input": _describe(start), "loss": "none" if robust is None else repr(robust)})
+    with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
+        result = adjust_bundle(start, config, loss=robust, callback=show)
+        stopped = should_stop()
+    summary = _summary(file, name, started, start, result, config, robust, stopped)
+    write_reconstruction(folder / name, result.reconstruction)
+    _write_scene(folder / "scene.ply", result.reconstruction)
+    if not no_report:
+        from boxplus.report.bundle_report import write_bundle_report
+
+        with terminal.console.status("drawing the report"):
+            write_bundle_report(folder, summary, start, result)
+    summary.write(folder / "run.json")
+    terminal.results(summary, "px", folder, ["report.html", name, "scene.ply", "run.json"])
+    if summary.state == "interrupted":
+        raise typer.Exit(130)
+
+
+def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Files and folders that this command writes."""
+    from boxplus.formats import colmap_binary, colmap_text
+    from boxplus.report.optimization_plots import PLOTS
+
+    model, plots = folder / "adjusted", folder / "plots"
+    files = [folder / name for name in ("report.html", "adjusted.txt", "adjusted.txt.bz2", "scene.ply", "run.json")]
+    files += [plots / name for name in PLOTS]
+    files += [model / name for name in (*colmap_text.FILES, *colmap_binary.FILES)]
+    return files, [model, plots]
+
+
+def _describe(start: Reconstruction) -> str:
+    sizes = _sizes(start)
+    return f"{_kind(start)}; " + ", ".join(f"{count:,} {name}" for name, count in sizes.items())
+
+
+def _kind(start: Reconstruction) -> str:
+    from boxplus.formats.bal import BalProblem
+    from boxplus.formats.colmap_model import ColmapModel
+
+    if isinstance(start, ColmapModel):
+        return f"COLMAP model ({start.format}, cameras {', '.join(sorted(set(start.camera_models)))})"
+    return "BAL file" if isinstance(start, BalProblem) else "BAL file with common intrinsics"
+
+
+def _sizes(start: Reconstruction) -> dict[str, int]:
+    from boxplus.report.bundle_scene import camera_centers
+
+    return {"cameras": len(camera_centers(start)), "points": len(start.points), "observations": len(start.pixels)}
+
+
+def _summary(
+    file: Path,
+    output: str,
+    started: datetime,
+    start: Reconstruction,
+    result: BundleAdjustmentResult,
+    config: BundleAdjustmentConfig,
+    loss: Loss | None,
+    stopped: bool,
+) -> OptimizationSummary:
+    from boxplus.cli.optimization_terminal import ended_by_user, versions
+    from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+
+    solution = result.solution
+    rho = "" if loss is None else f", ρ {loss!r}"
+    return OptimizationSummary(
+        program="boxplus ba",
+        versions=versions(),
+        started=started,
+        state="interrupted" if ended_by_user(solution, stopped) else "finished",
+        input=str(file),
+        output=output,
+        sizes={**_sizes(start), "used": len(result.errors)},
+        settings={**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), "loss": repr(loss) if loss else "none"},
+        status=solution.status,
+        reason=solution.reason,
+        method=solution.method,
+        linear_solver=solution.linear_solver,
+        convention=f"cost ½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over the observations, σ = {config.sigma_px:g} px{rho}",
+        start="the file's cameras and points",
+        cost_initial=solution.cost_initial,
+        cost=solution.cost,
+        errors_initial=ErrorFacts.of(result.errors_start),
+        errors=ErrorFacts.of(result.errors),
+        invalid=solution.invalid,
+        notes=list(result.notes),
+        timing_s=solution.timing_s,
+        history=iteration_facts(solution),
+    )
+
+
+def _write_scene(path: Path, reconstruction: Reconstruction) -> None:
+    """Points in their colours, then the camera centres in red."""
+    import numpy as np
+
+    from boxplus.formats.scene_ply import write_scene_ply
+    from boxplus.report.bundle_scene import camera_centers
+
+    centers = camera_centers(reconstruction)
+    colors = getattr(reconstruction, "colors", None)
+    of_points = np.full((len(reconstruction.points), 3), 160, np.uint8) if colors is None else colors
+    of_cameras = np.tile(np.array([220, 40, 30], np.uint8), (len(centers), 1))
+    write_scene_ply(path, np.vstack([reconstruction.points, centers]), np.vstack([of_points, of_cameras]))

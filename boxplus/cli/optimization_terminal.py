@@ -1,0 +1,202 @@
+"""What `boxplus ba` and `boxplus pgo` share: options of the solver, a row for every step, and results at the end."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from boxplus.errors import InputError
+
+if TYPE_CHECKING:
+    from boxplus.optimization.losses import Loss
+    from boxplus.optimization.solution import Iteration, Solution
+    from boxplus.optimization.solver_options import SolverOptions
+    from boxplus.systems.optimization_summary import OptimizationSummary
+
+_WIDTHS = (4, 16, 10, 10, 10, 10, 9)
+# Scales at which a robust loss is 95 % as good as least squares where all errors are Gaussian.
+_LOSS_SCALE = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "geman_mcclure": 3.787, "welsch": 2.985}
+_LOSS_NAME = {"huber": "Huber", "cauchy": "Cauchy", "tukey": "Tukey", "geman_mcclure": "GemanMcClure", "welsch": "Welsch"}
+
+LOSS_HELP = (
+    "none, or huber, cauchy, tukey, geman_mcclure or welsch with its scale in standard deviations, as in huber:1.0; without one, "
+    "the scale of 95 % efficiency."
+)
+
+
+class MethodChoice(StrEnum):
+    """How a step is chosen."""
+
+    levenberg_marquardt = "levenberg_marquardt"
+    gauss_newton = "gauss_newton"
+    dogleg = "dogleg"
+
+
+class LinearSolverChoice(StrEnum):
+    """How a step is computed."""
+
+    auto = "auto"
+    dense = "dense"
+    sparse = "sparse"
+    schur = "schur"
+
+
+def parse_loss(text: str) -> Loss | None:
+    """The loss of `huber:1.0` and its like; None for `none`.
+
+    Raises:
+        InputError: an unknown name, or a scale that is not a positive number.
+    """
+    from boxplus.optimization import losses
+
+    name, _, scale = text.strip().lower().partition(":")
+    name = name.replace("-", "_")
+    if name == "none":
+        return None
+    if name not in _LOSS_NAME:
+        raise InputError(f"--loss none or one of {', '.join(_LOSS_NAME)}", repr(text), "write it as in --loss huber:1.0")
+    try:
+        value = float(scale) if scale else _LOSS_SCALE[name]
+    except ValueError:
+        raise InputError(f"a number as the scale of {name}", repr(scale), f"write it as in --loss {name}:1.0") from None
+    loss: Loss = getattr(losses, _LOSS_NAME[name])(value)
+    return loss
+
+
+def solver_options(
+    default: SolverOptions,
+    method: MethodChoice,
+    linear_solver: LinearSolverChoice,
+    max_iterations: int | None,
+    time_limit_s: float | None,
+    threads: int | None,
+) -> SolverOptions:
+    """The options with what was given on the command line."""
+    given = {
+        "method": method.value,
+        "linear_solver": linear_solver.value,
+        "threads": threads if threads is not None else min(2, os.cpu_count() or 1),
+        "max_iterations": max_iterations,
+        "time_limit_s": time_limit_s,
+    }
+    return default.model_copy(update={name: value for name, value in given.items() if value is not None})
+
+
+def versions() -> dict[str, str]:
+    """Of boxplus, Python and what computes."""
+    import boxplus
+
+    libraries = {name: version(name) for name in ("numpy", "numba", "scipy")}
+    return {"boxplus": boxplus.__version__, "python": platform.python_version(), **libraries}
+
+
+class OptimizationTerminal:
+    """Prints on the standard output, the same on a terminal and in a pipe but for the colours."""
+
+    def __init__(self) -> None:
+        self.console = Console(highlight=False)
+        self._last: float | None = None
+
+    def facts(self, title: str, rows: Mapping[str, str]) -> None:
+        """A bold title, and rows of a name and what it is."""
+        self.console.print(Text(title, "bold"), soft_wrap=True)
+        table = Table(box=None, show_header=False, pad_edge=False)
+        table.add_column(style="bold")
+        table.add_column(overflow="fold")
+        for name, text in rows.items():
+            table.add_row(name, Text(text))
+        self.console.print(table)
+
+    def warn(self, text: str) -> None:
+        """A warning."""
+        self.console.print(Text.assemble(("warning: ", "yellow"), text), soft_wrap=True)
+
+    @contextmanager
+    def steps(self, method: MethodChoice, should_stop: Callable[[], bool]) -> Iterator[Callable[[Iteration], bool]]:
+        """Prints the head of the table; yields what `Problem.solve` calls for every step."""
+        from boxplus._jit import on_compilation
+
+        parameter = {MethodChoice.levenberg_marquardt: "λ", MethodChoice.dogleg: "radius"}.get(method, "length")
+        compiling = False
+
+        def note_compilation(kernel: str) -> None:
+            nonlocal compiling
+            if not compiling:
+                compiling = True
+                self.console.print("compiling kernels (first use only) …")
+
+        head: list[str] | None = ["step", "cost", "change", "gradient", "largest δ", parameter, "time [s]"]
+
+        def show(iteration: Iteration) -> bool:
+            nonlocal head
+            if head is not None:
+                self._row(head, "bold")
+                head = None
+            change = "" if self._last is None else f"{iteration.cost - self._last:.2e}"
+            style = ""
+            if not iteration.accepted:
+                change, style = "rejected", "yellow"
+            moved = f"{iteration.step:.2e}" if iteration.number else ""
+            cells = [str(iteration.number), f"{iteration.cost:.9e}", change, f"{iteration.gradient:.2e}", moved]
+            self._row([*cells, f"{iteration.parameter:.1e}", f"{iteration.time_s:.3f}"], style)
+            self._last = iteration.cost
+            return should_stop()
+
+        with on_compilation(note_compilation):
+            yield show
+
+    def _row(self, cells: list[str], style: str) -> None:
+        line = " ".join(cell.rjust(width) for cell, width in zip(cells, _WIDTHS, strict=True))
+        self.console.print(Text(line, style), soft_wrap=True)
+
+    def announce_stop(self) -> None:
+        """Say that Ctrl-C was heard."""
+        self.console.print("interrupted: stopping after this step; Ctrl-C again stops at once")
+
+    def results(self, summary: OptimizationSummary, unit: str, folder: Path, files: list[str]) -> None:
+        """Why it stopped, errors before and after, notes and files."""
+        good = summary.status == "converged" and summary.state == "finished"
+        self.console.print(Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow"), soft_wrap=True)
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for heading in (f"error [{unit}]", "rms", "median", "99th perc.", "largest", "not valid"):
+            table.add_column(heading, justify="left" if heading.startswith("error") else "right")
+        for name, errors in (("before", summary.errors_initial), ("after", summary.errors)):
+            values = (errors.rms, errors.median, errors.p99, errors.largest)
+            table.add_row(name, *(f"{value:.4g}" for value in values), str(errors.invalid))
+        self.console.print(table)
+        rows = {"cost": f"{summary.cost_initial:.9e} → {summary.cost:.9e}"}
+        if summary.chi2 is not None and summary.chi2_initial is not None:
+            rows["χ²"] = f"{summary.chi2_initial:.6f} → {summary.chi2:.6f} (without ½ and without robust loss)"
+        rows |= {
+            "start": summary.start,
+            "method": summary.method,
+            "linear solver": summary.linear_solver,
+            "summed": summary.convention,
+        }
+        table = Table(box=None, show_header=False, pad_edge=False)
+        table.add_column(style="bold", no_wrap=True)
+        table.add_column(overflow="fold")
+        for name, text in rows.items():
+            table.add_row(name, Text(text))
+        self.console.print(table)
+        for note in summary.notes:
+            self.warn(note)
+        for name in files:
+            if (folder / name).exists():
+                self.console.print(f"  {folder / name}", soft_wrap=True, markup=False)
+
+
+def ended_by_user(solution: Solution, stopped: bool) -> bool:
+    """Whether it was Ctrl-C that ended it."""
+    return stopped and solution.status == "stopped"

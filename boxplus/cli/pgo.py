@@ -1,0 +1,222 @@
+"""`boxplus pgo`: a pose graph in, an optimised one and a report out."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.optimization_terminal import LOSS_HELP, LinearSolverChoice, MethodChoice
+
+if TYPE_CHECKING:
+    from boxplus.formats.pose_graph import PoseGraph
+    from boxplus.optimization.losses import Loss
+    from boxplus.systems.optimization_summary import OptimizationSummary
+    from boxplus.systems.pose_graph import PoseGraphConfig, PoseGraphResult
+
+
+class StartChoice(StrEnum):
+    """Where to start."""
+
+    auto = "auto"
+    file = "file"
+    spanning_tree = "spanning_tree"
+    chordal = "chordal"
+
+
+class ObjectiveChoice(StrEnum):
+    """What is minimised."""
+
+    logarithm = "logarithm"
+    chordal = "chordal"
+
+
+class RotationErrorChoice(StrEnum):
+    """What the rotation part of a 3D information matrix refers to."""
+
+    rotation_vector = "rotation_vector"
+    quaternion = "quaternion"
+
+
+class CrossBlockChoice(StrEnum):
+    """How the block between translation and rotation is read."""
+
+    auto = "auto"
+    as_g2o = "upper"
+    transposed = "transposed"
+    dropped = "dropped"
+
+
+def pgo(
+    file: Annotated[Path, typer.Argument(help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")
+    ] = None,
+    start: Annotated[
+        StartChoice, typer.Option("--start", help="Where to start; auto: the cheaper of the file's poses and the chordal start.")
+    ] = StartChoice.auto,
+    loss: Annotated[str, typer.Option("--loss", help=f"Robust loss: {LOSS_HELP}")] = "none",
+    objective: Annotated[
+        ObjectiveChoice,
+        typer.Option("--objective", help="logarithm: the error Log(Z⁻¹ Ti⁻¹ Tj) with its information; chordal: that of SE-Sync."),
+    ] = ObjectiveChoice.logarithm,
+    rotation_error: Annotated[
+        RotationErrorChoice,
+        typer.Option(
+            "--rotation-error", help="What 3D rotation information in the file refers to; quaternion: g2o's half angles."
+        ),
+    ] = RotationErrorChoice.rotation_vector,
+    cross_block: Annotated[
+        CrossBlockChoice,
+        typer.Option("--cross-block", help="How the block between translation and rotation of 3D information is read."),
+    ] = CrossBlockChoice.auto,
+    ignore_unknown: Annotated[
+        bool, typer.Option("--ignore-unknown", help="Leave out lines that are no poses or edges, and count them.")
+    ] = False,
+    method: Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")] = MethodChoice.levenberg_marquardt,
+    linear_solver: Annotated[
+        LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
+    ] = LinearSolverChoice.auto,
+    max_iterations: Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")] = 100,
+    time_limit: Annotated[
+        float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+    ] = None,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+) -> None:
+    """Find the poses that agree best with the relative poses measured between them.
+
+    The result is written in the format of the input, and as graph.ply (poses and edges). Exit codes: 0 done, 1 the problem does
+    not determine its variables or the results could not be written, 2 bad input, 130 interrupted (results up to there are
+    complete).
+    """
+    from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
+    from boxplus.cli.run_terminal import stop_on_interrupt
+    from boxplus.formats.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
+    from boxplus.systems.output_folder import prepare_output_folder
+    from boxplus.systems.pose_graph import PoseGraphConfig, optimize_pose_graph
+
+    started, terminal = datetime.now(UTC), OptimizationTerminal()
+    robust = parse_loss(loss)
+    config = PoseGraphConfig()
+    config = config.model_copy(
+        update={
+            "start": start.value,
+            "objective": objective.value,
+            "solver": solver_options(config.solver, method, linear_solver, max_iterations, time_limit, threads),
+        }
+    )
+    with terminal.console.status("reading"):
+        kind = graph_format(file)
+        graph = read_pose_graph(
+            file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
+        )
+    folder = output or Path(f"{file.resolve().stem}_boxplus")
+    prepare_output_folder(folder, "boxplus pgo", *_own_files(folder), overwrite=overwrite)
+    name = "optimized.g2o" if kind == "g2o" else "optimized.graph"
+    described = f"{'g2o' if kind == 'g2o' else 'TORO'}, {graph.dimension}D; {len(graph.ids):,} poses, {len(graph.edges):,} edges"
+    terminal.facts(file.name, {"input": described, "loss": "none" if robust is None else repr(robust)})
+    for warning in graph.warnings:
+        terminal.warn(warning)
+    with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
+        result = optimize_pose_graph(graph, config, loss=robust, callback=show)
+        stopped = should_stop()
+    reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
+    summary = _summary(file, name, started, graph, result, config, robust, reading, stopped)
+    write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
+    _write_graph_ply(folder / "graph.ply", result.graph)
+    if not no_report:
+        from boxplus.report.graph_report import write_graph_report
+
+        with terminal.console.status("drawing the report"):
+            write_graph_report(folder, summary, graph, result)
+    summary.write(folder / "run.json")
+    terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "run.json"])
+    if summary.state == "interrupted":
+        raise typer.Exit(130)
+
+
+def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Files and folders that this command writes."""
+    from boxplus.report.optimization_plots import PLOTS
+
+    files = [folder / name for name in ("report.html", "optimized.g2o", "optimized.graph", "graph.ply", "run.json")]
+    return files + [folder / "plots" / name for name in PLOTS], [folder / "plots"]
+
+
+def _convention(graph: PoseGraph, config: PoseGraphConfig, loss: Loss | None, reading: dict[str, str]) -> str:
+    inner = (
+        "eᵀ Ω e with e = Log(Z⁻¹ Ti⁻¹ Tj), Ω in the order rotation, translation"
+        if config.objective == "logarithm"
+        else "κ ‖Rj − Ri Rij‖² + τ ‖tj − ti − Ri tij‖², the objective of SE-Sync"
+    )
+    text = f"χ² = Σ {inner}; cost ½ Σ {f'ρ of it, ρ {loss!r}' if loss else 'of it, ½ χ²'}"
+    if not reading:
+        return text
+    taken = "the full rotation vector" if reading["rotation_error"] == "rotation_vector" else "g2o's half angles"
+    return f"{text}; rotation information of the file taken for {taken}, its cross block read as {reading['cross_block']}"
+
+
+def _summary(
+    file: Path,
+    output: str,
+    started: datetime,
+    graph: PoseGraph,
+    result: PoseGraphResult,
+    config: PoseGraphConfig,
+    loss: Loss | None,
+    reading: dict[str, str],
+    stopped: bool,
+) -> OptimizationSummary:
+    from boxplus.cli.optimization_terminal import ended_by_user, versions
+    from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+
+    solution = result.solution
+    settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), **reading}
+    return OptimizationSummary(
+        program="boxplus pgo",
+        versions=versions(),
+        started=started,
+        state="interrupted" if ended_by_user(solution, stopped) else "finished",
+        input=str(file),
+        output=output,
+        sizes={"poses": len(graph.ids), "edges": len(graph.edges), "held": len(result.held)},
+        settings={**settings, "loss": repr(loss) if loss else "none"},
+        status=solution.status,
+        reason=solution.reason,
+        method=solution.method,
+        linear_solver=solution.linear_solver,
+        convention=_convention(graph, config, loss, reading),
+        start=result.start_reason,
+        cost_initial=solution.cost_initial,
+        cost=solution.cost,
+        chi2_initial=result.chi2_start,
+        chi2=result.chi2,
+        errors_initial=ErrorFacts.of(result.errors_start),
+        errors=ErrorFacts.of(result.errors),
+        invalid=solution.invalid,
+        notes=[*graph.warnings, *result.notes],
+        timing_s={"start": result.timing_s["start"], **solution.timing_s},
+        history=iteration_facts(solution),
+    )
+
+
+def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
+    """Positions of the poses, and the edges between them; held poses in red."""
+    import numpy as np
+
+    from boxplus.formats.scene_ply import write_scene_ply
+    from boxplus.report.graph_report import positions
+    from boxplus.systems.pose_graph_start import held_poses
+
+    if graph.poses is None:
+        return
+    colors = np.tile(np.array([53, 104, 168], np.uint8), (len(graph.ids), 1))
+    colors[held_poses(graph)] = (220, 40, 30)
+    write_scene_ply(path, positions(graph, graph.poses), colors, graph.edges)
