@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel, run_chunks
 from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.counting_sort import order_by
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.optimization.product_tiles import add_sums, tile_of
@@ -41,11 +42,13 @@ class Gather:
     residual: NDArray[np.uint32]
 
     @classmethod
-    def sorted_by(cls, group: Group, a: int, b: int, place: NDArray[np.int64], residual: NDArray[np.intp]) -> Gather:
-        """From the place that each of the residuals adds to."""
-        order = np.argsort(place, kind="stable")
-        target, begin = np.unique(place[order], return_index=True)
-        return cls(group, a, b, target, np.append(begin, len(place)), residual[order].astype(np.uint32))
+    def sorted_by(
+        cls, group: Group, a: int, b: int, item: NDArray[np.int64], place: NDArray[np.int64], residual: NDArray[np.intp]
+    ) -> Gather:
+        """From the item that each of the residuals adds to, and the place of every item."""
+        order, begin = order_by(item, len(place))
+        touched = np.flatnonzero(np.diff(begin))
+        return cls(group, a, b, place[touched], np.append(begin[touched], len(item)), residual[order].astype(np.uint32))
 
 
 @kernel
@@ -111,7 +114,7 @@ class NormalEquations:
             for a, number_a in enumerate(numbers):
                 free = np.flatnonzero(number_a >= 0)
                 if len(free):
-                    self._gradients.append(Gather.sorted_by(group, a, a, layout.start[number_a[free]], free))
+                    self._gradients.append(Gather.sorted_by(group, a, a, number_a[free], layout.start[:-1], free))
                 for b, number_b in enumerate(numbers):
                     # The lower triangle; a residual connected to the same variable twice adds both its cross products.
                     lower = (number_a > number_b) | (number_a == number_b)
@@ -122,10 +125,9 @@ class NormalEquations:
                         parts.append((group, a, b, selected))
         none = [np.zeros(0, dtype=np.int64)]
         self.pattern, pairs = BlockPattern.from_pairs(layout.sizes, np.concatenate(rows or none), np.concatenate(columns or none))
-        place = self.pattern.value_start[pairs.block]
         ends = np.cumsum([len(selected) for *_, selected in parts])
         self._products = [
-            Gather.sorted_by(group, a, b, place[end - len(selected) : end], selected)
+            Gather.sorted_by(group, a, b, pairs.block[end - len(selected) : end], self.pattern.value_start[:-1], selected)
             for (group, a, b, selected), end in zip(parts, ends, strict=True)
         ]
         self.values = np.zeros(int(self.pattern.value_start[-1]))

@@ -50,7 +50,7 @@ class SchurSystem(LinearSystem):
         self._others = np.delete(np.arange(layout.dof), self._own)
         self._C, self._L = np.zeros((count, e, e)), np.zeros((count, e, e))
         self._b, self._y = np.zeros((count, e)), np.zeros((count, e))
-        self._squares, self._slopes = _gathers_of(layout, groups, eliminated, e)
+        self._squares, self._slopes = _gathers_of(layout, groups, eliminated, count, e)
         self._equations = NormalEquations(self._rest, groups)
         self._entries = build_entries(layout, self._rest, groups, eliminated, count)
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
@@ -197,7 +197,9 @@ class SchurSystem(LinearSystem):
         return reached
 
 
-def _gathers_of(layout: Layout, groups: Sequence[Group], eliminated: Variables, e: int) -> tuple[list[Gather], list[Gather]]:
+def _gathers_of(
+    layout: Layout, groups: Sequence[Group], eliminated: Variables, count: int, e: int
+) -> tuple[list[Gather], list[Gather]]:
     """The residuals that add to C, and to the gradient, of each eliminated variable."""
     squares, slopes = [], []
     for group in groups:
@@ -206,6 +208,6 @@ def _gathers_of(layout: Layout, groups: Sequence[Group], eliminated: Variables, 
             continue
         slot, number = found
         selected = np.flatnonzero(number >= 0)
-        squares.append(Gather.sorted_by(group, slot, slot, number[selected] * e * e, selected))
-        slopes.append(Gather.sorted_by(group, slot, slot, number[selected] * e, selected))
+        squares.append(Gather.sorted_by(group, slot, slot, number[selected], np.arange(count) * e * e, selected))
+        slopes.append(Gather.sorted_by(group, slot, slot, number[selected], np.arange(count) * e, selected))
     return squares, slopes

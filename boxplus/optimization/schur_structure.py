@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.optimization.counting_sort import order_by
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.optimization.normal_equations import Gather
@@ -98,25 +99,32 @@ def _entries_of(
     count: int,
     e: int,
 ) -> Entries:
-    key = np.concatenate([f * count + p for *_, f, p in parts])
-    unique, entry = np.unique(key, return_inverse=True)
-    kept, of = unique // count, unique % count
+    f_all, p_all = np.concatenate([f for *_, f, _ in parts]), np.concatenate([p for *_, p in parts])
+    # Sorted by E, then stably by F: entries come F variable by F variable, and ascend in E within each.
+    by_e = order_by(p_all, count)[0]
+    by_f = by_e[order_by(f_all[by_e], len(rest.sizes))[0]]
+    f_sorted, p_sorted = f_all[by_f], p_all[by_f]
+    is_new = np.ones(len(by_f), dtype=np.bool_)
+    is_new[1:] = (f_sorted[1:] != f_sorted[:-1]) | (p_sorted[1:] != p_sorted[:-1])
+    entry = np.empty(len(by_f), dtype=np.int64)
+    entry[by_f] = np.cumsum(is_new) - 1
+    kept, of = f_sorted[is_new], p_sorted[is_new]
     variables, begin = np.unique(kept, return_index=True)
-    order = np.argsort(of, kind="stable")
+    order, of_eliminated = order_by(of, count)
     gathers = []
     end = 0
     for group, slot, other, selected, *_ in parts:
         end += len(selected)
-        gathers.append(Gather.sorted_by(group, slot, other, entry[end - len(selected) : end], selected))
+        gathers.append(Gather.sorted_by(group, slot, other, entry[end - len(selected) : end], np.arange(len(kept)), selected))
     return Entries(
         dof=dof,
         start=rest.start[variables],
-        begin=np.append(begin, len(unique)),
+        begin=np.append(begin, len(kept)),
         kept=kept,
         eliminated=of.astype(np.uint32),
-        Z=np.zeros((len(unique), e, dof)),
-        of_eliminated=np.searchsorted(of[order], np.arange(count + 1)),
-        order=order.astype(np.uint32),
+        Z=np.zeros((len(kept), e, dof)),
+        of_eliminated=of_eliminated,
+        order=order,
         start_of_entry=rest.start[kept],
         gathers=tuple(gathers),
     )
@@ -129,8 +137,9 @@ def build_products(
     kept = np.concatenate([k.kept for k in entries]) if entries else np.zeros(0, dtype=np.int64)
     of = np.concatenate([k.eliminated for k in entries]).astype(np.int64) if entries else kept
     first = np.cumsum([0, *(len(k.kept) for k in entries)])
-    order = np.lexsort((kept, of))
-    begin = np.searchsorted(of[order], np.arange(count + 1))
+    by_kept = order_by(kept, len(rest.sizes))[0]
+    by_eliminated, begin = order_by(of[by_kept], count)
+    order = by_kept[by_eliminated].astype(np.int64)
     a = np.empty(count_pairs(begin), dtype=np.uint32)
     b = np.empty_like(a)
     list_pairs(begin, order, a, b)
@@ -149,10 +158,11 @@ def build_products(
             chosen = np.flatnonzero((kind_a == i) & (kind_b == j))
             if not len(chosen):
                 continue
-            chosen = chosen[np.argsort(pair_block[chosen], kind="stable")]
-            blocks, start = np.unique(pair_block[chosen], return_index=True)
+            by_block, start = order_by(pair_block[chosen], len(pattern.row))
+            blocks = np.flatnonzero(np.diff(start))
+            chosen = chosen[by_block]
             entry_a = (a[chosen] - first[i]).astype(np.uint32)
             entry_b = (b[chosen] - first[j]).astype(np.uint32)
             target = pattern.value_start[blocks]
-            products.append(Products(rows, columns, target, np.append(start, len(chosen)), entry_a, entry_b))
+            products.append(Products(rows, columns, target, np.append(start[blocks], len(chosen)), entry_a, entry_b))
     return pattern, places, products
