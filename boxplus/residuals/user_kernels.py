@@ -19,6 +19,7 @@ import numpy as np
 from numba.core import config as numba_config
 from numba.core import types
 from numba.core.errors import NumbaError, UnsupportedBytecodeError
+from numba.extending import intrinsic
 
 from boxplus.errors import InputError
 from boxplus.manifolds.tangent_step import copy_into, step_into
@@ -60,6 +61,7 @@ def compiled_loops(
     compute, returned = _compiled("function", function, tuple(rows))
     store = _Store(returned, dim, function.__name__)
     names: dict[str, Any] = {"function": compute, "np": np, "step_into": step_into, "copy_into": copy_into}
+    names["present"] = present if returned is not None else _as_it_is
     evaluate = _loop("evaluate", _evaluate_source(variables, len(data), store), names)
     if jacobian is not None:
         expected = f"the arguments of {function.__name__} and then one (dim, dof) array to fill for each variable"
@@ -110,6 +112,21 @@ def _compiled(role: str, function: Callable[..., Any], arguments: tuple[types.Ty
             "use scalars, NumPy arrays, math and kernels from boxplus.manifolds only, or give a batch function",
         ) from error
     return dispatcher, dispatcher.overloads[arguments].signature.return_type
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def present(typing_context: Any, value: Any) -> Any:
+    """A value that may be None, and is not: Numba does not index a tuple that may be None."""
+    inner = value.type if isinstance(value, types.Optional) else value
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return context.cast(builder, arguments[0], value, inner)
+
+    return inner(value), generate
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
 
 
 def _as_sequence(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -164,14 +181,15 @@ class _Store:
             )
 
     def guard(self, value: str, on_none: str) -> str:
-        """Lines that leave with `on_none` when there is no residual, and return when its length is wrong."""
+        """Lines that leave with `on_none` where there is no residual, else call it `found` and return when its length is wrong."""
         lines = [f"if {value} is None:", *(f"    {line}" for line in on_none.split("; "))] if self.can_be_none else []
+        lines += [f"found = present({value})"] if self.can_be_none else [f"found = {value}"]
         if self.has_length:
-            lines += [f"if len({value}) != {self.dim}:", f"    return len({value}) + 1"]
+            lines += [f"if len(found) != {self.dim}:", "    return len(found) + 1"]
         return "\n".join(lines)
 
-    def entries(self, value: str) -> list[str]:
-        return [value] if self.is_scalar else [f"{value}[{c}]" for c in range(self.dim)]
+    def entries(self) -> list[str]:
+        return ["found"] if self.is_scalar else [f"found[{c}]" for c in range(self.dim)]
 
 
 def _evaluate_source(variables: int, data: int, store: _Store) -> str:
@@ -230,7 +248,7 @@ def _numeric_source(variables: int, data: int, store: _Store, dofs: tuple[int, .
             for c in range(np.uint64({store.dim})):
                 J{s}[n, c, k] = scale * (e_of[ahead, c] - e_of[ahead + one, c])""")
         begin += 2 * dof
-    copies = "\n".join(f"            e_of[probe, {c}] = {entry}" for c, entry in enumerate(store.entries("e")))
+    copies = "\n".join(f"            e_of[probe, {c}] = {entry}" for c, entry in enumerate(store.entries()))
     # Beside a neighbour without residual the difference is one-sided, from the residual itself.
     on_none = "; ".join(
         [
@@ -273,7 +291,7 @@ def linearize(
 
 def _residual(store: _Store) -> str:
     lines = [store.guard("e", "valid[n] = False; r[n, :] = 0.0; continue")]
-    lines += [f"r[n, {c}] = {entry}" for c, entry in enumerate(store.entries("e"))]
+    lines += [f"r[n, {c}] = {entry}" for c, entry in enumerate(store.entries())]
     return _indent("\n".join(lines), 8)
 
 

@@ -209,6 +209,27 @@ def test_none_and_masks_mean_singular(is_batch: bool, has_jacobian: bool) -> Non
         assert np.allclose(linear.jacobians[0][2], [[1.0, 0.0]], atol=1e-5)
 
 
+@pytest.mark.parametrize("has_jacobian", [False, True])
+def test_none_may_stand_for_several_numbers(has_jacobian: bool) -> None:
+    def direction(p):
+        length = math.sqrt(p[0] ** 2 + p[1] ** 2)
+        if length < 1.0:
+            return None
+        return p[0] / length, p[1] / length
+
+    def direction_jacobian(p, J):
+        cube = math.sqrt(p[0] ** 2 + p[1] ** 2) ** 3
+        J[0, 0], J[0, 1], J[1, 0], J[1, 1] = p[1] ** 2 / cube, -p[0] * p[1] / cube, -p[0] * p[1] / cube, p[0] ** 2 / cube
+
+    jacobian = direction_jacobian if has_jacobian else None
+    residual = UserResidual(direction, dim=2, manifolds=(Euclidean(2),), count=3, jacobian=jacobian)
+    p = np.array([[3.0, 4.0], [0.1, 0.2], [0.0, -2.0]])
+    assert residual.linearize(p).valid.tolist() == [True, False, True]
+    assert np.allclose(residual.evaluate(p), [[0.6, 0.8], [0.0, 0.0], [0.0, -1.0]])
+    report = check_jacobian(residual, p)
+    assert report.passed and report.invalid == 1, report
+
+
 def test_data_come_as_scalars_rows_and_matrices() -> None:
     def affine(x, scale, matrix, which):
         return scale * (matrix[0, 0] * x[0] + matrix[0, 1] * x[1]), x[which]
