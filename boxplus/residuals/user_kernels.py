@@ -181,7 +181,7 @@ class _Store:
             )
 
     def guard(self, value: str, on_none: str) -> str:
-        """Lines that leave with `on_none` where there is no residual, else call it `found` and return when its length is wrong."""
+        """Lines that leave with `on_none` where there is no residual, else name it `found`, and return if its length is wrong."""
         lines = [f"if {value} is None:", *(f"    {line}" for line in on_none.split("; "))] if self.can_be_none else []
         lines += [f"found = present({value})"] if self.can_be_none else [f"found = {value}"]
         if self.has_length:
