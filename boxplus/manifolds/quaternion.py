@@ -12,10 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
-from boxplus.manifolds._batch import map_batch
+from boxplus.manifolds._batch import map_batch, map_pairs
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.so3 import SERIES_SWITCH, log_quaternion, quaternion_into, right_jacobian_into, right_jacobian_inverse_into
+from boxplus.manifolds.so3 import (
+    SERIES_SWITCH,
+    log_quaternion,
+    quaternion_scalars,
+    right_jacobian_into,
+    right_jacobian_inverse_into,
+)
 
 
 @kernel(inline=True)
@@ -92,7 +98,7 @@ def normalized_scalars(w: float, x: float, y: float, z: float) -> tuple[float, f
 @kernel
 def _from_matrix_batch(R: NDArray[np.float64], q_wxyz: NDArray[np.float64]) -> None:
     for i in range(R.shape[0]):
-        quaternion_into(R[i], q_wxyz[i])
+        q_wxyz[i, 0], q_wxyz[i, 1], q_wxyz[i, 2], q_wxyz[i, 3] = quaternion_scalars(R[i])
 
 
 def from_matrix(R: ArrayLike) -> NDArray[np.float64]:
@@ -100,31 +106,31 @@ def from_matrix(R: ArrayLike) -> NDArray[np.float64]:
     return map_batch(_from_matrix_batch, "R", R, (3, 3), (4,))
 
 
+@kernel
+def _to_matrix_batch(q_wxyz: NDArray[np.float64], R: NDArray[np.float64]) -> None:
+    for i in range(q_wxyz.shape[0]):
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_entries(q_wxyz[i, 0], q_wxyz[i, 1], q_wxyz[i, 2], q_wxyz[i, 3])
+        R[i, 0, 0], R[i, 0, 1], R[i, 0, 2] = r00, r01, r02
+        R[i, 1, 0], R[i, 1, 1], R[i, 1, 2] = r10, r11, r12
+        R[i, 2, 0], R[i, 2, 1], R[i, 2, 2] = r20, r21, r22
+
+
 def to_matrix(q_wxyz: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4); the caller normalises."""
-    q = np.asarray(q_wxyz, dtype=np.float64)
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return map_batch(_to_matrix_batch, "q_wxyz", q_wxyz, (4,), (3, 3))
+
+
+@kernel
+def _multiply_batch(p: NDArray[np.float64], q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    for i in range(p.shape[0]):
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = multiply_scalars(
+            p[i, 0], p[i, 1], p[i, 2], p[i, 3], q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        )
 
 
 def multiply(p_wxyz: ArrayLike, q_wxyz: ArrayLike) -> NDArray[np.float64]:
     """Hamilton product p ⊗ q, (..., 4): R(p ⊗ q) = R(p) R(q)."""
-    pw, px, py, pz = np.moveaxis(np.asarray(p_wxyz, dtype=np.float64), -1, 0)
-    qw, qx, qy, qz = np.moveaxis(np.asarray(q_wxyz, dtype=np.float64), -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    return map_pairs(_multiply_batch, "p_wxyz", p_wxyz, 4, "q_wxyz", q_wxyz, 4, 4)
 
 
 @kernel

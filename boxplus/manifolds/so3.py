@@ -95,35 +95,28 @@ def right_jacobian_inverse_into(wx: float, wy: float, wz: float, J: NDArray[np.f
     _quadratic(wx, wy, wz, 0.5, inverse_jacobian_coefficient(wx * wx + wy * wy + wz * wz), J)
 
 
-@kernel
-def quaternion_into(R: NDArray[np.float64], q_wxyz: NDArray[np.float64]) -> None:
-    """Unit quaternion of R with w ≥ 0, by the largest element (Shepperd; SPEC.md 1.2)."""
+@kernel(inline=True)
+def quaternion_scalars(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of R with w ≥ 0, by the largest element (Shepperd; SPEC.md 1.2)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
-        q_wxyz[0] = 1.0 + trace
-        q_wxyz[1] = R[2, 1] - R[1, 2]
-        q_wxyz[2] = R[0, 2] - R[2, 0]
-        q_wxyz[3] = R[1, 0] - R[0, 1]
+        w, x, y, z = 1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     elif R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2]:
-        q_wxyz[0] = R[2, 1] - R[1, 2]
-        q_wxyz[1] = 1.0 + R[0, 0] - R[1, 1] - R[2, 2]
-        q_wxyz[2] = R[0, 1] + R[1, 0]
-        q_wxyz[3] = R[0, 2] + R[2, 0]
+        w, x, y, z = R[2, 1] - R[1, 2], 1.0 + R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]
     elif R[1, 1] >= R[2, 2]:
-        q_wxyz[0] = R[0, 2] - R[2, 0]
-        q_wxyz[1] = R[0, 1] + R[1, 0]
-        q_wxyz[2] = 1.0 + R[1, 1] - R[0, 0] - R[2, 2]
-        q_wxyz[3] = R[1, 2] + R[2, 1]
+        w, x, y, z = R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1.0 + R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]
     else:
-        q_wxyz[0] = R[1, 0] - R[0, 1]
-        q_wxyz[1] = R[0, 2] + R[2, 0]
-        q_wxyz[2] = R[1, 2] + R[2, 1]
-        q_wxyz[3] = 1.0 + R[2, 2] - R[0, 0] - R[1, 1]
-    scale = 1.0 / math.sqrt(q_wxyz[0] ** 2 + q_wxyz[1] ** 2 + q_wxyz[2] ** 2 + q_wxyz[3] ** 2)
-    if q_wxyz[0] < 0.0:
+        w, x, y, z = R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1.0 + R[2, 2] - R[0, 0] - R[1, 1]
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    if w < 0.0:
         scale = -scale
-    for i in range(4):
-        q_wxyz[i] *= scale
+    return scale * w, scale * x, scale * y, scale * z
+
+
+@kernel
+def quaternion_into(R: NDArray[np.float64], q_wxyz: NDArray[np.float64]) -> None:
+    """As `quaternion_scalars`, into (4,)."""
+    q_wxyz[0], q_wxyz[1], q_wxyz[2], q_wxyz[3] = quaternion_scalars(R)
 
 
 @kernel
@@ -143,9 +136,8 @@ def log_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float
 @kernel
 def log_into(R: NDArray[np.float64], w: NDArray[np.float64]) -> None:
     """w = Log(R), (3,)."""
-    q = np.empty(4)
-    quaternion_into(R, q)
-    w[0], w[1], w[2] = log_quaternion(q[0], q[1], q[2], q[3])
+    qw, qx, qy, qz = quaternion_scalars(R)
+    w[0], w[1], w[2] = log_quaternion(qw, qx, qy, qz)
 
 
 @kernel
