@@ -188,7 +188,7 @@ def large(program: Path | None, folder: Path) -> list[Metric]:
         file = folder / f"synthetic-{cameras}.txt"
         write_bal(file, synthetic(cameras, points, seen))
         own = subprocess.run([sys.executable, __file__, "--worker", str(file)], check=True, capture_output=True, text=True)
-        figures = json.loads(own.stdout.splitlines()[-1])
+        figures = json.loads(next(line for line in own.stdout.splitlines() if line.startswith("{")))
         name = f"bundle/{cameras} cameras, {points * seen:,} observations"
         label = f"{name}: {_ITERATIONS} iterations"
         if program is None:

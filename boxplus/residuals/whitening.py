@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.errors import InputError
 
 _SYMMETRY = 1e-6  # largest asymmetry, of the largest entry, that counts as rounding
+_ROUNDING = 1e-9  # a negative eigenvalue up to this share of the largest is rounding of what was written to a file
 _LEAST_PIVOT = 1e-14  # what is left of a diagonal entry, as a share of it, that does not count as rounding
 
 
@@ -40,7 +41,8 @@ class Whitening:
         Args:
             dim, count: d rows of a residual, N residuals.
             sigma: standard deviation in the unit of the residual: a number, (d,), (N, 1) or (N, d).
-            covariance, information: (d, d) or (N, d, d), symmetric and positive definite.
+            covariance, information: (d, d) or (N, d, d), symmetric and positive definite. An information matrix may be
+                semi-definite: along its null space the residual says nothing.
 
         Raises:
             InputError: two descriptions, a wrong shape, a sigma that is not positive and finite, a matrix that is not
@@ -118,16 +120,27 @@ def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse:
     try:
         factor = np.linalg.cholesky(array)
         pivots = np.einsum("nii->ni", factor) ** 2
-        positive = bool((pivots > _LEAST_PIVOT * np.einsum("nii->ni", array)).all())
+        definite = bool((pivots > _LEAST_PIVOT * np.einsum("nii->ni", array)).all())
     except np.linalg.LinAlgError:
-        positive = False
-    if not positive:
-        eigenvalues = np.linalg.eigvalsh(array)
-        n = int(np.argmin(eigenvalues[:, 0] / np.maximum(scale, 1e-300)))
-        raise InputError(
-            f"{name} positive definite",
-            f"eigenvalues from {eigenvalues[n, 0]:.3g} to {eigenvalues[n, -1]:.3g} in residual {n}",
-            "a direction without information cannot be whitened: leave it out of the residual",
-        )
+        definite = False
+    if not definite:
+        return _of_semidefinite(name, array, allowed=not inverse)
     # Ω = L Lᵀ is whitened by Lᵀ; Σ = C Cᵀ by C⁻¹, which spares the inverse of Σ.
     return np.ascontiguousarray(np.linalg.inv(factor) if inverse else np.swapaxes(factor, 1, 2))
+
+
+def _of_semidefinite(name: str, matrices: NDArray[np.float64], *, allowed: bool) -> NDArray[np.float64]:
+    """W = √Λ Vᵀ of information matrices V Λ Vᵀ some of which say nothing along some directions."""
+    values, vectors = np.linalg.eigh(matrices)
+    largest = values[:, -1]
+    bad = (values[:, 0] < (-_ROUNDING if allowed else _LEAST_PIVOT) * largest) | ~(largest > 0.0)
+    if bad.any():
+        n = int(np.argmax(bad))
+        raise InputError(
+            f"{name} positive {'semi-' if allowed else ''}definite and not zero",
+            f"eigenvalues from {values[n, 0]:.3g} to {values[n, -1]:.3g} in residual {n}",
+            "check the order in which its entries were read"
+            if allowed
+            else "a direction known exactly is no measurement: fix it",
+        )
+    return np.ascontiguousarray(np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2))

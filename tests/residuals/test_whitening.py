@@ -37,11 +37,20 @@ def test_sigmas_of_all_shapes():
         ({"sigma": 1.0, "information": np.eye(2)}, "sigma and information"),
         ({"information": np.eye(3)}, "shape"),
         ({"information": [[1.0, 0.5], [0.0, 1.0]]}, "symmetric – got an asymmetry of 0.5 in residual 0"),
-        ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "positive definite – got eigenvalues from -1"),
-        ({"information": [[1.0, 0.0], [0.0, 0.0]]}, "leave it out of the residual"),
+        ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "positive definite and not zero – got eigenvalues from -1"),
+        ({"covariance": [[1.0, 0.0], [0.0, 0.0]]}, "known exactly"),
+        ({"information": [[1.0, 2.0], [2.0, 1.0]]}, "semi-definite and not zero – got eigenvalues from -1"),
+        ({"information": np.zeros((2, 2))}, "not zero"),
         ({"covariance": [[np.nan, 0.0], [0.0, 1.0]]}, "NaN or infinity in residual 0"),
     ],
 )
 def test_what_is_no_noise_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         Whitening.of(2, 3, **arguments)
+
+
+def test_information_may_leave_directions_open():
+    direction = np.array([0.6, 0.8])
+    information = 4.0 * np.outer(direction, direction)
+    W = Whitening.of(2, 1, information=information).factors[0]
+    np.testing.assert_allclose(W.T @ W, information, atol=1e-12)
