@@ -156,7 +156,7 @@ def factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
 
 @kernel
 def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width: np.uint64, inverse: Buffer, pivots: Buffer,
-                 column: np.uint64, c: Buffer, c_at: np.uint64, ldc: np.uint64) -> np.uint64:  # fmt: skip
+                 column: np.uint64, c: Buffer, c_at: np.uint64, ldc: np.uint64, accumulate: np.uint64) -> np.uint64:  # fmt: skip
     """Factorise a panel in place and form the update matrix of the rows below.
 
     Args:
@@ -164,6 +164,7 @@ def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
         inverse: written at `column`: reciprocals of the diagonal of L.
         pivots: written at `column`: their inverse squares.
         c: buffer that receives the update matrix -L₂₁ L₂₁ᵀ, (rows - width) square, lower triangle.
+        accumulate: 1 to add it to what is there.
 
     Returns:
         The first column whose pivot is not positive and finite, or `width`.
@@ -182,6 +183,6 @@ def factor_panel(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
             update(p, here, ld, p, a_at, ld, p, a_at, ld, rest, width - behind, depth, _ONE, _ONE)
         if rows > width:
             below, a_at = rows - width, at + width + k * ld
-            update(c, c_at, ldc, p, a_at, ld, p, a_at, ld, below, below, depth, _ONE, min(k, _ONE))
+            update(c, c_at, ldc, p, a_at, ld, p, a_at, ld, below, below, depth, _ONE, max(min(k, _ONE), accumulate))
         k = behind
     return width

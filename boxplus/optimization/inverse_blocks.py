@@ -91,6 +91,10 @@ def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffe
         front, following = table[g], table[g + _ONE]
         width, below, at, ld = front["width"], front["below"], front["panel_at"], front["panel_ld"]
         below_at, below_ld = front["update_at"], front["update_ld"]
+        if front["parent"] < fronts and table[front["parent"]]["eager"]:
+            p = table[front["parent"]]
+            p_at, p_ld, p_below, p_below_ld = p["panel_at"], p["panel_ld"], p["update_at"], p["update_ld"]
+            _hand_to_child(front, following["run_start"], runs, z, p_at, p_ld, p["width"], stack, p_below, p_below_ld)
         _invert_triangle(factor, at, ld, inverse, front["column"], width, m, negative)
         update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, _ONE, _ZERO)
         if below > _ZERO:
@@ -99,9 +103,10 @@ def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffe
             update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, _ZERO, _ZERO)
             _transpose(z, at + width, ld, below, width, z_transposed, _ZERO, width, _ZERO)
             update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, _ONE, _ONE)
-        for c in range(front["child_start"], following["child_start"]):
-            child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
-            _hand_to_child(child, last, runs, z, at, ld, width, stack, below_at, below_ld)
+        if not front["eager"]:
+            for c in range(front["child_start"], following["child_start"]):
+                child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+                _hand_to_child(child, last, runs, z, at, ld, width, stack, below_at, below_ld)
 
 
 @kernel

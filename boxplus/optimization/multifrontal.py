@@ -64,36 +64,77 @@ def _add_child(child: Table, first: np.uint64, split: np.uint64, last: np.uint64
 
 
 @kernel(inline=True)
-def _begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
-                 values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer,
-                 entries_of_diagonal: Buffer) -> None:  # fmt: skip
-    """Fill the panel: blocks of the matrix, damping, and what the children add to it."""
-    front, following = table[g], table[g + _ONE]
+def _fill_front(g: np.uint64, table: Table, entries: Table, scalar_order: Indices, values: Buffer, diagonal: Buffer,
+                factor: Buffer, entries_of_diagonal: Buffer) -> None:  # fmt: skip
+    """Fill the panel with the blocks of the matrix and damping."""
+    front = table[g]
     column, at, ld = front["column"], front["panel_at"], front["panel_ld"]
     for k in range(at, at + front["width"] * ld):
         factor[k] = 0.0
-    _fill_panel(front["entry_start"], following["entry_start"], ld, entries, values, factor)
+    _fill_panel(front["entry_start"], table[g + _ONE]["entry_start"], ld, entries, values, factor)
     for k in range(front["width"]):
         entry = factor[at + k + k * ld] + diagonal[scalar_order[column + k]]
         factor[at + k + k * ld] = entry
         entries_of_diagonal[column + k] = entry
-    for c in range(front["child_start"], following["child_start"]):
+
+
+@kernel
+def _open_parent(p: np.uint64, table: Table, entries: Table, scalar_order: Indices, values: Buffer, diagonal: Buffer,
+                 factor: Buffer, stack: Buffer, entries_of_diagonal: Buffer) -> None:  # fmt: skip
+    """What an eager front needs before its first child."""
+    _fill_front(p, table, entries, scalar_order, values, diagonal, factor, entries_of_diagonal)
+    at = table[p]["update_at"]
+    for k in range(at, at + table[p]["below"] * table[p]["update_ld"]):
+        stack[k] = 0.0
+
+
+@kernel
+def _add_to_parent(g: np.uint64, table: Table, runs: Table, factor: Buffer, stack: Buffer) -> None:
+    """Add a whole update matrix to an eager parent."""
+    front, last, parent = table[g], table[g + _ONE]["run_start"], table[table[g]["parent"]]
+    at, ld = parent["panel_at"], parent["panel_ld"]
+    _add_child(front, front["run_start"], front["run_split"], last, runs, stack, factor, at, ld, _ZERO)
+    at, ld = parent["update_at"], parent["update_ld"]
+    _add_child(front, front["run_split"], last, last, runs, stack, stack, at, ld, parent["width"])
+
+
+@kernel(inline=True)
+def _begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
+                 values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer,
+                 entries_of_diagonal: Buffer) -> None:  # fmt: skip
+    """Fill the panel: blocks of the matrix, damping, and what the children add to it. An eager front has all that already."""
+    front = table[g]
+    if front["eager"]:
+        return
+    _fill_front(g, table, entries, scalar_order, values, diagonal, factor, entries_of_diagonal)
+    for c in range(front["child_start"], table[g + _ONE]["child_start"]):
         child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+        at, ld = front["panel_at"], front["panel_ld"]
         _add_child(child, child["run_start"], child["run_split"], last, runs, stack, factor, at, ld, _ZERO)
 
 
 @kernel(inline=True)
-def _end_front(g: np.uint64, table: Table, children: Indices, runs: Table, stack: Buffer, pivots: Buffer,
+def _end_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
+               values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, pivots: Buffer,
                entries_of_diagonal: Buffer) -> np.uint64:  # fmt: skip
-    """Add the rest of the children's update matrices to this one; returns the first singular column, or width."""
-    front, following = table[g], table[g + _ONE]
+    """Add the rest of the children's update matrices to this one, and this one to an eager parent.
+
+    Returns the first column that is singular, or width.
+    """
+    front = table[g]
     column, width = front["column"], front["width"]
     for k in range(width):
         if pivots[column + k] <= SINGULAR * entries_of_diagonal[column + k]:
             return np.uint64(k)
-    for c in range(front["child_start"], following["child_start"]):
-        child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
-        _add_child(child, child["run_split"], last, last, runs, stack, stack, front["update_at"], front["update_ld"], width)
+    if not front["eager"]:
+        for c in range(front["child_start"], table[g + _ONE]["child_start"]):
+            child, last = table[children[c]], table[children[c] + _ONE]["run_start"]
+            _add_child(child, child["run_split"], last, last, runs, stack, stack, front["update_at"], front["update_ld"], width)
+    p = front["parent"]
+    if p + _ONE < len(table) and table[p]["eager"]:
+        if children[table[p]["child_start"]] == g:
+            _open_parent(p, table, entries, scalar_order, values, diagonal, factor, stack, entries_of_diagonal)
+        _add_to_parent(g, table, runs, factor, stack)
     return np.uint64(width)
 
 
@@ -105,10 +146,13 @@ def begin_front(g: np.uint64, table: Table, children: Indices, runs: Table, entr
 
 
 @kernel
-def end_front(g: np.uint64, table: Table, children: Indices, runs: Table, stack: Buffer, pivots: Buffer,
+def end_front(g: np.uint64, table: Table, children: Indices, runs: Table, entries: Table, scalar_order: Indices,
+              values: Buffer, diagonal: Buffer, factor: Buffer, stack: Buffer, pivots: Buffer,
               entries_of_diagonal: Buffer) -> np.uint64:  # fmt: skip
     """See `_end_front`; for a front that several threads work on."""
-    return _end_front(g, table, children, runs, stack, pivots, entries_of_diagonal)  # type: ignore[no-any-return]
+    return _end_front(  # type: ignore[no-any-return]
+        g, table, children, runs, entries, scalar_order, values, diagonal, factor, stack, pivots, entries_of_diagonal
+    )
 
 
 @kernel
@@ -132,9 +176,11 @@ def factorize(sequence: Indices, begin: np.uint64, end: np.uint64, table: Table,
         column, width, rows = front["column"], front["width"], front["width"] + front["below"]
         _begin_front(g, table, children, runs, entries, scalar_order, values, diagonal, factor, stack, entries_of_diagonal)
         at, ld, update_at, update_ld = front["panel_at"], front["panel_ld"], front["update_at"], front["update_ld"]
-        failed = factor_panel(factor, at, ld, rows, width, inverse, pivots, column, stack, update_at, update_ld)
+        failed = factor_panel(factor, at, ld, rows, width, inverse, pivots, column, stack, update_at, update_ld, front["eager"])
         if failed == width:
-            failed = _end_front(g, table, children, runs, stack, pivots, entries_of_diagonal)
+            failed = _end_front(
+                g, table, children, runs, entries, scalar_order, values, diagonal, factor, stack, pivots, entries_of_diagonal
+            )
         if failed < width:
             return np.uint64(column + failed)
     return np.uint64(len(inverse))

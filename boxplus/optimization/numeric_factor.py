@@ -74,11 +74,11 @@ class NumericFactor:
     def _factorize_large(self, front: int, values: NDArray[np.float64], diagonal: NDArray[np.float64]) -> int:
         """One front by all threads: block after block of columns, the rest of the front updated in rows side by side."""
         fronts, record, g = self._fronts, self._fronts.table[front], np.uint64(front)
-        column, width, below, at, ld, update_at, update_ld = (
-            int(record[name]) for name in ("column", "width", "below", "panel_at", "panel_ld", "update_at", "update_ld")
-        )
-        tables = (fronts.table, fronts.children, fronts.runs)
-        begin_front(g, *tables, fronts.entries, fronts.scalar_order, values, diagonal, self.panels, self.stack, self._entries)
+        column, width, below, at, ld = (int(record[name]) for name in ("column", "width", "below", "panel_at", "panel_ld"))
+        update_at, update_ld, eager = int(record["update_at"]), int(record["update_ld"]), bool(record["eager"])
+        tables = (fronts.table, fronts.children, fronts.runs, fronts.entries, fronts.scalar_order)
+        numbers = (values, diagonal, self.panels, self.stack)
+        begin_front(g, *tables, *numbers, self._entries)
         for k in range(0, width, int(BLOCK)):
             depth = min(int(BLOCK), width - k)
             corner, place = at + k + k * ld, np.uint64(column + k)
@@ -89,8 +89,8 @@ class NumericFactor:
             behind = corner + depth * (ld + 1)
             rest = width - k - depth
             self._update(self.panels, behind, ld, corner + depth, ld, rest + below, rest, depth, True)
-            self._update(self.stack, update_at, update_ld, at + width + k * ld, ld, below, below, depth, k > 0)
-        done = int(end_front(g, *tables, self.stack, self.pivots, self._entries))
+            self._update(self.stack, update_at, update_ld, at + width + k * ld, ld, below, below, depth, k > 0 or eager)
+        done = int(end_front(g, *tables, *numbers, self.pivots, self._entries))
         return column + done if done < width else len(self.pivots)
 
     def _update(self, c: NDArray[np.float64], c_at: int, ldc: int, a_at: int, lda: int, rows: int, columns: int, depth: int,

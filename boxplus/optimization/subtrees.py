@@ -51,7 +51,7 @@ def _makespan(times: list[float], threads: int) -> float:
     return max(ends)
 
 
-def split_tree(parent: Indices, width: Indices, below: Indices, threads: int) -> tuple[Indices, Indices]:
+def split_tree(parent: Indices, width: Indices, below: Indices, eager: Indices, threads: int) -> tuple[Indices, Indices]:
     """The part of each front, and where the parts begin when the fronts are sorted by them.
 
     The last part is the rest: it waits for all others, the subtrees, of which the longest come first.
@@ -72,7 +72,7 @@ def split_tree(parent: Indices, width: Indices, below: Indices, threads: int) ->
             time = rest + _makespan([t for t, _, _ in subtrees], threads)
             if len(subtrees) > 1 and time < best[0]:
                 best = (time, subtrees)
-            if not heap:
+            if not heap or eager[heap[0][1]]:  # the children of an eager front must not work side by side
                 break
             _, g = heapq.heappop(heap)
             rest += float(own[g])

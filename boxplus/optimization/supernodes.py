@@ -4,7 +4,9 @@ A front eliminates the columns of one supernode. Its panel, `width + below` rows
 L; its update matrix, `below` by `below`, is what the elimination adds to the later rows, and is added to the parent front.
 Both are column-major. Update matrices live in two stacks that grow towards each other, one for the even and one for the odd
 levels of the tree, so that a front's own update matrix can be formed while those of its children are still there. Each of the
-subtrees that threads work on side by side has its own pair of stacks, and so has the rest of the tree.
+subtrees that threads work on side by side has its own pair of stacks, and so has the rest of the tree. Where very many
+children would wait for their parent (landmarks for a camera), the parent's memory is there first and each child adds its
+update matrix at once.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ FRONT = np.dtype(
             "entry_start",  # first entry in `entries`
             "row_start",  # first entry in `rows`
             "parent",  # index of the parent front, their number for a root
+            "eager",  # 1 where each child adds its update matrix as soon as it is done, 0 where all wait for the front's turn
         )
     ]
 )
@@ -57,6 +60,7 @@ ENTRY = np.dtype([("source", np.uint64), ("target", np.uint64), ("rows", np.uint
 STORED, TRANSPOSED, DIAGONAL = 0, 1, 2
 
 ALIGNMENT = 8  # elements, a cache line
+MANY_CHILDREN, MUCH_MEMORY = 8, 4  # from how many children, and how many times a front's own memory, they do not wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,24 +110,52 @@ def stride(rows: int) -> int:
 
 
 @kernel
-def _stack_offsets(parent: Indices, below: Indices, strides: Indices, part: Indices, parts: int) -> tuple[Indices, int]:
+def _eager_fronts(parent: Indices, size: Indices) -> Indices:
+    """1 for fronts whose many children together would hold much more memory than their own update matrix."""
+    groups = len(parent)
+    count, total = np.zeros(groups + 1, np.int64), np.zeros(groups + 1, np.int64)
+    for g in range(groups):
+        count[parent[g]] += 1
+        total[parent[g]] += size[g]
+    return ((count[:groups] >= MANY_CHILDREN) & (total[:groups] > MUCH_MEMORY * size)).astype(np.int64)
+
+
+@kernel
+def _stack_offsets(parent: Indices, size: Indices, eager: Indices, part: Indices, parts: int) -> tuple[Indices, int]:
     """Place of each update matrix, and the size of all stacks together. Every part of the tree has two stacks of its own."""
     groups = len(parent)
-    level, offset = np.zeros(groups + 1, np.int64), np.zeros(groups, np.int64)
+    level, offset, first = np.zeros(groups + 1, np.int64), np.zeros(groups, np.int64), np.arange(groups + 1)
     for g in range(groups - 1, -1, -1):
         level[g] = level[parent[g]] + 1 if parent[g] < groups else 0
-    lowest_child = np.full(groups + 1, groups)
-    top, peak, base = np.zeros((parts, 2), np.int64), np.zeros(parts, np.int64), np.zeros(parts + 1, np.int64)
-    size = (below * strides + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
     for g in range(groups):
-        p, side = part[g], level[g] % 2
-        offset[g] = top[p, side]
-        top[p, side] += size[g]
+        first[parent[g]] = min(first[parent[g]], first[g])
+    lowest_child, opened = np.full(groups + 1, groups), np.empty(groups, np.int64)
+    top, peak, base = np.zeros((parts, 2), np.int64), np.zeros(parts, np.int64), np.zeros(parts + 1, np.int64)
+    for g in range(groups):
+        p, count, q = part[g], 0, g
+        # What is allocated now: the front's own update matrix, and those of eager fronts above it that it is the first below.
+        while q < groups and first[q] == g:
+            if eager[q]:
+                opened[count] = q
+                count += 1
+            q = parent[q]
+        if not eager[g]:
+            opened[1 : count + 1] = opened[:count].copy()
+            opened[0] = g
+            count += 1
+        for k in range(count - 1, -1, -1):
+            q = opened[k]
+            side = level[q] % 2
+            offset[q] = top[p, side]
+            top[p, side] += size[q]
         peak[p] = max(peak[p], top[p, 0] + top[p, 1])
         if lowest_child[g] < groups:
-            top[p, 1 - side] = offset[lowest_child[g]]
+            top[p, 1 - level[g] % 2] = offset[lowest_child[g]]
         if parent[g] < groups and part[parent[g]] == p:
-            lowest_child[parent[g]] = min(lowest_child[parent[g]], g)
+            if eager[parent[g]]:
+                top[p, level[g] % 2] = offset[g]
+            else:
+                lowest_child[parent[g]] = min(lowest_child[parent[g]], g)
     for p in range(parts):
         base[p + 1] = base[p] + peak[p]
     for g in range(groups):
@@ -233,17 +265,19 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64], threads: int) -> Fr
     scalar_rows = np.zeros(len(rows) + 1, np.int64)
     np.cumsum(sizes[rows], out=scalar_rows[1:])
     below = np.diff(scalar_rows[row_start])
-    part, parts = split_tree(group_parent, width, below, threads)
+    update_strides = np.array([stride(int(rows)) for rows in below], np.int64)
+    update_sizes = (below * update_strides + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
+    eager = _eager_fronts(group_parent, update_sizes)
+    part, parts = split_tree(group_parent, width, below, eager, threads)
     table = np.zeros(groups + 1, FRONT)
     table["column"] = start[first]
     table["width"][:groups], table["below"][:groups] = width, below
     table["panel_ld"][:groups] = [stride(int(rows)) for rows in width + below]
     panel_sizes = (table["panel_ld"][:groups].astype(np.int64) * width + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
     table["panel_at"][1:] = np.cumsum(panel_sizes)
-    update_strides = np.array([stride(int(rows)) for rows in below], np.int64)
     table["update_ld"][:groups] = update_strides
-    table["update_at"][:groups], stack_size = _stack_offsets(group_parent, below, update_strides, part, len(parts) - 1)
-    table["parent"][:groups] = group_parent
+    table["update_at"][:groups], stack_size = _stack_offsets(group_parent, update_sizes, eager, part, len(parts) - 1)
+    table["parent"][:groups], table["eager"][:groups] = group_parent, eager
     table["row_start"] = scalar_rows[row_start]
     table["child_start"][1:] = np.cumsum(np.bincount(group_parent, minlength=groups + 1)[:groups])
     runs = np.empty((len(rows), 3), np.uint64)

@@ -240,3 +240,29 @@ def test_the_example_of_the_documentation_runs() -> None:
     scope: dict[str, NDArray[np.float64]] = {}
     exec(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)[0], scope)
     np.testing.assert_allclose(scope["x"], 0.5)
+
+
+STARS = {
+    "landmarks of one camera": ([6] + [3] * 50, [0] * 50, range(1, 51)),
+    "landmarks of several cameras": (
+        [6] * 4 + [3] * 200,
+        np.repeat(range(4, 204), 2),
+        np.random.default_rng(0).integers(0, 4, 400),
+    ),
+    "a star of stars": ([6] * 13 + [3] * 120, [*[0] * 12, *np.repeat(range(1, 13), 10)], [*range(1, 13), *range(13, 133)]),
+}
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("star", STARS)
+def test_fronts_with_many_children(star: str, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subtrees, "WORTHWHILE", 0.0)
+    monkeypatch.setattr(numeric_factor, "LARGE", 100.0)
+    sizes, i, j = STARS[star]
+    pattern, _ = BlockPattern.from_pairs(sizes, i, j)
+    values, dense = positive_definite(pattern, np.random.default_rng(0))
+    cholesky = check(pattern, values, dense, threads=threads)
+    assert cholesky._fronts.table["eager"].any()
+    inverse, start, every = np.linalg.inv(dense), pattern.start, np.arange(len(pattern.sizes))
+    for k, block in enumerate(cholesky.inverse_blocks(every, every)):
+        np.testing.assert_allclose(block, inverse[start[k] : start[k + 1], start[k] : start[k + 1]], rtol=1e-9, atol=1e-12)
