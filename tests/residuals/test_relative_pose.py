@@ -136,7 +136,7 @@ def test_noise_and_measurements_are_checked() -> None:
         RelativePose(2.0 * Z)
     with pytest.raises(InputError, match=r"expected measured of shape \(n, 3\) on SE2"):
         RelativePose2D(Z)
-    with pytest.raises(InputError, match="expected information positive definite"):
+    with pytest.raises(InputError, match="expected information positive semi-definite"):
         RelativePose(Z, information=-np.eye(6))
     with pytest.raises(InputError, match=r"expected T_world_j of shape \(3, 7\) or \(7,\) on SE3"):
         RelativePose(Z).evaluate(Z, Z[:2])
@@ -153,6 +153,14 @@ def test_priors_on_every_manifold(manifold: Manifold) -> None:
     report = check_jacobian(residual, x)
     assert report.passed, report
     assert np.allclose(residual.whitening.factors[0], 2.0 * np.eye(manifold.dof))
+
+
+def test_a_prior_of_the_position_alone() -> None:
+    mean = PRODUCT.random(np.random.default_rng(9), 1)[0]
+    residual = Prior(PRODUCT, mean, information=np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0]))
+    x = PRODUCT.boxplus(mean, [0.5, 0.2, -0.1, 1.0, 2.0, 3.0])
+    whitened = residual.whitening.factors[0] @ residual.evaluate(x)[0]
+    assert np.isclose(whitened @ whitened, 4.0 * 14.0)
 
 
 @pytest.mark.parametrize("other", [SE3Left, PRODUCT], ids=str)
