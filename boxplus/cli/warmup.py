@@ -1,34 +1,83 @@
-"""`boxplus warmup`: compile the kernels of the main job before they are needed."""
+"""`boxplus warmup`: compile the kernels of the main jobs before they are needed."""
 
 from __future__ import annotations
 
 
 def warmup() -> None:
-    """Compile everything now, so that the first run does not have to. Takes half a minute, once."""
-    import tempfile
+    """Compile everything now, so that the first run does not have to. Takes a minute, once."""
     import time
-    from pathlib import Path
 
     from rich.console import Console
 
-    from boxplus._jit import cache_root
-    from boxplus.simulation import SpinningLidar, simulate
-    from boxplus.simulation.live_recording import as_recording
-    from boxplus.systems.odometry_run import Progress, run_odometry
-    from boxplus.systems.run_config import load_run_config
+    from boxplus._jit import cache_root, on_compilation
 
     console = Console(highlight=False)
     began = time.perf_counter()
+    compiled: set[str] = set()
+    with console.status("compiling kernels …") as status:
+
+        def show(name: str) -> None:
+            compiled.add(name)
+            status.update(f"compiling kernels … {name}")
+
+        with on_compilation(show):
+            _run_odometry()
+            _optimize_pose_graphs()
+            _adjust_bundle()
+    what = f"{len(compiled)} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
+    console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
+
+
+def _run_odometry() -> None:
+    import tempfile
+    from pathlib import Path
+
+    from boxplus.simulation import SpinningLidar, simulate
+    from boxplus.simulation.live_recording import as_recording
+    from boxplus.systems.odometry_run import run_odometry
+    from boxplus.systems.run_config import load_run_config
+
     # A car in a map box so small that it slides: every kernel of a run is called.
     odometry = {"threads": 2, "box_side": 40.0, "detection_range": 5.0, "extrinsic_estimation": "on"}
     recording = as_recording(simulate("moving_start", duration_s=3.0, lidar=SpinningLidar(azimuth_steps=500)))
-    with console.status("compiling kernels …") as status, tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
+        run_odometry(recording, Path(folder) / "run", load_run_config(overrides={"odometry": odometry}))
 
-        def show(progress: Progress) -> None:
-            if progress.compiling is not None:
-                status.update(f"compiling kernels … {progress.compiling}")
 
-        summary = run_odometry(recording, Path(folder) / "run", load_run_config(overrides={"odometry": odometry}), progress=show)
-    compiled = summary.timing.compiled_kernels
-    what = f"{compiled} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
-    console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
+def _optimize_pose_graphs() -> None:
+    import numpy as np
+
+    from boxplus.formats.pose_graph import PoseGraph
+    from boxplus.manifolds import se2, se3
+    from boxplus.manifolds.se2 import SE2
+    from boxplus.manifolds.se3 import SE3
+    from boxplus.optimization.losses import Huber
+    from boxplus.systems.pose_graph import optimize_pose_graph, pose_graph_problem
+
+    count = 60  # more than the dense solver takes
+    i = np.arange(count)
+    edges = np.concatenate([np.stack([i, (i + 1) % count], 1), np.stack([i, (i + 7) % count], 1)])
+    for dimension, manifold, group in ((2, SE2, se2), (3, SE3, se3)):
+        poses = manifold.random(np.random.default_rng(0), count)
+        measured = group.compose(group.inverse(poses[edges[:, 0]]), poses[edges[:, 1]])
+        measured = manifold.boxplus(measured, np.full((len(edges), manifold.dof), 0.01))
+        information = np.tile(np.eye(manifold.dof), (len(edges), 1, 1))
+        none = np.zeros(0, dtype=np.int64)
+        graph = PoseGraph(dimension, i, poses, edges, measured, information, none)
+        optimize_pose_graph(graph)
+        problem, variables = pose_graph_problem(graph, loss=Huber(1.0))
+        problem.solve().covariance(variables[[1]])
+
+
+def _adjust_bundle() -> None:
+    import numpy as np
+
+    from boxplus.formats.bal import BalProblem
+    from boxplus.systems.bundle_adjustment import adjust_bundle
+
+    rng = np.random.default_rng(0)
+    cameras = np.hstack([0.05 * rng.standard_normal((20, 6)), np.tile([500.0, 0.0, 0.0], (20, 1))])
+    points = rng.uniform([-1.0, -1.0, -6.0], [1.0, 1.0, -4.0], (100, 3))
+    camera_of, point_of = (index.reshape(-1) for index in np.indices((20, 100)))
+    pixels = -500.0 * points[point_of, :2] / points[point_of, 2:]
+    adjust_bundle(BalProblem(cameras, points, camera_of, point_of, pixels))
