@@ -100,13 +100,10 @@ class Fronts:
     stack_size: int
 
 
-@kernel
-def stride(rows: int) -> int:
-    """Column stride of a matrix: whole cache lines where it is worth it, never a large power of two."""
-    if rows < 4 * ALIGNMENT:
-        return rows
+def _strides(rows: Indices) -> Indices:
+    """Column strides of matrices: whole cache lines where it is worth it, never a large power of two."""
     padded = (rows + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
-    return padded + ALIGNMENT if padded % 64 == 0 else padded
+    return np.where(rows < 4 * ALIGNMENT, rows, np.where(padded % 64 == 0, padded + ALIGNMENT, padded))
 
 
 @kernel
@@ -133,16 +130,14 @@ def _stack_offsets(parent: Indices, size: Indices, eager: Indices, part: Indices
     top, peak, base = np.zeros((parts, 2), np.int64), np.zeros(parts, np.int64), np.zeros(parts + 1, np.int64)
     for g in range(groups):
         p, count, q = part[g], 0, g
+        if not eager[g]:
+            opened[0], count = g, 1
         # What is allocated now: the front's own update matrix, and those of eager fronts above it that it is the first below.
         while q < groups and first[q] == g:
             if eager[q]:
                 opened[count] = q
                 count += 1
             q = parent[q]
-        if not eager[g]:
-            opened[1 : count + 1] = opened[:count].copy()
-            opened[0] = g
-            count += 1
         for k in range(count - 1, -1, -1):
             q = opened[k]
             side = level[q] % 2
@@ -166,12 +161,12 @@ def _stack_offsets(parent: Indices, size: Indices, eager: Indices, part: Indices
 
 @kernel
 def _runs(first: Indices, parent: Indices, row_start: Indices, rows: Indices, group_of: Indices, start: Indices,
-          table: NDArray[np.void], runs: NDArray[np.uint64]) -> int:  # fmt: skip
-    """Where the rows of each front lie in its parent; returns the number of runs."""
+          run_start: Indices, run_split: Indices, runs: NDArray[np.uint64]) -> None:  # fmt: skip
+    """Where the rows of each front lie in its parent."""
     groups, count = len(parent), 0
     for g in range(groups):
-        table[g]["run_start"] = count
-        table[g]["run_split"] = count
+        run_start[g] = count
+        run_split[g] = count
         p = parent[g]
         if p == groups:
             continue
@@ -195,28 +190,24 @@ def _runs(first: Indices, parent: Indices, row_start: Indices, rows: Indices, gr
                 count += 1
                 begun = True
             if there < width:
-                table[g]["run_split"] = count
+                run_split[g] = count
             expected = there + size
             here += size
-    table[groups]["run_start"] = count
-    return count
+    run_start[groups] = count
 
 
 @kernel
 def _entries(col_start: Indices, row: Indices, value_start: Indices, position: Indices, group_of: Indices, first: Indices,
-             row_start: Indices, rows: Indices, start: Indices, table: NDArray[np.void],
-             entries: NDArray[np.uint64]) -> None:  # fmt: skip
+             row_start: Indices, rows: Indices, start: Indices, panel_at: Indices, panel_ld: Indices,
+             entry_start: Indices, entries: NDArray[np.uint64]) -> None:  # fmt: skip
     """Where each block of the matrix goes in the factor."""
     groups, n = len(first) - 1, len(position)
-    count = np.zeros(groups + 1, np.int64)
     for column in range(n):
         for k in range(col_start[column], col_start[column + 1]):
-            count[group_of[min(position[row[k]], position[column])] + 1] += 1
+            entry_start[group_of[min(position[row[k]], position[column])] + 1] += 1
     for g in range(groups):
-        count[g + 1] += count[g]
-    for g in range(groups + 1):
-        table[g]["entry_start"] = count[g]
-    fill, block, column_of = count[:groups].copy(), np.empty(len(row), np.int64), np.empty(len(row), np.int64)
+        entry_start[g + 1] += entry_start[g]
+    fill, block, column_of = entry_start[:groups].copy(), np.empty(len(row), np.int64), np.empty(len(row), np.int64)
     for column in range(n):
         for k in range(col_start[column], col_start[column + 1]):
             g = group_of[min(position[row[k]], position[column])]
@@ -231,8 +222,8 @@ def _entries(col_start: Indices, row: Indices, value_start: Indices, position: I
         for k in range(row_start[g], row_start[g + 1]):
             local[rows[k]] = behind
             behind += start[rows[k] + 1] - start[rows[k]]
-        at, ld = np.int64(table[g]["panel_at"]), np.int64(table[g]["panel_ld"])
-        for e in range(count[g], count[g + 1]):
+        at, ld = panel_at[g], panel_ld[g]
+        for e in range(entry_start[g], entry_start[g + 1]):
             k = block[e]
             a, b = position[row[k]], position[column_of[e]]
             entries[e, 0] = value_start[k]
@@ -265,27 +256,41 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64], threads: int) -> Fr
     scalar_rows = np.zeros(len(rows) + 1, np.int64)
     np.cumsum(sizes[rows], out=scalar_rows[1:])
     below = np.diff(scalar_rows[row_start])
-    update_strides = np.array([stride(int(rows)) for rows in below], np.int64)
+    update_strides = _strides(below)
     update_sizes = (below * update_strides + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
     eager = _eager_fronts(group_parent, update_sizes)
     part, parts = split_tree(group_parent, width, below, eager, threads)
     table = np.zeros(groups + 1, FRONT)
     table["column"] = start[first]
     table["width"][:groups], table["below"][:groups] = width, below
-    table["panel_ld"][:groups] = [stride(int(rows)) for rows in width + below]
-    panel_sizes = (table["panel_ld"][:groups].astype(np.int64) * width + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT
-    table["panel_at"][1:] = np.cumsum(panel_sizes)
+    panel_ld, panel_at = _strides(width + below), np.zeros(groups + 1, np.int64)
+    np.cumsum((panel_ld * width + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT, out=panel_at[1:])
+    table["panel_ld"][:groups], table["panel_at"] = panel_ld, panel_at
     table["update_ld"][:groups] = update_strides
     table["update_at"][:groups], stack_size = _stack_offsets(group_parent, update_sizes, eager, part, len(parts) - 1)
     table["parent"][:groups], table["eager"][:groups] = group_parent, eager
     table["row_start"] = scalar_rows[row_start]
     table["child_start"][1:] = np.cumsum(np.bincount(group_parent, minlength=groups + 1)[:groups])
     runs = np.empty((len(rows), 3), np.uint64)
-    run_count = _runs(first, group_parent, row_start, rows, group_of, start, table, runs)
+    run_start, run_split, entry_start = (np.zeros(groups + 1, np.int64) for _ in range(3))
+    _runs(first, group_parent, row_start, rows, group_of, start, run_start, run_split, runs)
     entries = np.empty((len(pattern.row), 5), np.uint64)
     _entries(
-        pattern.col_start, pattern.row, pattern.value_start, position, group_of, first, row_start, rows, start, table, entries
+        pattern.col_start,
+        pattern.row,
+        pattern.value_start,
+        position,
+        group_of,
+        first,
+        row_start,
+        rows,
+        start,
+        panel_at,
+        panel_ld,
+        entry_start,
+        entries,
     )
+    table["run_start"], table["run_split"], table["entry_start"] = run_start, run_split, entry_start
     return Fronts(
         sizes=pattern.sizes,
         order=order,
@@ -296,10 +301,10 @@ def lay_out(pattern: BlockPattern, order: NDArray[np.int64], threads: int) -> Fr
         children=np.argsort(group_parent, kind="stable").astype(np.uint64),
         sequence=np.argsort(part, kind="stable").astype(np.uint64),
         parts=parts,
-        runs=runs[:run_count].copy().view(RUN)[:, 0],
+        runs=runs[: run_start[-1]].copy().view(RUN)[:, 0],
         entries=entries.view(ENTRY)[:, 0],
         rows=_expand(start[rows], sizes[rows]),
-        factor_size=int(table["panel_at"][-1]),
+        factor_size=int(panel_at[-1]),
         stack_size=stack_size,
     )
 
