@@ -18,8 +18,8 @@ from boxplus.systems.lio_config import LioConfig
 from boxplus.systems.run_config import MapConfig
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-PYTHON_PAGES = [ROOT / "README.md", ROOT / "docs" / "library_use.md"]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PYTHON_PAGES = [ROOT / "README.md", ROOT / "docs" / "library_use.md", ROOT / "docs" / "least_squares.md"]
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -103,7 +103,7 @@ def test_commands_for_a_recording_run(workspace: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("page", [pytest.param(page, id=page.name) for page in PAGES])
+@pytest.mark.parametrize("page", [pytest.param(page, id=str(page.relative_to(ROOT))) for page in PAGES])
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         if not target.startswith("https://"):
@@ -112,8 +112,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_every_page_is_in_the_index() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    missing = [page.name for page in PAGES if page.parent.name == "docs" and page.name != "index.md" and page.name not in index]
-    assert not missing
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.ipynb")]
+    assert not [page.name for page in pages if page.name != "index.md" and f"({page.name})" not in index]
 
 
 @pytest.mark.parametrize("model", [LioConfig, RecordingOptions, MapConfig])
