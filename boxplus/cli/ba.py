@@ -103,7 +103,7 @@ def ba(
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
     from boxplus.formats import colmap_binary, colmap_text
-    from boxplus.report.optimization_plots import PLOTS
+    from boxplus.systems.optimization_summary import PLOTS
 
     model, plots = folder / "adjusted", folder / "plots"
     files = [folder / name for name in ("report.html", "adjusted.txt", "adjusted.txt.bz2", "scene.ply", "run.json")]

@@ -170,7 +170,7 @@ class OptimizationTerminal:
         self.console.print(Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow"), soft_wrap=True)
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in (f"error [{unit}]", "rms", "median", "99th perc.", "largest", "not valid"):
-            table.add_column(heading, justify="left" if heading.startswith("error") else "right")
+            table.add_column(Text(heading), justify="left" if heading.startswith("error") else "right")
         for name, errors in (("before", summary.errors_initial), ("after", summary.errors)):
             values = (errors.rms, errors.median, errors.p99, errors.largest)
             table.add_row(name, *(f"{value:.4g}" for value in values), str(errors.invalid))

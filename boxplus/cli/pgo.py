@@ -144,7 +144,7 @@ def pgo(
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
-    from boxplus.report.optimization_plots import PLOTS
+    from boxplus.systems.optimization_summary import PLOTS
 
     files = [folder / name for name in ("report.html", "optimized.g2o", "optimized.graph", "graph.ply", "run.json")]
     return files + [folder / "plots" / name for name in PLOTS], [folder / "plots"]
@@ -212,7 +212,7 @@ def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
     import numpy as np
 
     from boxplus.formats.scene_ply import write_scene_ply
-    from boxplus.report.graph_report import positions
+    from boxplus.systems.pose_graph import positions
     from boxplus.systems.pose_graph_start import held_poses
 
     if graph.poses is None:

@@ -49,9 +49,10 @@ def write_bundle_report(
         (f"{sizes['cameras']:,}", "cameras"),
         (f"{sizes['points']:,}", f"points, seen {sizes['observations']:,} times"),
     ]
+    inside = [f"{view.inside(scene).mean():.0%}" for scene in (before, after)]
     text = (
-        "Cameras and points, these coloured by the mean error of their observations; points far outside are left out. "
-        "Drag to turn, scroll to zoom."
+        f"Cameras, and the points within the box that holds nearly all of them at the end ({inside[0]} of the points before, "
+        f"{inside[1]} after), coloured by the mean error of their observations. Drag to turn, scroll to zoom."
     )
     picture = figure_section("Before and after", text, _scenes(before, after, view))
     page = folder / "report.html"
@@ -77,7 +78,8 @@ def _scenes(before: BundleScene, after: BundleScene, view: Viewpoint) -> go.Figu
             "colorbar": {
                 "title": {"text": "error [px]", "side": "right"},
                 "thickness": 12,
-                "len": 0.6,
+                "len": 0.5,
+                "y": 0.35,
                 "tickvals": list(ticks),
                 "ticktext": [f"{10.0**tick:g}" for tick in ticks],
             },
@@ -106,10 +108,11 @@ def _scenes(before: BundleScene, after: BundleScene, view: Viewpoint) -> go.Figu
             row=1,
             col=column,
         )
-    eye = 1.7 * (-0.75 * view.depth + 0.6 * view.up + 0.25 * view.right)
+    eye = 1.35 * (-0.75 * view.depth + 0.6 * view.up + 0.25 * view.right)
     axis = {"backgroundcolor": "white", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
     layout = {
-        "aspectmode": "data",
+        "aspectmode": "manual",
+        "aspectratio": _xyz((view.high - view.low) / (view.high - view.low).max()),
         "dragmode": "orbit",
         "camera": {"eye": _xyz(eye), "up": _xyz(view.up)},
         **{
@@ -118,7 +121,9 @@ def _scenes(before: BundleScene, after: BundleScene, view: Viewpoint) -> go.Figu
         },
     }
     figure.update_scenes(layout)
-    figure.update_layout(height=560, font=FONT, margin={"l": 0, "r": 0, "t": 30, "b": 0}, paper_bgcolor="white")
+    figure.update_layout(
+        height=560, modebar={"orientation": "v"}, font=FONT, margin={"l": 0, "r": 0, "t": 30, "b": 0}, paper_bgcolor="white"
+    )
     return figure
 
 

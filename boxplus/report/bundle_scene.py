@@ -93,9 +93,13 @@ class Viewpoint:
         bottom, top = np.percentile(known, [5.0, 97.0]) if len(known) else (0.1, 1.0)
         return cls(up, np.cross(depth, up), depth, low - margin, high + margin, (float(bottom), float(max(top, 1.01 * bottom))))
 
+    def inside(self, scene: BundleScene) -> NDArray[np.bool_]:
+        """(n,) which points lie within the box."""
+        return np.asarray(((scene.points >= self.low) & (scene.points <= self.high)).all(axis=1))
+
     def shown(self, scene: BundleScene) -> NDArray[np.intp]:
         """The points within the box, an even selection where they are many."""
-        inside = np.flatnonzero(((scene.points >= self.low) & (scene.points <= self.high)).all(axis=1))
+        inside = np.flatnonzero(self.inside(scene))
         return inside[:: max(1, -(-len(inside) // _MOST_POINTS))]
 
 

@@ -18,7 +18,7 @@ from boxplus.report.optimization_plots import plain, write_optimization_plots
 from boxplus.report.palette import FAINT, GRID, SERIES
 from boxplus.report.skeleton import figure_section, html_table
 from boxplus.systems.optimization_summary import OptimizationSummary
-from boxplus.systems.pose_graph import PoseGraphResult
+from boxplus.systems.pose_graph import PoseGraphResult, positions
 
 _WORST = 15
 _WORST_SHARE = 0.01
@@ -59,11 +59,6 @@ def write_graph_report(folder: Path, summary: OptimizationSummary, graph: PoseGr
     picture = figure_section("Before and after", text, draw(graph, panels, result.errors))
     page = folder / "report.html"
     return write_optimization_page(page, summary, numbers, picture, errors, "σ", _worst_edges(graph, result))
-
-
-def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) positions of poses laid out as in a graph; z = 0 in the plane."""
-    return poses[:, 4:] if graph.dimension == 3 else np.column_stack([poses[:, 1:], np.zeros(len(poses))])
 
 
 def _panels(graph: PoseGraph, result: PoseGraphResult) -> list[tuple[str, NDArray[np.float64]]]:
@@ -110,9 +105,15 @@ def _scenes(graph: PoseGraph, panels: list[tuple[str, NDArray[np.float64]]], err
                 col=column,
             )
     axis = {"backgroundcolor": "white", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False, "nticks": 5}
-    scene = {"aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": -1.1, "y": -1.3, "z": 0.9}}}
+    far = 0.75 + 0.15 * len(panels)  # narrow panels need distance
+    eye = {"x": -0.8 * far, "y": -1.0 * far, "z": 0.7 * far}
+    scene = {"aspectmode": "manual", "dragmode": "orbit", "camera": {"eye": eye}}
     figure.update_scenes({**scene, **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"}})
-    return _framed(figure, 560, True)
+    for column, (_, xyz) in enumerate(panels, 1):
+        extent = np.maximum(np.ptp(xyz, axis=0), 1e-3 * max(float(np.ptp(xyz, axis=0).max()), 1e-9))
+        ratio = {name: float(value) for name, value in zip("xyz", extent / extent.max(), strict=True)}
+        figure.update_scenes(aspectratio=ratio, row=1, col=column)
+    return _framed(figure, 560 if len(panels) < 3 else 440, True)
 
 
 def _planes(graph: PoseGraph, panels: list[tuple[str, NDArray[np.float64]]], errors: NDArray[np.float64]) -> go.Figure:
@@ -144,6 +145,7 @@ def _planes(graph: PoseGraph, panels: list[tuple[str, NDArray[np.float64]]], err
 def _framed(figure: go.Figure, height: int, is_3d: bool) -> go.Figure:
     figure.update_layout(
         height=height,
+        modebar={"orientation": "v"},
         font=FONT,
         paper_bgcolor="white",
         margin={"l": 60, "r": 10, "t": 30, "b": 30},
@@ -154,7 +156,8 @@ def _framed(figure: go.Figure, height: int, is_3d: bool) -> go.Figure:
 
 def _picture(graph: PoseGraph, panels: list[tuple[str, NDArray[np.float64]]], errors: NDArray[np.float64]) -> Figure:
     """The panels as a picture, in 3D seen obliquely."""
-    figure = Figure(figsize=(6.0 * len(panels), 6.2), layout="constrained")
+    figure = Figure(figsize=(6.0 * len(panels), 6.4))
+    figure.set_layout_engine("constrained", rect=(0.0, 0.05, 1.0, 0.94))
     projection = {"projection": "3d"} if graph.dimension == 3 else {}
     for number, (title, xyz) in enumerate(panels, 1):
         axes = figure.add_subplot(1, len(panels), number, **projection)
@@ -177,7 +180,7 @@ def _picture(graph: PoseGraph, panels: list[tuple[str, NDArray[np.float64]]], er
             axes.set_aspect("equal")
             plain(axes)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(handles, labels, loc="lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 

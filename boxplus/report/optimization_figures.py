@@ -90,6 +90,7 @@ def cost_over_iterations(history: list[IterationFacts], parameter: str) -> go.Fi
         figure.update_yaxes(title_text=name, row=row, col=1)
     figure.update_yaxes(type="log", exponentformat="power", nticks=5)
     figure.update_yaxes(title_text="cost", row=1, col=1)
+    figure.update_xaxes(dtick=max(1, len(history) // 10))
     figure.update_xaxes(title_text="step", row=3, col=1)
     return styled(figure, 460)
 

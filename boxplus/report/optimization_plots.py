@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.optimization_figures import AFTER, BEFORE, counts_per_bin, error_bins
 from boxplus.report.palette import FAINT, GRID, SERIES
-from boxplus.systems.optimization_summary import IterationFacts
+from boxplus.systems.optimization_summary import PLOTS, IterationFacts
 
-PLOTS = ("before_after.png", "errors.png", "cost.png")
 _DPI = 130
 
 

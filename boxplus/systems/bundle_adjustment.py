@@ -96,9 +96,15 @@ def adjust_bundle(
     Nothing is held: Levenberg-Marquardt stays near the start along the seven directions that move the whole scene.
 
     Raises:
-        InputError: a camera model without a counterpart here; intrinsics that cannot be refined.
+        InputError: a camera model without a counterpart here; no observation; a method without damping.
     """
     config = config if config is not None else BundleAdjustmentConfig()
+    if config.solver.method == "gauss_newton":
+        raise InputError(
+            "a method that damps its steps",
+            "gauss_newton, though images do not tell where the whole scene lies, how it is turned and how large it is",
+            "use levenberg_marquardt or dogleg",
+        )
     begin = time.perf_counter()
     problem = Problem()
     if isinstance(reconstruction, BalProblem):

@@ -14,6 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from boxplus.formats.output import atomic_file
 from boxplus.optimization.solution import Solution
 
+PLOTS = ("before_after.png", "errors.png", "cost.png")
+"""Pictures that the reports put into the folder `plots`."""
+
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")

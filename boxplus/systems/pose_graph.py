@@ -150,6 +150,11 @@ def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "l
     return float(_squared_errors(graph, poses, objective).sum())
 
 
+def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) positions of poses laid out as in a graph [m]; z = 0 in the plane."""
+    return poses[:, 4:] if graph.dimension == 3 else np.column_stack([poses[:, 1:], np.zeros(len(poses))])
+
+
 def _squared_errors(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective) -> NDArray[np.float64]:
     """(m,) what every edge adds to chi2."""
     i, j = graph.edges.T
