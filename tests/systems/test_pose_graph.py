@@ -99,3 +99,39 @@ def test_optima_of_the_shared_graphs(shared_data, name, expected):
     assert result.solution.status == "converged"
     assert round(result.chi2, 4) == expected
     assert chi2(result.graph, result.graph.poses) == result.chi2
+
+
+@pytest.mark.parametrize(
+    ("name", "optimum", "digits"),
+    [
+        ("smallGrid3D", 1025.398, 3),
+        ("parking-garage", 1.26252, 5),
+        ("CSAIL", 31.7037, 4),
+        ("intel", 52.3482, 4),
+        ("MIT", 61.154, 3),
+        ("manhattan", 6431.39, 2),
+        ("cubicle", 717.126, 3),
+        ("sphere2500", 1687.006, 3),
+    ],
+)
+def test_certified_optima_of_se_sync(shared_data, name, optimum, digits):
+    """The global optima of its objective, certified by others (shared/data/graphs/SOURCE.md)."""
+    result = optimize_pose_graph(read_g2o(shared_data / "graphs" / f"{name}.g2o"), PoseGraphConfig(objective="chordal"))
+    assert result.start == "chordal"
+    assert round(result.chi2, digits) == optimum
+
+
+@pytest.mark.parametrize(("cross_block", "expected"), [("auto", 2712.969), ("dropped", 2745.552)])
+def test_cubicle_depends_on_how_its_information_is_read(shared_data, cross_block, expected):
+    graph = read_g2o(shared_data / "graphs" / "cubicle.g2o", cross_block=cross_block)
+    assert len(graph.warnings) == (cross_block == "auto")
+    assert round(optimize_pose_graph(graph).chi2, 3) == expected
+
+
+def test_errors_of_edges_add_up():
+    graph, _ = random_graph(3, noise=0.05)
+    for objective in ("logarithm", "chordal"):
+        result = optimize_pose_graph(graph, PoseGraphConfig(objective=objective))
+        assert (result.errors**2).sum() == pytest.approx(result.chi2, rel=1e-12)
+        assert result.chi2 == pytest.approx(2.0 * result.solution.cost, rel=1e-9)
+        assert (result.errors_start**2).sum() == pytest.approx(result.chi2_start, rel=1e-12)

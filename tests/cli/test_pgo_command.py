@@ -1,0 +1,153 @@
+"""`boxplus pgo`: every format in and out, starts and conventions as told, and how it fails."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from small_problems import loop_graph
+from typer.testing import CliRunner, Result
+
+from boxplus.cli import app
+from boxplus.errors import SingularProblemError
+from boxplus.formats.g2o import read_g2o, write_g2o
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.toro import read_toro, write_toro
+from boxplus.manifolds.se3 import SE3
+from boxplus.systems import pose_graph
+from boxplus.systems.pose_graph import optimize_pose_graph
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["pgo", *map(str, arguments)])
+
+
+def words(result: Result) -> str:
+    """The output without the line breaks of its tables."""
+    return " ".join(result.output.split())
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_g2o_goes_back_to_g2o(tmp_path: Path, dimension: int) -> None:
+    graph = loop_graph(dimension)
+    write_g2o(tmp_path / "loops.g2o", graph)
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    expected = optimize_pose_graph(graph)
+    written = read_g2o(tmp_path / "out" / "optimized.g2o")
+    assert_allclose(written.poses, expected.graph.poses, atol=1e-12)
+    assert_allclose(written.information, graph.information, rtol=1e-14)
+    summary = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert summary["chi2"] == pytest.approx(expected.chi2, rel=1e-9) == pytest.approx(2.0 * summary["cost"], rel=1e-9)
+    assert summary["start"] == expected.start_reason and "cheaper than" in summary["start"]
+    told = words(result)
+    assert f"g2o, {dimension}D; 24 poses, 35 edges" in told and expected.start_reason in told
+    assert "e = Log(Z⁻¹ Ti⁻¹ Tj), Ω in the order rotation, translation; cost ½ Σ of it, ½ χ²" in told
+    assert ("taken for the full rotation vector" in told) == (dimension == 3)
+    ply = (tmp_path / "out" / "graph.ply").read_bytes()
+    assert b"element vertex 24\n" in ply and b"element edge 35\n" in ply
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_toro_goes_back_to_toro(tmp_path: Path, dimension: int) -> None:
+    graph = loop_graph(dimension)
+    write_toro(tmp_path / "loops.graph", graph)
+    result = call(tmp_path / "loops.graph", "-o", tmp_path / "out", "--start", "file", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert f"TORO, {dimension}D" in result.output and "file, as asked for" in result.output
+    written = read_toro(tmp_path / "out" / "optimized.graph")
+    assert len(written.ids) == 24 and not (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("with_poses", [True, False])
+def test_the_page_shows_file_start_and_result(tmp_path: Path, dimension: int, with_poses: bool) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(dimension, with_poses))
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--loss", "cauchy")
+    assert result.exit_code == 0, result.output
+    body = (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
+    assert ('"text":"in the file"' in body) == with_poses
+    for told in ("start: chordal", "Edges with the largest errors", "ρ Cauchy(2.385)", "dense Cholesky"):
+        assert told in body
+    for name in ("before_after.png", "errors.png", "cost.png"):
+        assert (tmp_path / "out" / "plots" / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_the_objective_of_se_sync(tmp_path: Path) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(3))
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--objective", "chordal", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "κ ‖Rj − Ri Rij‖² + τ ‖tj − ti − Ri tij‖², the objective of SE-Sync" in words(result)
+
+
+def test_half_angles_are_converted_and_back(tmp_path: Path) -> None:
+    graph = loop_graph(3)
+    write_g2o(tmp_path / "half.g2o", graph, rotation_error="quaternion")
+    result = call(tmp_path / "half.g2o", "-o", tmp_path / "out", "--rotation-error", "quaternion", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "taken for g2o's half angles" in words(result)
+    written = read_g2o(tmp_path / "out" / "optimized.g2o", rotation_error="quaternion")
+    assert_allclose(written.information, graph.information, rtol=1e-14)
+
+
+def test_pieces_and_poses_without_edges_are_told(tmp_path: Path) -> None:
+    one = loop_graph(3)
+    assert one.poses is not None
+    count = len(one.ids)
+    lonely = PoseGraph(
+        3,
+        np.arange(2 * count + 1),
+        np.vstack([one.poses, SE3.boxplus(one.poses, [0, 0, 0, 5.0, 0, 0]), one.poses[:1]]),
+        np.vstack([one.edges, one.edges + count]),
+        np.vstack([one.measurements, one.measurements]),
+        np.concatenate([one.information, one.information]),
+        np.array([5]),
+    )
+    write_g2o(tmp_path / "two.g2o", lonely)
+    result = call(tmp_path / "two.g2o", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    told = words(result)
+    assert f"warning: the graph falls into 3 pieces without edges between them; poses {count}, {2 * count}, the first" in told
+    assert f"warning: 1 poses have no edge and stay where they are: {2 * count}" in told
+    assert "1 poses have no edge" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_singular_problem_explains_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*arguments: object, **options: object) -> None:
+        raise SingularProblemError("the problem does not determine its variables: rotation z of poses[3] can move freely")
+
+    monkeypatch.setattr(pose_graph, "optimize_pose_graph", singular)
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stderr == "error: the problem does not determine its variables: rotation z of poses[3] can move freely\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "told"),
+    [
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n", ["--start", "file"], "poses in the file to start from"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", [], "graph.g2o, line 1"),
+        ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_XY 0 1\n", [], "graph.g2o, line 2"),
+        ("EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1\n", [], "positive semi-definite information matrix"),
+        ("", [], "at least one edge"),
+    ],
+)
+def test_bad_input_is_one_paragraph(tmp_path: Path, text: str, arguments: list[str], told: str) -> None:
+    (tmp_path / "graph.g2o").write_text(text)
+    result = call(tmp_path / "graph.g2o", "-o", tmp_path / "out", *arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: expected ") and result.stderr.count("\n") == 1
+    assert told in result.stderr
+
+
+def test_unknown_lines_are_left_out_on_request_and_counted(tmp_path: Path) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    with (tmp_path / "loops.g2o").open("a") as file:
+        file.write("EDGE_XY 0 1 2 3\n")
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--ignore-unknown", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "warning: 1 lines EDGE_XY were left out" in words(result)
