@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.strategy import Step, Strategy
+from boxplus.optimization.strategy import Step, Strategy, inner
 
 _LEAST_DIAGONAL = 1e-6
 _LEAST_RADIUS = 1e-12
@@ -79,7 +79,7 @@ class _Legs:
         if length >= radius:
             return radius / length, 0.0
         leg = newton - cauchy
-        a, b, c = float(leg @ leg), float(cauchy @ leg), length * length - radius * radius
+        a, b, c = inner(leg, leg), inner(cauchy, leg), length * length - radius * radius
         # Of the two forms of the root, the one without cancellation.
         root = math.sqrt(max(b * b - a * c, 0.0))
         share = -c / (b + root) if b > 0.0 else (root - b) / a
@@ -100,7 +100,7 @@ def _legs(problem: LeastSquares) -> _Legs | None:
             share = max(_FIRST_REGULARIZATION, 10.0 * share)
     else:
         return None
-    length = -float(gradient @ descent) / along if along > 0.0 else 1.0
+    length = -inner(gradient, descent) / along if along > 0.0 else 1.0
     cauchy = length * descent
     # H δ_n = −g − share·diag(H) δ_n spares further products with H.
     pulled = -gradient - share * squared * newton
@@ -108,6 +108,6 @@ def _legs(problem: LeastSquares) -> _Legs | None:
         scale=np.sqrt(squared),
         cauchy=cauchy,
         newton=newton,
-        slope=(float(gradient @ cauchy), float(gradient @ newton)),
-        curvature=(length * length * along, float(cauchy @ pulled), float(newton @ pulled)),
+        slope=(inner(gradient, cauchy), inner(gradient, newton)),
+        curvature=(length * length * along, inner(cauchy, pulled), inner(newton, pulled)),
     )

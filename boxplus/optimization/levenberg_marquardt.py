@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.strategy import Step, Strategy
+from boxplus.optimization.strategy import Step, Strategy, inner
 
 # Entries of diag(H) beyond these do not scale the damping: a direction without information is damped all the same.
 _LEAST_DIAGONAL, _LARGEST_DIAGONAL = 1e-6, 1e32
@@ -39,7 +39,7 @@ class LevenbergMarquardt(Strategy):
             except NotPositiveDefinite:
                 self._grow()
                 continue
-            return Step(delta, 0.5 * float(delta @ (D * delta - problem.system.gradient)))
+            return Step(delta, 0.5 * inner(delta, D * delta - problem.system.gradient))
         return None
 
     def _scale(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
