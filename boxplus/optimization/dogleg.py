@@ -41,7 +41,7 @@ class Dogleg(Strategy):
         legs = self._legs
         a, b = legs.within(self.parameter)
         delta = a * legs.cauchy + b * legs.newton
-        self._length = float(np.linalg.norm(delta * legs.scale))
+        self._length = _length(delta * legs.scale)
         # The model −gᵀδ − ½ δᵀHδ, from the products of the two legs.
         slope = a * legs.slope[0] + b * legs.slope[1]
         bend = a * a * legs.curvature[0] + 2.0 * a * b * legs.curvature[1] + b * b * legs.curvature[2]
@@ -73,9 +73,9 @@ class _Legs:
     def within(self, radius: float) -> tuple[float, float]:
         """Shares of δ_c and δ_n at the point of 0 → δ_c → δ_n on the border of the region, or at its end."""
         cauchy, newton = self.cauchy * self.scale, self.newton * self.scale
-        if float(np.linalg.norm(newton)) <= radius:
+        if _length(newton) <= radius:
             return 0.0, 1.0
-        length = float(np.linalg.norm(cauchy))
+        length = _length(cauchy)
         if length >= radius:
             return radius / length, 0.0
         leg = newton - cauchy
@@ -84,6 +84,10 @@ class _Legs:
         root = math.sqrt(max(b * b - a * c, 0.0))
         share = -c / (b + root) if b > 0.0 else (root - b) / a
         return 1.0 - share, share
+
+
+def _length(vector: NDArray[np.float64]) -> float:
+    return math.sqrt(inner(vector, vector))
 
 
 def _legs(problem: LeastSquares) -> _Legs | None:
