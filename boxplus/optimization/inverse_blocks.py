@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.dense_kernels import Buffer, update
+from boxplus.optimization.dense_kernels import BLOCK, Buffer, update
 from boxplus.optimization.multifrontal import Indices, Table
 from boxplus.optimization.supernodes import DIAGONAL, STORED, TRANSPOSED, Fronts
 from boxplus.optimization.triangular_solve import forward
@@ -75,6 +75,19 @@ def _hand_to_child(child: Table, last: np.uint64, runs: Table, z: Buffer, at: np
 
 
 @kernel
+def _product(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint64, lda: np.uint64, b: Buffer, b_at: np.uint64,
+             ldb: np.uint64, rows: np.uint64, columns: np.uint64, depth: np.uint64, lower: np.uint64,
+             accumulate: np.uint64) -> None:  # fmt: skip
+    """`update` in pieces of the depth whose part of A stays in the cache."""
+    k = np.uint64(0)
+    while k < depth:
+        piece = min(depth - k, BLOCK)
+        add = max(accumulate, min(k, _ONE))
+        update(c, c_at, ldc, a, a_at + k * lda, lda, b, b_at + k * ldb, ldb, rows, columns, piece, lower, add)
+        k += piece
+
+
+@kernel
 def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffer, inverse: Buffer, stack: Buffer, z: Buffer,
                      m: Buffer, negative: Buffer, w: Buffer, z_transposed: Buffer) -> None:  # fmt: skip
     """The inverse on the pattern of the factor, in panels like those of the factor.
@@ -96,13 +109,13 @@ def selected_inverse(table: Table, children: Indices, runs: Table, factor: Buffe
             p_at, p_ld, p_below, p_below_ld = p["panel_at"], p["panel_ld"], p["update_at"], p["update_ld"]
             _hand_to_child(front, following["run_start"], runs, z, p_at, p_ld, p["width"], stack, p_below, p_below_ld)
         _invert_triangle(factor, at, ld, inverse, front["column"], width, m, negative)
-        update(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, _ONE, _ZERO)
+        _product(z, at, ld, m, _ZERO, width, negative, _ZERO, width, width, width, width, _ONE, _ZERO)
         if below > _ZERO:
             _transpose(stack, below_at, below_ld, below, below, stack, below_at, below_ld, _ONE)
-            update(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, _ZERO, _ZERO)
-            update(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, _ZERO, _ZERO)
+            _product(w, _ZERO, width, negative, _ZERO, width, factor, at + width, ld, width, below, width, _ZERO, _ZERO)
+            _product(z, at + width, ld, stack, below_at, below_ld, w, _ZERO, width, below, width, below, _ZERO, _ZERO)
             _transpose(z, at + width, ld, below, width, z_transposed, _ZERO, width, _ZERO)
-            update(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, _ONE, _ONE)
+            _product(z, at, ld, w, _ZERO, width, z_transposed, _ZERO, width, width, width, below, _ONE, _ONE)
         if not front["eager"]:
             for c in range(front["child_start"], following["child_start"]):
                 child, last = table[children[c]], table[children[c] + _ONE]["run_start"]

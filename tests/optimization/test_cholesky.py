@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
 
 from boxplus.errors import InputError
+from boxplus.formats.g2o import read_g2o
 from boxplus.optimization import numeric_factor, subtrees
 from boxplus.optimization.block_matrix import BlockPattern
 from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
@@ -268,3 +270,30 @@ def test_fronts_with_many_children(star: str, threads: int, monkeypatch: pytest.
     inverse, start, every = np.linalg.inv(dense), pattern.start, np.arange(len(pattern.sizes))
     for k, block in enumerate(cholesky.inverse_blocks(every, every)):
         np.testing.assert_allclose(block, inverse[start[k] : start[k + 1], start[k] : start[k + 1]], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("graph", ["tinyGrid3D", "smallGrid3D", "intel", "MIT", "manhattan", "parking-garage"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_agrees_with_superlu_on_pose_graphs(shared_data: Path, graph: str, threads: int) -> None:
+    edges = read_g2o(shared_data / "graphs" / f"{graph}.g2o").edges
+    rng = np.random.default_rng(0)
+    i, j = edges.T
+    dof = 3 if graph in ("intel", "MIT", "manhattan") else 6
+    pattern, index = BlockPattern.from_pairs([dof] * (edges.max() + 1), np.concatenate([i, j, i]), np.concatenate([i, j, j]))
+    first, second = rng.normal(size=(2, len(edges), dof, dof))
+    squares = [first.transpose(0, 2, 1) @ first, second.transpose(0, 2, 1) @ second, first.transpose(0, 2, 1) @ second]
+    blocks = np.concatenate(squares)
+    blocks[index.transposed] = blocks[index.transposed].transpose(0, 2, 1)
+    values = np.zeros((len(pattern.row), dof, dof))
+    np.add.at(values, index.block, blocks)
+    values[pattern.col_start[:-1]] += np.eye(dof)
+    cholesky = SparseCholesky(pattern, threads=threads)
+    cholesky.factorize(values.ravel())
+    matrix = pattern.to_scipy(values.ravel())
+    oracle, b = splu(matrix), rng.normal(size=(matrix.shape[0], 3))
+    np.testing.assert_allclose(cholesky.solve(b), oracle.solve(b), rtol=1e-8, atol=1e-10)
+    every = np.arange(0, len(pattern.sizes), max(1, len(pattern.sizes) // 50))
+    for k, block in zip(every, cholesky.inverse_blocks(every, every), strict=True):
+        unit = np.zeros((matrix.shape[0], dof))
+        unit[dof * k : dof * (k + 1)] = np.eye(dof)
+        np.testing.assert_allclose(block, oracle.solve(unit)[dof * k : dof * (k + 1)], rtol=1e-7, atol=1e-10)
