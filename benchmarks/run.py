@@ -85,6 +85,10 @@ BENCHMARKS = {
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
     "memory": Benchmark(("--minutes", "3")),
     "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),
+    "graphs": Benchmark(("--rounds", "1", "--only", "intel", "MIT")),
+    "bundle": Benchmark(("--rounds", "1")),
+    "imu": Benchmark(("--rounds", "2")),
+    "residuals": Benchmark(("--edges", "1000", "--rounds", "1")),
 }
 
 
