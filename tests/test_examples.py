@@ -12,12 +12,14 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"
 
 # What the output must say for the example to have shown what it is about.
 SHOWS = {
+    "bundle_adjustment": "before, 0.51 px after",
     "dynamic_kdtree": "after delete_box: 24668 (332 removed)",
     "evaluate_trajectory": "ATE rmse: 1.7",
     "least_squares_problem": "every fifth is wrong: [0, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55]",
     "line_bundle_adjustment": "after : end points are 0.2",
     "odometry_from_arrays": "position error:",
     "own_residual": "hand_eye_batch: converged after",
+    "pose_graph": "largest error: edge 250, 198",
     "read_recording": "19 scans, 401 IMU samples; left out: nothing",
 }
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from small_problems import write_small_files
 
 from boxplus.recordings.options import RecordingOptions
 from boxplus.simulation import simulate, write_recording
@@ -19,7 +20,10 @@ from boxplus.systems.run_config import MapConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PYTHON_PAGES = [ROOT / "README.md", ROOT / "docs" / "library_use.md", ROOT / "docs" / "least_squares.md"]
+PYTHON_PAGES = [
+    ROOT / "README.md",
+    *(ROOT / "docs" / f"{name}.md" for name in ("library_use", "least_squares", "bundle_adjustment", "pose_graphs")),
+]
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -32,8 +36,9 @@ COMMANDS = [line for block in blocks(ROOT / "README.md", "sh") for line in block
 
 @pytest.fixture(scope="session")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the recording that the README speaks of: flight.bag and flight.gt.tum."""
+    """A folder with the files that the README speaks of: flight.bag, flight.gt.tum, scene.txt.bz2 and loops.g2o."""
     folder = tmp_path_factory.mktemp("flight")
+    write_small_files(folder)
     write_recording(simulate("walk", duration_s=6.0), folder / "flight", "ros1")
     return folder
 
@@ -92,15 +97,17 @@ def test_python_of_the_pages_runs(page: Path, workspace: Path) -> None:
     run([sys.executable, "-W", "error", "-c", "\n".join(code)], workspace)
 
 
-def test_commands_for_a_recording_run(workspace: Path) -> None:
+def test_commands_of_the_readme_run(workspace: Path) -> None:
     commands = [shlex.split(command) for command in COMMANDS if not command.startswith("make ")]
-    assert {command[1] for command in commands} == {"inspect", "lio", "eval"}
+    assert {command[1] for command in commands} == {"inspect", "lio", "eval", "ba", "pgo"}
     for program, *arguments in commands:
         assert program == ".venv/bin/boxplus"
         run([sys.executable, "-c", "from boxplus.cli import main; main()", *arguments], workspace)
     assert {"report.html", "trajectory.tum", "map.ply", "config.yaml", "run.json"} <= {
         path.name for path in (workspace / "flight").iterdir()
     }
+    for folder, result in (("scene_boxplus", "adjusted.txt.bz2"), ("loops_boxplus", "optimized.g2o")):
+        assert {"report.html", "run.json", result} <= {path.name for path in (workspace / folder).iterdir()}
 
 
 @pytest.mark.parametrize("page", [pytest.param(page, id=str(page.relative_to(ROOT))) for page in PAGES])

@@ -110,7 +110,7 @@ def optimize_pose_graph(
     return PoseGraphResult(
         graph=replace(graph, poses=solution[poses]),
         start=chosen,
-        start_reason=_reason(graph, config.start, chosen, costs),
+        start_reason=_reason(config.start, chosen, costs),
         poses_start=candidates[chosen],
         start_costs=costs,
         chi2_start=float(squared_start.sum()),
@@ -189,13 +189,13 @@ def _starts(graph: PoseGraph, wanted: Literal["auto", "file", "spanning_tree", "
     return starts
 
 
-def _reason(graph: PoseGraph, wanted: str, chosen: Start, costs: dict[Start, float]) -> str:
+def _reason(wanted: str, chosen: Start, costs: dict[Start, float]) -> str:
     """Why a start was taken."""
     name = chosen.replace("_", " ")
     if wanted != "auto":
         return f"{name}, as asked for; cost {costs[chosen]:.6g}"
     if len(costs) == 1:
-        return f"{name}, as {graph.source} has no poses; cost {costs[chosen]:.6g}"
+        return f"{name}, as the graph has no poses of its own; cost {costs[chosen]:.6g}"
     others = ", ".join(f"{cost:.6g} ({other})" for other, cost in costs.items() if other != chosen)
     return f"{name}, with cost {costs[chosen]:.6g} cheaper than {others}"
 
