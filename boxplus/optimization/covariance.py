@@ -1,6 +1,12 @@
-"""Covariance of variables at a solution: blocks of H⁻¹, in their tangents."""
+"""Covariance of variables at a solution: blocks of H⁻¹, in their tangents.
+
+Where H is singular, H⁻¹ does not exist, but the blocks of variables that no unobservable direction moves do: they are the same in
+every generalised inverse of H (Rao and Mitra 1971). Holding one tangent for each direction gives one of these.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,31 +14,84 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares, Values
-from boxplus.optimization.singularity import explain_singularity, null_space
+from boxplus.optimization.null_space import NullSpace, find_null_space
+from boxplus.optimization.singularity import explain_singularity
+from boxplus.optimization.variable_names import variable_names
 from boxplus.optimization.variables import VariableRows
 
 
-def covariance_blocks(problem: LeastSquares, values: Values, first: VariableRows, second: VariableRows) -> NDArray[np.float64]:
-    """Blocks (k, dof, dof) of H⁻¹ at `values` for pairs of variables; zero where one of them is fixed.
+class Covariances:
+    """H⁻¹ of a problem at one point. The first question linearises, looks for unobservable directions and factorises.
 
-    Raises:
-        InputError: `first` and `second` differ in length.
-        SingularProblemError: H has a null space: the covariance of what it touches is infinite.
+    Args:
+        problem: may have been moved elsewhere since; it is then brought back.
+        values: the point.
     """
-    if len(first) != len(second):
-        raise InputError("as many second variables as first ones", f"{len(first)} and {len(second)}", "pair them")
-    if problem.values is not values:
-        problem.start(values)
-    try:
-        directions, _ = null_space(problem)
-        if directions.shape[1]:
-            raise SingularProblemError(explain_singularity(problem))
-        problem.system.factorize(None)
-    except NotPositiveDefinite as error:
-        raise SingularProblemError(explain_singularity(problem, error)) from error
-    i, j = problem.layout.numbers(first), problem.layout.numbers(second)
-    blocks = np.zeros((len(first), first.block.manifold.dof, second.block.manifold.dof))
-    free = np.flatnonzero((i >= 0) & (j >= 0))
-    for k, block in zip(free, problem.system.inverse_blocks(i[free], j[free]), strict=True):
-        blocks[k] = block
-    return blocks
+
+    def __init__(self, problem: LeastSquares, values: Values) -> None:
+        self._problem, self._values = problem, values
+        self._space: NullSpace | None = None
+        self._is_factorized = False
+
+    def blocks(self, first: VariableRows, second: VariableRows) -> NDArray[np.float64]:
+        """Blocks (k, dof of first, dof of second) of H⁻¹ for pairs of variables; zero where one of them is fixed.
+
+        Raises:
+            InputError: `first` and `second` differ in length.
+            SingularProblemError: an unobservable direction moves one of them.
+        """
+        if len(first) != len(second):
+            raise InputError("as many second variables as first ones", f"{len(first)} and {len(second)}", "pair them")
+        i, j = self._problem.layout.numbers(first), self._problem.layout.numbers(second)
+        free = np.flatnonzero((i >= 0) & (j >= 0))
+        self._prepare(np.concatenate([i[free], j[free]]))
+        blocks = np.zeros((len(first), first.block.manifold.dof, second.block.manifold.dof))
+        for k, block in zip(free, self._problem.system.inverse_blocks(i[free], j[free]), strict=True):
+            blocks[k] = block
+        return blocks
+
+    def joint(self, selected: Sequence[VariableRows]) -> NDArray[np.float64]:
+        """The covariance (D, D) of all selected variables together, tangent after tangent in the order given.
+
+        Raises:
+            InputError: nothing is selected.
+            SingularProblemError: an unobservable direction moves one of them.
+        """
+        if not selected:
+            raise InputError("at least one selection of variables", "none", "give rows of a block, such as poses[[0, 3]]")
+        number = np.concatenate([self._problem.layout.numbers(rows) for rows in selected])
+        dof = np.concatenate([np.full(len(rows), rows.block.manifold.dof) for rows in selected])
+        start = np.concatenate([[0], np.cumsum(dof)])
+        free = np.flatnonzero(number >= 0)
+        self._prepare(number[free])
+        matrix = np.zeros((int(start[-1]), int(start[-1])))
+        a, b = (free[k] for k in np.tril_indices(len(free)))
+        for p, q, block in zip(a, b, self._problem.system.inverse_blocks(number[a], number[b]), strict=True):
+            matrix[start[p] : start[p + 1], start[q] : start[q + 1]] = block
+            matrix[start[q] : start[q + 1], start[p] : start[p + 1]] = block.T
+        return matrix
+
+    def _prepare(self, wanted: NDArray[np.int64]) -> None:
+        """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""
+        problem = self._problem
+        if problem.values is not self._values:
+            problem.start(self._values)
+            self._is_factorized = False
+        if self._space is None:
+            self._space = find_null_space(problem)
+            self._is_factorized = False
+        moved = np.unique(wanted[self._space.moves[wanted]])
+        if len(moved):
+            raise SingularProblemError(
+                f"no covariance of {variable_names(problem.layout, moved)}: " + explain_singularity(problem, space=self._space)
+            )
+        if self._is_factorized:
+            return
+        held = np.zeros(problem.layout.dof)
+        own = problem.system.diagonal[self._space.pivots]
+        held[self._space.pivots] = np.where(own > 0.0, own, 1.0)
+        try:
+            problem.system.factorize(held if len(self._space.pivots) else None)
+        except NotPositiveDefinite as error:
+            raise SingularProblemError(explain_singularity(problem, error, self._space)) from error
+        self._is_factorized = True

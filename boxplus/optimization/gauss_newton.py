@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.strategy import Step, Strategy
+from boxplus.optimization.singularity import refuse_free_step
+from boxplus.optimization.strategy import Step, Strategy, inner
 
 _HALVINGS = 20
 
@@ -21,15 +22,21 @@ class GaussNewton(Strategy):
         self._full: NDArray[np.float64] | None = None
 
     def propose(self, problem: LeastSquares) -> Step | None:
-        """See `Strategy.propose`."""
+        """See `Strategy.propose`.
+
+        Raises:
+            SingularProblemError: the step goes where nothing is measured.
+        """
         if self._full is None:
-            self._full = problem.solve(None)
+            full = problem.solve(None)
+            refuse_free_step(problem, full)
+            self._full = full
             self.parameter = 1.0
         if self.parameter < 0.5**_HALVINGS:
             return None
         a = self.parameter
         # The model falls by −a gᵀδ − a²/2 δᵀHδ, and Hδ = −g.
-        slope = float(problem.system.gradient @ self._full)
+        slope = inner(problem.system.gradient, self._full)
         return Step(a * self._full, -slope * (a - 0.5 * a * a))
 
     def judge(self, ratio: float | None) -> bool:

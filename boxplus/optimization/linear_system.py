@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
+from boxplus.optimization.multifrontal import SINGULAR
 from boxplus.optimization.normal_equations import NormalEquations
 
 
@@ -71,9 +72,12 @@ class DenseSystem(LinearSystem):
 
         matrix = self._dense if damping is None else self._dense + np.diag(damping)
         self._factor, info = dpotrf(matrix, lower=1, clean=1)
-        if info > 0:
-            block = int(np.searchsorted(self._layout.start, info - 1, side="right")) - 1
-            raise NotPositiveDefinite(block, info - 1 - int(self._layout.start[block]), float(self._factor[info - 1, info - 1]))
+        pivots = np.diag(self._factor) ** 2
+        rounded = np.flatnonzero(pivots <= SINGULAR * np.diag(matrix))
+        row = info - 1 if info > 0 else int(rounded[0]) if len(rounded) else -1
+        if row >= 0:
+            block = int(np.searchsorted(self._layout.start, row, side="right")) - 1
+            raise NotPositiveDefinite(block, row - int(self._layout.start[block]), float(pivots[row]))
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `LinearSystem.solve`."""

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.covariance import covariance_blocks
+from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.variables import VariableRows, Variables
 
@@ -66,6 +66,10 @@ class Solution:
     notes: tuple[str, ...]
     timing_s: dict[str, float]
     _problem: LeastSquares = field(repr=False)
+    _covariances: Covariances = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_covariances", Covariances(self._problem, self.values))
 
     def __getitem__(self, selected: Variables | VariableRows) -> NDArray[np.float64]:
         """Values (n, size) of a block, or (k, size) of rows of it."""
@@ -78,20 +82,40 @@ class Solution:
         """Steps tried."""
         return self.history[-1].number
 
-    def covariance(self, first: VariableRows, second: VariableRows | None = None) -> NDArray[np.float64]:
+    def covariance(self, first: VariableRows | Variables, second: VariableRows | Variables | None = None) -> NDArray[np.float64]:
         """Covariance of variables in their tangents at the solution, in the units of the tangents.
+
+        The first call costs about two factorisations, many variables together about three more; what was computed is kept.
 
         Args:
             first: k variables.
             second: k variables, for the cross-covariances of first[n] and second[n]; None for `first` itself.
 
         Returns:
-            (k, dof, dof) blocks of H⁻¹. A fixed variable has covariance zero: it is known.
+            (k, dof, dof) blocks of H⁻¹, the losses' weights included. A fixed variable has covariance zero: it is known.
 
         Raises:
-            SingularProblemError: a direction of the problem is unobservable.
+            SingularProblemError: an unobservable direction of the problem moves one of these variables.
         """
-        return covariance_blocks(self._problem, self.values, first, first if second is None else second)
+        rows = _rows(first)
+        return self._covariances.blocks(rows, rows if second is None else _rows(second))
+
+    def joint_covariance(self, *selected: VariableRows | Variables) -> NDArray[np.float64]:
+        """Covariance (D, D) of all selected variables together, their tangents one after the other in the order given.
+
+        Raises:
+            InputError, SingularProblemError: as for `covariance`.
+        """
+        return self._covariances.joint([_rows(rows) for rows in selected])
+
+    def standard_deviations(self, selected: VariableRows | Variables) -> NDArray[np.float64]:
+        """Square roots (k, dof) of the diagonals of `covariance`, in the units of the tangents; zero where fixed.
+
+        Raises:
+            SingularProblemError: as for `covariance`.
+        """
+        diagonal = np.einsum("kii->ki", self.covariance(selected))
+        return np.asarray(np.sqrt(diagonal))
 
     def summary(self) -> str:
         """A few lines for a terminal or a log."""
@@ -103,3 +127,7 @@ class Solution:
         ]
         lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
         return "\n".join([*lines, *self.notes])
+
+
+def _rows(selected: VariableRows | Variables) -> VariableRows:
+    return selected[:] if isinstance(selected, Variables) else selected
