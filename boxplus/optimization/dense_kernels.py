@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.optimization.vector_tiles import (
-    LANES,
+    TALL_FROM,
     TILE_ROWS,
     factor_1,
     factor_1_short,
@@ -35,7 +35,7 @@ from boxplus.optimization.vector_tiles import (
 Buffer = NDArray[np.float64]
 
 _ONE, _THREE, _SIX = np.uint64(1), np.uint64(3), np.uint64(6)
-_SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
+_TALL_FROM, _TALL = np.uint64(TALL_FROM), np.uint64(TILE_ROWS)
 BLOCK = np.uint64(96)  # columns that are eliminated together
 _ROWS = np.uint64(480)  # rows that are updated together: with so many columns they stay in the second-level cache
 
@@ -58,7 +58,7 @@ def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint6
             if left >= _SIX:
                 while i < bottom:
                     count, at = min(bottom - i, _TALL), c_at + i + j * ldc
-                    if count > _SHORT:
+                    if count >= _TALL_FROM:
                         update_6(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                     else:
                         update_6_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
@@ -67,7 +67,7 @@ def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint6
             elif left >= _THREE:
                 while i < bottom:
                     count, at = min(bottom - i, _TALL), c_at + i + j * ldc
-                    if count > _SHORT:
+                    if count >= _TALL_FROM:
                         update_3(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                     else:
                         update_3_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
@@ -76,7 +76,7 @@ def update(c: Buffer, c_at: np.uint64, ldc: np.uint64, a: Buffer, a_at: np.uint6
             else:
                 while i < bottom:
                     count, at = min(bottom - i, _TALL), c_at + i + j * ldc
-                    if count > _SHORT:
+                    if count >= _TALL_FROM:
                         update_1(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
                     else:
                         update_1_short(c, at, ldc, a, a_at + i, lda, b, b_at + j, ldb, depth, count, accumulate)
@@ -108,39 +108,39 @@ def factor_block(p: Buffer, at: np.uint64, ld: np.uint64, rows: np.uint64, width
         here = b_at + j * ld
         i = j + count
         if left >= _SIX:
-            if count > _SHORT:
+            if count >= _TALL_FROM:
                 factor_6(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             else:
                 factor_6_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             while i < rows:
                 count, here = min(rows - i, _TALL), at + i + j * ld
-                if count > _SHORT:
+                if count >= _TALL_FROM:
                     solve_6(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
                 else:
                     solve_6_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
                 i += count
             step = _SIX
         elif left >= _THREE:
-            if count > _SHORT:
+            if count >= _TALL_FROM:
                 factor_3(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             else:
                 factor_3_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             while i < rows:
                 count, here = min(rows - i, _TALL), at + i + j * ld
-                if count > _SHORT:
+                if count >= _TALL_FROM:
                     solve_3(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
                 else:
                     solve_3_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
                 i += count
             step = _THREE
         else:
-            if count > _SHORT:
+            if count >= _TALL_FROM:
                 factor_1(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             else:
                 factor_1_short(p, here, ld, p, b_at, ld, p, b_at, ld, j, count, inverse, k, pivots)
             while i < rows:
                 count, here = min(rows - i, _TALL), at + i + j * ld
-                if count > _SHORT:
+                if count >= _TALL_FROM:
                     solve_1(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)
                 else:
                     solve_1_short(p, here, ld, p, at + i, ld, p, b_at, ld, j, count, inverse, k)

@@ -12,7 +12,7 @@ from boxplus._jit import kernel
 from boxplus.optimization.dense_kernels import Buffer, update
 from boxplus.optimization.multifrontal import Indices, Table
 from boxplus.optimization.vector_tiles import (
-    LANES,
+    TALL_FROM,
     TILE_ROWS,
     dots_1,
     dots_3,
@@ -34,7 +34,7 @@ from boxplus.optimization.vector_tiles import (
 )
 
 _ZERO, _ONE, _THREE, _SIX = np.uint64(0), np.uint64(1), np.uint64(3), np.uint64(6)
-_SHORT, _TALL = np.uint64(LANES), np.uint64(TILE_ROWS)
+_TALL_FROM, _TALL = np.uint64(TALL_FROM), np.uint64(TILE_ROWS)
 
 
 @kernel
@@ -48,16 +48,16 @@ def forward(factor: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64, inve
             count, a_at = min(sides - s, _TALL), x_at + s
             here = a_at + j * sides
             if left >= _SIX:
-                if count > _SHORT:
+                if count >= _TALL_FROM:
                     solve_6(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
                 else:
                     solve_6_short(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
             elif left >= _THREE:
-                if count > _SHORT:
+                if count >= _TALL_FROM:
                     solve_3(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
                 else:
                     solve_3_short(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
-            elif count > _SHORT:
+            elif count >= _TALL_FROM:
                 solve_1(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
             else:
                 solve_1_short(x, here, sides, x, a_at, sides, factor, b_at, ld, j, count, inverse, k)
@@ -73,16 +73,16 @@ def _subtract_transposed(x: Buffer, x_at: np.uint64, sides: np.uint64, y: Buffer
     while s < sides:
         count, here, there = min(sides - s, _TALL), x_at + s, y_at + s
         if columns == _SIX:
-            if count > _SHORT:
+            if count >= _TALL_FROM:
                 transposed_6(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
             else:
                 transposed_6_short(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
         elif columns == _THREE:
-            if count > _SHORT:
+            if count >= _TALL_FROM:
                 transposed_3(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
             else:
                 transposed_3_short(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
-        elif count > _SHORT:
+        elif count >= _TALL_FROM:
             transposed_1(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
         else:
             transposed_1_short(x, here, sides, y, there, sides, factor, at, ld, depth, count, _ONE)
@@ -158,7 +158,7 @@ def _subtract(y: Buffer, y_at: np.uint64, factor: Buffer, at: np.uint64, ld: np.
     i = np.uint64(0)
     while i < rows:
         count = min(rows - i, _TALL)
-        if count > _SHORT:
+        if count >= _TALL_FROM:
             update_1(y, y_at + i, _ONE, factor, at + i, ld, x, x_at, _ONE, depth, count, accumulate)
         else:
             update_1_short(y, y_at + i, _ONE, factor, at + i, ld, x, x_at, _ONE, depth, count, accumulate)

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 LANES = 8  # rows per vector; where registers are narrower LLVM splits it
 TILE_VECTORS = 2 if binding.get_host_cpu_features().get("avx512f", False) else 1
 TILE_ROWS = LANES * TILE_VECTORS
+TALL_FROM = LANES + 1 if TILE_VECTORS > 1 else LANES  # rows from which on the tall tile is used
 
 _DOUBLE = ir.DoubleType()
 _INDEX = ir.IntType(64)
@@ -45,8 +46,9 @@ def _function(module: Any, kind: Any, name: str) -> Any:
 class _Emitter:
     """Vector loads, stores and arithmetic at `pointer + index` within the function that is being built."""
 
-    def __init__(self, builder: Any, valid_rows: Any, vectors: int) -> None:
+    def __init__(self, builder: Any, valid_rows: Any, vectors: int, *, masked: bool = True) -> None:
         self.builder = builder
+        self.full = vectors - 1 if masked else vectors
         self.vectors = vectors
         module = builder.module
         pointer = ir.PointerType(_VECTOR)
@@ -77,7 +79,7 @@ class _Emitter:
         found = []
         for v in range(self.vectors):
             place = self.builder.bitcast(self.address(pointer, _INDEX(LANES * v)), ir.PointerType(_VECTOR))
-            if v < self.vectors - 1:
+            if v < self.full:
                 found.append(self.builder.load(place, align=8))
             else:
                 found.append(self.builder.call(self._load, [place, ir.IntType(32)(8), self._last_rows, self.zero]))
@@ -86,7 +88,7 @@ class _Emitter:
     def store(self, values: list[Any], pointer: Any) -> None:
         for v, value in enumerate(values):
             place = self.builder.bitcast(self.address(pointer, _INDEX(LANES * v)), ir.PointerType(_VECTOR))
-            if v < self.vectors - 1:
+            if v < self.full:
                 self.builder.store(value, place, align=8)
             else:
                 self.builder.call(self._store, [value, place, ir.IntType(32)(8), self._last_rows])
@@ -150,9 +152,10 @@ def _pointer(context: Any, builder: Any, array: Any, offset: Any) -> Any:
 class _Tile:
     """What the tiles begin with: C, and the product A Bᵀ."""
 
-    def __init__(self, context: Any, builder: Any, args: Any, columns: int, vectors: int, *, transposed: bool = False) -> None:
+    def __init__(self, context: Any, builder: Any, args: Any, shape: tuple[int, int, bool], *, transposed: bool = False) -> None:
+        columns, vectors, masked = shape
         c, c_at, ldc, a, a_at, lda, b, b_at, ldb, depth, rows = args[:11]
-        self.emit = _Emitter(builder, rows, vectors)
+        self.emit = _Emitter(builder, rows, vectors, masked=masked)
         start, b_pointer = _pointer(context, builder, c, c_at), _pointer(context, builder, b, b_at)
         a_pointer = _pointer(context, builder, a, a_at)
         self.products = self.emit.product(a_pointer, lda, b_pointer, ldb, depth, columns, transposed=transposed)
@@ -160,9 +163,9 @@ class _Tile:
         self.places = [self.emit.address(start, builder.mul(ldc, _INDEX(k))) for k in range(columns)]
 
 
-def _compiled_update(columns: int, vectors: int, *, transposed: bool) -> Callable[..., None]:
+def _compiled_update(shape: tuple[int, int, bool], *, transposed: bool) -> Callable[..., None]:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        tile = _Tile(context, builder, args, columns, vectors, transposed=transposed)
+        tile = _Tile(context, builder, args, shape, transposed=transposed)
         emit = tile.emit
         for place, products in zip(tile.places, tile.products, strict=True):
             entry, add, store = builder.block, builder.append_basic_block("accumulate"), builder.append_basic_block("store")
@@ -171,7 +174,7 @@ def _compiled_update(columns: int, vectors: int, *, transposed: bool) -> Callabl
             old = emit.load(place)
             builder.branch(store)
             builder.position_at_end(store)
-            starts = [builder.phi(_VECTOR) for _ in range(vectors)]
+            starts = [builder.phi(_VECTOR) for _ in old]
             for start, value in zip(starts, old, strict=True):
                 start.add_incoming(emit.zero, entry)
                 start.add_incoming(value, add)
@@ -186,10 +189,10 @@ def _compiled_update(columns: int, vectors: int, *, transposed: bool) -> Callabl
     return tile  # type: ignore[no-any-return]
 
 
-def _compiled_solve(columns: int, vectors: int, *, factor: bool) -> Callable[..., None]:
+def _compiled_solve(shape: tuple[int, int, bool], *, factor: bool) -> Callable[..., None]:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        tile = _Tile(context, builder, args, columns, vectors)
-        emit = tile.emit
+        tile = _Tile(context, builder, args, shape)
+        emit, columns = tile.emit, shape[0]
         inverse, pivots = (_pointer(context, builder, args[k], args[12]) for k in (11, 13 if factor else 11))
         root = _function(builder.module, ir.FunctionType(_DOUBLE, [_DOUBLE]), "llvm.sqrt.f64")
         x = [
@@ -338,17 +341,20 @@ def _plain_dots(columns: int) -> Callable[..., None]:
 
 
 def _tiles(kind: Literal["update", "update_transposed", "solve", "factor"]) -> list[Callable[..., None]]:
-    """The six shapes of one kind: 6, 3 and 1 columns, each with `TILE_VECTORS` vectors and with one."""
-    shapes = [(columns, vectors) for columns in (6, 3, 1) for vectors in (TILE_VECTORS, 1)]
+    """The six shapes of one kind: 6, 3 and 1 columns, each for `TALL_FROM … TILE_ROWS` rows and for 1 to `LANES`.
+
+    Masks cost nothing where there are registers for them, as there are with AVX-512; elsewhere the tall tile is a full one.
+    """
+    shapes = [(columns, *rows) for columns in (6, 3, 1) for rows in ((TILE_VECTORS, TILE_VECTORS > 1), (1, True))]
     transposed, factor = kind == "update_transposed", kind == "factor"
     if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
-        plain = [
-            _plain_update(c, transposed=transposed) if "update" in kind else _plain_solve(c, factor=factor) for c, _ in shapes
+        return [
+            _plain_update(shape[0], transposed=transposed) if "update" in kind else _plain_solve(shape[0], factor=factor)
+            for shape in shapes
         ]
-        return plain
     if "update" in kind:
-        return [_compiled_update(c, v, transposed=transposed) for c, v in shapes]
-    return [_compiled_solve(c, v, factor=factor) for c, v in shapes]
+        return [_compiled_update(shape, transposed=transposed) for shape in shapes]
+    return [_compiled_solve(shape, factor=factor) for shape in shapes]
 
 
 update_6, update_6_short, update_3, update_3_short, update_1, update_1_short = _tiles("update")

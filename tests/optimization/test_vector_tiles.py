@@ -18,7 +18,7 @@ def shapes() -> list[tuple[int, int, int]]:
     found = []
     for k, columns in enumerate(COLUMNS):
         found += [(columns, rows, 2 * k + 1) for rows in range(1, tiles.LANES + 1)]
-        found += [(columns, rows, 2 * k) for rows in range(tiles.TILE_ROWS - tiles.LANES + 1, tiles.TILE_ROWS + 1)]
+        found += [(columns, rows, 2 * k) for rows in range(tiles.TALL_FROM, tiles.TILE_ROWS + 1)]
     return found
 
 
