@@ -189,35 +189,49 @@ def _compiled_update(shape: tuple[int, int, bool], *, transposed: bool) -> Calla
     return tile  # type: ignore[no-any-return]
 
 
+def _solve_columns(builder: Any, tile: _Tile, x: list[list[Any]], inverse: Any, ldb: Any) -> None:
+    """X L⁻ᵀ column by column, L and the reciprocals of its diagonal from memory."""
+    emit = tile.emit
+    for k in range(len(x)):
+        scale = emit.broadcast(inverse, _INDEX(k))
+        x[k] = [builder.fmul(value, scale) for value in x[k]]
+        emit.store(x[k], tile.places[k])
+        column = emit.address(tile.behind_b, builder.mul(ldb, _INDEX(k)))
+        negative = [builder.fneg(value) for value in x[k]]
+        for later in range(k + 1, len(x)):
+            weight = emit.broadcast(column, _INDEX(later))
+            x[later] = [emit.fma(value, weight, old) for value, old in zip(negative, x[later], strict=True)]
+
+
+def _factor_columns(builder: Any, tile: _Tile, x: list[list[Any]], inverse: Any, pivots: Any) -> None:
+    """L from its first rows in registers. Columns wait for a division by the pivot only; roots are taken beside that."""
+    emit = tile.emit
+    root = _function(builder.module, ir.FunctionType(_DOUBLE, [_DOUBLE]), "llvm.sqrt.f64")
+    for k in range(len(x)):
+        pivot = builder.extract_element(x[k][0], ir.IntType(32)(k))
+        quotient = builder.fdiv(ir.Constant(_DOUBLE, -1.0), pivot)
+        for later in range(k + 1, len(x)):
+            weight = emit.splat(builder.fmul(builder.extract_element(x[k][0], ir.IntType(32)(later)), quotient))
+            x[later] = [emit.fma(value, weight, old) for value, old in zip(x[k], x[later], strict=True)]
+        scale = builder.fdiv(ir.Constant(_DOUBLE, 1.0), builder.call(root, [pivot]))
+        builder.store(pivot, emit.address(pivots, _INDEX(k)))
+        builder.store(scale, emit.address(inverse, _INDEX(k)))
+        emit.store([builder.fmul(value, emit.splat(scale)) for value in x[k]], tile.places[k])
+
+
 def _compiled_solve(shape: tuple[int, int, bool], *, factor: bool) -> Callable[..., None]:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         tile = _Tile(context, builder, args, shape)
-        emit, columns = tile.emit, shape[0]
+        emit = tile.emit
         inverse, pivots = (_pointer(context, builder, args[k], args[12]) for k in (11, 13 if factor else 11))
-        root = _function(builder.module, ir.FunctionType(_DOUBLE, [_DOUBLE]), "llvm.sqrt.f64")
         x = [
             [builder.fsub(o, s) for o, s in zip(emit.load(p), sums, strict=True)]
             for p, sums in zip(tile.places, tile.products, strict=True)
         ]
-        for k in range(columns):
-            if factor:
-                pivot = builder.extract_element(x[k][0], ir.IntType(32)(k))
-                builder.store(pivot, emit.address(pivots, _INDEX(k)))
-                scale = builder.fdiv(ir.Constant(_DOUBLE, 1.0), builder.call(root, [pivot]))
-                builder.store(scale, emit.address(inverse, _INDEX(k)))
-                scales = emit.splat(scale)
-            else:
-                scales = emit.broadcast(inverse, _INDEX(k))
-            x[k] = [builder.fmul(value, scales) for value in x[k]]
-            emit.store(x[k], tile.places[k])
-            column = emit.address(tile.behind_b, builder.mul(args[8], _INDEX(k)))
-            negative = [builder.fneg(value) for value in x[k]]
-            for later in range(k + 1, columns):
-                if factor:
-                    weights = emit.splat(builder.extract_element(x[k][0], ir.IntType(32)(later)))
-                else:
-                    weights = emit.broadcast(column, _INDEX(later))
-                x[later] = [emit.fma(value, weights, old) for value, old in zip(negative, x[later], strict=True)]
+        if factor:
+            _factor_columns(builder, tile, x, inverse, pivots)
+        else:
+            _solve_columns(builder, tile, x, inverse, args[8])
         return context.get_dummy_value()
 
     if factor:
