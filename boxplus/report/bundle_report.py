@@ -108,7 +108,7 @@ def _scenes(before: BundleScene, after: BundleScene, view: Viewpoint) -> go.Figu
             row=1,
             col=column,
         )
-    eye = 1.35 * (-0.75 * view.depth + 0.6 * view.up + 0.25 * view.right)
+    eye = 1.2 * (-0.75 * view.depth + 0.6 * view.up + 0.25 * view.right)
     axis = {"backgroundcolor": "white", "gridcolor": GRID, "zerolinecolor": GRID, "showspikes": False}
     layout = {
         "aspectmode": "manual",
