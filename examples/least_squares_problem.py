@@ -55,5 +55,5 @@ for name, estimate in (("odometry alone", start), ("all", solution[poses])):
 whitened = edges.evaluate(solution[poses[first]], solution[poses[second]]) / sigma_loop
 far = np.flatnonzero(np.linalg.norm(whitened, axis=1) > 6.0)
 print(f"loops beyond 6 standard deviations, every fifth is wrong: {far.tolist()}")
-std = np.sqrt(solution.covariance(poses[[0, 410, 799]])[:, range(3, 6), range(3, 6)])
+std = solution.standard_deviations(poses[[0, 410, 799]])[:, 3:]
 print(f"standard deviations of poses 0, 410 and 799 [m]:\n{std.round(2)}")

@@ -44,7 +44,7 @@ for function, is_batch in ((hand_eye, False), (hand_eye_batch, True)):
     problem.add_residuals(residual, mounting)
     solution = problem.solve()
     e = bp.SE3.boxminus(solution[mounting], true)[0]
-    std = np.sqrt(solution.covariance(mounting[:])[0].diagonal())
+    std = solution.standard_deviations(mounting)[0]
     print(f"{function.__name__}: {solution.status} after {solution.iterations} iterations, Jacobian {residual.jacobian_kind}")
     print(f"  rotation  off by {np.degrees(np.linalg.norm(e[:3])):.3f}°, standard deviations {np.degrees(std[:3]).round(3)}°")
     print(f"  position  off by {1e3 * np.linalg.norm(e[3:]):.2f} mm, standard deviations {(1e3 * std[3:]).round(2)} mm")
