@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
-    from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D
+    from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_weights
     from boxplus.residuals.gicp import Gicp, plane_covariances
     from boxplus.residuals.imu import ImuPreintegration
     from boxplus.residuals.imu_preintegration import ImuNoise, Preintegration
@@ -51,6 +51,7 @@ _HOME = {
     "ReprojectionTiedIntrinsics": "reprojection_tied_intrinsics",
     "Residual": "residual",
     "UserResidual": "user_residual",
+    "chordal_weights": "chordal_pose",
     "plane_covariances": "gicp",
 }
 
@@ -79,6 +80,7 @@ __all__ = [
     "ReprojectionTiedIntrinsics",
     "Residual",
     "UserResidual",
+    "chordal_weights",
     "plane_covariances",
 ]
 
