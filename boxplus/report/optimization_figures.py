@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
@@ -88,11 +90,19 @@ def cost_over_iterations(history: list[IterationFacts], parameter: str) -> go.Fi
         line = {"color": color, "width": 1.5}
         figure.add_scatter(x=number, y=shown, name=name, mode="lines+markers", marker={"size": 4}, line=line, row=row, col=1)
         figure.update_yaxes(title_text=name, row=row, col=1)
-    figure.update_yaxes(type="log", exponentformat="power", nticks=5)
+    for row, values in enumerate(([*costs, top], [i.gradient for i in history], [i.parameter for i in history]), 1):
+        figure.update_yaxes(type="log", exponentformat="power", dtick=_decades_between_ticks(values), row=row, col=1)
     figure.update_yaxes(title_text="cost", row=1, col=1)
     figure.update_xaxes(dtick=max(1, len(history) // 10))
     figure.update_xaxes(title_text="step", row=3, col=1)
     return styled(figure, 460)
+
+
+def _decades_between_ticks(values: list[float]) -> int | None:
+    """So many that a low panel has room for their labels; None, to let the page choose, for less than a decade."""
+    positive = [value for value in values if value > 0.0]
+    decades = math.log10(max(positive) / min(positive)) if positive else 0.0
+    return math.ceil(decades / 4.0) if decades > 1.0 else None
 
 
 def styled(figure: go.Figure, height: int) -> go.Figure:
