@@ -100,7 +100,7 @@ class SparseSystem(LinearSystem):
     def __init__(self, layout: Layout, groups: Sequence[Group], threads: int) -> None:
         self._equations = NormalEquations(layout, groups)
         self._threads = threads
-        self._cholesky = SparseCholesky(self._equations.pattern)
+        self._cholesky = SparseCholesky(self._equations.pattern, threads=threads)
         self.description = (
             f"sparse Cholesky of {layout.dof} degrees of freedom, {self._cholesky.nnz_factor:,} non-zeros in the factor"
         )

@@ -55,7 +55,7 @@ class SchurSystem(LinearSystem):
         self._entries = build_entries(layout, self._rest, groups, eliminated, count)
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
         self._values = np.zeros(int(self._pattern.value_start[-1]))
-        self._cholesky = SparseCholesky(self._pattern)
+        self._cholesky = SparseCholesky(self._pattern, threads=threads)
         self.gradient, self.diagonal = np.zeros(layout.dof), np.zeros(layout.dof)
         self.description = (
             f"Schur elimination of {count} {eliminated.name!r} ({e} degrees of freedom each, no residual connects two of them), "

@@ -22,6 +22,7 @@ WITH_PROGRAM = [
     "inverse_depth",
     "inverse_depth_intrinsics",
     "line_reprojection",
+    "marginal_prior",
     "prior",
     "relative_pose",
     "reprojection_intrinsics",
