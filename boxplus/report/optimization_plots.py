@@ -66,7 +66,7 @@ def _cost(history: list[IterationFacts]) -> Figure:
         top = max(costs) * (max(costs) / min(costs)) ** 0.1  # steps that led further up are drawn at the upper edge
         steps, tried = [i.number for i in rejected], [min(i.tried_cost or top, top) for i in rejected]
         axes.plot(steps, tried, "x", color=SERIES[4], label="tried and rejected")
-    axes.set(yscale="log", xlabel="step", ylabel="cost")
+    axes.set(yscale="log" if any(i.cost > 0.0 for i in history) else "linear", xlabel="step", ylabel="cost")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(fontsize=9, frameon=False)
     plain(axes)

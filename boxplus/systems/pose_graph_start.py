@@ -186,7 +186,8 @@ def _translations(
     np.add.at(right, i, -pull)
     inner = np.flatnonzero(free[i] & free[j])
     pattern, pairs = BlockPattern.from_pairs(np.ones(size, dtype=np.int64), number[j[inner]], number[i[inner]])
-    values = np.bincount(pairs.block, -weight[inner], len(pattern.row))
+    values = np.zeros(len(pattern.row))
+    np.add.at(values, pairs.block, -weight[inner])
     values[pattern.col_start[:-1]] += (np.bincount(i, weight, n) + np.bincount(j, weight, n))[free]
     cholesky = SparseCholesky(pattern)
     cholesky.factorize(values)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from small_problems import bal_problem, colmap_model, gbp_problem, in_camera, loop_graph
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.formats.colmap_model import ColmapModel
-from boxplus.manifolds import se3
+from boxplus.formats.g2o import write_g2o
+from boxplus.formats.pose_graph import PoseGraph
 from boxplus.report.bundle_scene import Viewpoint, camera_centers, frustum_lines, scene_of
 from boxplus.report.graph_report import _kinds, _panels
 from boxplus.report.optimization_figures import cost_over_iterations, counts_per_bin, error_bins, error_histogram
@@ -94,12 +99,18 @@ def test_edges_of_a_graph_are_drawn_once_each(dimension: int) -> None:
     assert [title for title, _ in _panels(graph, from_file)] == ["in the file", "after"]
 
 
-def test_a_graph_without_errors_is_drawn() -> None:
-    """All errors are rounding: no edge is worse than others."""
-    graph = loop_graph(3)
-    assert graph.poses is not None
-    exact = se3.compose(se3.inverse(graph.poses[graph.edges[:, 0]]), graph.poses[graph.edges[:, 1]])
-    object.__setattr__(graph, "measurements", exact)
-    result = optimize_pose_graph(graph)
-    assert result.chi2 < 1e-15
-    assert error_histogram(result.errors_start, result.errors, "σ").to_json()
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_graph_without_errors_is_drawn(dimension: int, tmp_path: Path) -> None:
+    """Two poses and one edge that is exactly right: all errors and costs are zero."""
+    poses = np.zeros((2, 7 if dimension == 3 else 3))
+    poses[:, 0] = float(dimension == 3)
+    poses[1, -1] = 1.0
+    information = np.eye(6 if dimension == 3 else 3)[None]
+    graph = PoseGraph(
+        3 if dimension == 3 else 2, np.arange(2), poses, np.array([[0, 1]]), poses[1:], information, np.zeros(0, dtype=np.int64)
+    )
+    write_g2o(tmp_path / "exact.g2o", graph)
+    result = CliRunner().invoke(app, ["pgo", str(tmp_path / "exact.g2o"), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "report.html").exists()
