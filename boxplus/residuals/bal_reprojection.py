@@ -31,7 +31,7 @@ from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.reprojection import check_pixels
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 
@@ -156,29 +156,12 @@ class BalReprojection(Residual):
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         _bal_reprojection(
             begin, end, x[0], index[0], x[1], index[1], self.pixels, self.z_min, r, jacobians[0], jacobians[1], valid, True
         )
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         _bal_reprojection(begin, end, x[0], index[0], x[1], index[1], self.pixels, self.z_min, r, *_NO_JACOBIANS, valid, False)

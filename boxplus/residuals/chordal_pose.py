@@ -26,7 +26,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 _NO_JACOBIANS_3D = (np.zeros((0, 12, 6)), np.zeros((0, 12, 6)))
@@ -160,29 +160,12 @@ class _Chordal(Residual):
             sigma[:, columns] = 1.0 / np.sqrt(np.broadcast_to(array, (count,)))[:, None]
         return Whitening.of(sigma.shape[1], count, sigma=sigma)
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         run = _chordal_3d if self.dim == 12 else _chordal_2d
         run(begin, end, x[0], x[1], index[0], index[1], self.measured, r, jacobians[0], jacobians[1], valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         run, none = (_chordal_3d, _NO_JACOBIANS_3D) if self.dim == 12 else (_chordal_2d, _NO_JACOBIANS_2D)
         run(begin, end, x[0], x[1], index[0], index[1], self.measured, r, none[0], none[1], valid, False)

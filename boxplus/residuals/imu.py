@@ -26,7 +26,7 @@ from boxplus.manifolds.quaternion import UnitQuaternion, exp_scalars, multiply_s
 from boxplus.manifolds.so3 import exp_coefficients, inverse_jacobian_coefficient, log_quaternion
 from boxplus.residuals.imu_preintegration import Preintegration, rows_of
 from boxplus.residuals.matrix3 import IDENTITY, Matrix3, apply, multiply, polynomial, scaled, transposed
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 POSE = Product(UnitQuaternion, Euclidean(3))
@@ -238,28 +238,11 @@ class ImuPreintegration(Residual):
             self.gravity, self.rotation == "log",
         )  # fmt: skip
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         _imu(begin, end, *x, *index, *self._terms, r, *jacobians, valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         _imu(begin, end, *x, *index, *self._terms, r, *NO_JACOBIANS, *NO_JACOBIANS, valid, False)
 

@@ -30,7 +30,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.reprojection import check_pixels
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 RHO_MIN = 1e-6  # inverse depth below which a point counts as at infinity [1/m]
@@ -182,41 +182,16 @@ class InverseDepthReprojection(Residual):
         )
         self._parameters = camera.padded_parameters
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         self._run(begin, end, x, index, r, jacobians, valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-        with_jacobians: bool,
+        self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _inverse_depth(
             begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self._rays, self.pixels, self._parameters,

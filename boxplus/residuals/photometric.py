@@ -29,7 +29,7 @@ from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.photometric_kernel import photometric
 from boxplus.residuals.photometric_sampling import checked_image, sample
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 DSO_PATTERN = ((0, 0), (0, -2), (-1, -1), (1, -1), (-2, 0), (2, 0), (-1, 1), (0, 2))
@@ -126,29 +126,12 @@ class Photometric(Residual):
         self._constants = (None, rho, parameters[None, :4].copy(), np.zeros((1, 2)))
         self._constant_index = (once, each, once, once)
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         values, rows = self._all(x, self._constants), self._all(index, self._constant_index)
         photometric(begin, end, *values, *rows, *self._terms, r, *self._all(jacobians, self._no_jacobians), valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         values, rows = self._all(x, self._constants), self._all(index, self._constant_index)
         photometric(begin, end, *values, *rows, *self._terms, r, *self._no_jacobians, valid, False)

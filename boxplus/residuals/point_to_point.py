@@ -18,7 +18,7 @@ from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 NO_JACOBIANS = np.zeros((0, 3, 6))
@@ -85,28 +85,11 @@ class PointToPoint(Residual):
             whitening=Whitening.of(3, count, sigma=sigma, covariance=covariance, information=information),
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         _point_to_point(begin, end, x[0], index[0], self.p_source, self.p_target, r, jacobians[0], valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         _point_to_point(begin, end, x[0], index[0], self.p_source, self.p_target, r, NO_JACOBIANS, valid, False)
 

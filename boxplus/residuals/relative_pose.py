@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3, between_scalars, log_scalars
 from boxplus.manifolds.se3_jacobians import dual_blocks_into, right_jacobian_inverse_into
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 HALF_TURN_MARGIN = 1e-6  # rotation errors this close to π [rad] have an arbitrary axis sign
@@ -125,28 +125,11 @@ class RelativePose(Residual):
             whitening=Whitening.of(6, count, sigma=sigma, covariance=covariance, information=information),
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         is_exact = self.jacobian == "exact"
         _linearize(begin, end, x[0], x[1], index[0], index[1], self.measured, is_exact, r, jacobians[0], jacobians[1], valid)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         _evaluate(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
 
     def at_half_turn(self, *x: ArrayLike) -> NDArray[np.bool_]:

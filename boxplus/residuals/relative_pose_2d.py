@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import kernel
 from boxplus.manifolds.se2 import SE2, between_scalars, log_scalars
 from boxplus.manifolds.so3 import inverse_jacobian_coefficient
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 
@@ -109,25 +109,8 @@ class RelativePose2D(Residual):
             whitening=Whitening.of(3, count, sigma=sigma, covariance=covariance, information=information),
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         _linearize(begin, end, x[0], x[1], index[0], index[1], self.measured, r, jacobians[0], jacobians[1], valid)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         _evaluate(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)

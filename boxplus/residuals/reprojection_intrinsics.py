@@ -27,7 +27,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.reprojection import check_pixels, write_pose_point
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 _NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
@@ -122,41 +122,16 @@ class ReprojectionIntrinsics(Residual):
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         self._run(begin, end, x, index, r, jacobians, valid, True)
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-        with_jacobians: bool,
+        self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _reprojection_intrinsics(
             begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.z_min,

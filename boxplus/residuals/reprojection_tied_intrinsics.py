@@ -19,7 +19,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 
 
 class ReprojectionTiedIntrinsics(Residual):
@@ -73,29 +73,12 @@ class ReprojectionTiedIntrinsics(Residual):
         )
         self._J = np.zeros((self.count, 2, count))
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
         self._full.linearize_into(begin, end, self._expanded(x), index, r, (jacobians[0], jacobians[1], self._J), valid)
         np.matmul(self._J[begin:end], self.basis, out=jacobians[2][begin:end])
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         self._full.evaluate_into(begin, end, self._expanded(x), index, r, valid)
 

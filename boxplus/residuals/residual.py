@@ -12,6 +12,11 @@ from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.whitening import Whitening
 
+Array = NDArray[np.float64]
+Arrays = tuple[NDArray[np.float64], ...]
+Rows = tuple[NDArray[np.uint32], ...]
+Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True, slots=True)
 class Linearization:
@@ -60,16 +65,7 @@ class Residual(ABC):
         self.fixes_gauge = len(manifolds) == 1 if fixes_gauge is None else fixes_gauge
 
     @abstractmethod
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """Residuals, Jacobians and validity of the rows [begin, end), before whitening.
 
         Args:
@@ -80,15 +76,7 @@ class Residual(ABC):
         """
 
     @abstractmethod
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """As `linearize_into`, residuals and validity only; they must be the same bits."""
 
     def linearize(self, *x: ArrayLike) -> Linearization:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangent_step import tangent_steps
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.user_kernels import Loops, compiled_loops
 from boxplus.residuals.whitening import Whitening
 
@@ -109,16 +109,7 @@ class UserResidual(Residual):
                 function, jacobian, dim, tuple(manifold.dof for manifold in connected), types, self._tables is not None
             )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         if self._loops is not None and self._loops.linearize is not None:
             extra = (*self._tables, *self._steps) if self.jacobian is None and self._tables is not None else ()
             self._check(self._loops.linearize(begin, end, *x, *index, *self.data, *extra, r, *jacobians, valid))
@@ -132,15 +123,7 @@ class UserResidual(Residual):
             J[begin:end][~valid[begin:end]] = 0.0
         r[begin:end][~valid[begin:end]] = 0.0
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         if self._loops is not None:
             self._check(self._loops.evaluate(begin, end, *x, *index, *self.data, r, valid))
         else:
@@ -178,12 +161,7 @@ class UserResidual(Residual):
         return r, valid
 
     def _call_batch_jacobian(
-        self,
-        jacobian: Callable[..., Any],
-        begin: int,
-        end: int,
-        values: Sequence[NDArray[np.float64]],
-        jacobians: tuple[NDArray[np.float64], ...],
+        self, jacobian: Callable[..., Any], begin: int, end: int, values: Sequence[NDArray[np.float64]], jacobians: Arrays
     ) -> None:
         returned = jacobian(*values, *(array[begin:end] for array in self.data))
         matrices = [np.asarray(J, dtype=np.float64) for J in (returned if isinstance(returned, tuple | list) else (returned,))]
@@ -197,15 +175,7 @@ class UserResidual(Residual):
         for J, matrix in zip(jacobians, matrices, strict=True):
             J[begin:end] = matrix
 
-    def _differentiate(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-    ) -> None:
+    def _differentiate(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays) -> None:
         """Central differences, a whole chunk at a time; one-sided beside a singular neighbour."""
         values = self._gather(begin, end, x, index)
         for slot, manifold in enumerate(self.manifolds):
