@@ -142,22 +142,23 @@ def _summary(
     loss: Loss | None,
     stopped: bool,
 ) -> OptimizationSummary:
-    from boxplus.cli.optimization_terminal import ended_by_user, versions
+    from boxplus.cli.optimization_terminal import state_and_reason, versions
     from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
 
     solution = result.solution
+    state, reason = state_and_reason(solution, stopped)
     rho = "" if loss is None else f", ρ {loss!r}"
     return OptimizationSummary(
         program="boxplus ba",
         versions=versions(),
         started=started,
-        state="interrupted" if ended_by_user(solution, stopped) else "finished",
+        state=state,
         input=str(file),
         output=output,
         sizes={**_sizes(start), "used": len(result.errors)},
         settings={**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), "loss": repr(loss) if loss else "none"},
         status=solution.status,
-        reason=solution.reason,
+        reason=reason,
         method=solution.method,
         linear_solver=solution.linear_solver,
         convention=f"cost ½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over the observations, σ = {config.sigma_px:g} px{rho}",

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rich import box
 from rich.console import Console
@@ -197,6 +197,8 @@ class OptimizationTerminal:
                 self.console.print(f"  {folder / name}", soft_wrap=True, markup=False)
 
 
-def ended_by_user(solution: Solution, stopped: bool) -> bool:
-    """Whether it was Ctrl-C that ended it."""
-    return stopped and solution.status == "stopped"
+def state_and_reason(solution: Solution, stopped: bool) -> tuple[Literal["finished", "interrupted"], str]:
+    """Whether it was Ctrl-C that ended it, and why it stopped."""
+    if stopped and solution.status == "stopped":
+        return "interrupted", f"interrupted after step {solution.iterations}; everything up to there is written"
+    return "finished", solution.reason

@@ -174,22 +174,23 @@ def _summary(
     reading: dict[str, str],
     stopped: bool,
 ) -> OptimizationSummary:
-    from boxplus.cli.optimization_terminal import ended_by_user, versions
+    from boxplus.cli.optimization_terminal import state_and_reason, versions
     from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
 
     solution = result.solution
+    state, reason = state_and_reason(solution, stopped)
     settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), **reading}
     return OptimizationSummary(
         program="boxplus pgo",
         versions=versions(),
         started=started,
-        state="interrupted" if ended_by_user(solution, stopped) else "finished",
+        state=state,
         input=str(file),
         output=output,
         sizes={"poses": len(graph.ids), "edges": len(graph.edges), "held": len(result.held)},
         settings={**settings, "loss": repr(loss) if loss else "none"},
         status=solution.status,
-        reason=solution.reason,
+        reason=reason,
         method=solution.method,
         linear_solver=solution.linear_solver,
         convention=_convention(graph, config, loss, reading),

@@ -190,5 +190,6 @@ def test_an_interrupt_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.exit_code == 130
     summary = json.loads((tmp_path / "out" / "run.json").read_text())
     assert summary["state"] == "interrupted" and summary["history"][-1]["number"] == 0
+    assert "stopped: interrupted after step 0; everything up to there is written" in result.output
     assert np.isfinite(read_bal(tmp_path / "out" / "adjusted.txt").points).all()
     assert "interrupted" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
