@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from boxplus.maps.ikd_tree import IkdTree
     from boxplus.optimization import losses
     from boxplus.optimization.cholesky import SparseCholesky
+    from boxplus.optimization.graduated import graduate
     from boxplus.optimization.jacobian_check import check_jacobian
+    from boxplus.optimization.marginalization import marginalize
     from boxplus.optimization.problem import Problem
     from boxplus.optimization.solution import Solution
     from boxplus.optimization.solver_options import SolverOptions
@@ -105,6 +107,8 @@ _HOME = {
     "check_jacobian": "optimization.jacobian_check",
     "diagnose": "recordings.doctor",
     "evaluate": "evaluation.evaluation",
+    "graduate": "optimization.graduated",
+    "marginalize": "optimization.marginalization",
     "open_recording": "recordings.recording",
     "optimize_pose_graph": "systems.pose_graph",
     "read_pose_graph": "formats.pose_graph_file",
@@ -164,7 +168,9 @@ __all__ = [
     "diagnose",
     "evaluate",
     "formats",
+    "graduate",
     "losses",
+    "marginalize",
     "open_recording",
     "optimize_pose_graph",
     "read_pose_graph",

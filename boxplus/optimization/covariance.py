@@ -69,7 +69,7 @@ class Covariances:
         for p, q, block in zip(a, b, self._problem.system.inverse_blocks(number[a], number[b]), strict=True):
             matrix[start[p] : start[p + 1], start[q] : start[q + 1]] = block
             matrix[start[q] : start[q + 1], start[p] : start[p + 1]] = block.T
-        return matrix
+        return 0.5 * (matrix + matrix.T)
 
     def _prepare(self, wanted: NDArray[np.int64]) -> None:
         """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""

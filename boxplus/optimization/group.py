@@ -50,13 +50,14 @@ class Group:
     """N residuals of one kind, connected to variables.
 
     Attributes:
-        residual, loss, name: as given to `Problem.add_residuals`.
+        residual, name: as given to `Problem.add_residuals`.
+        loss: as given there, or to `set_loss` since.
         connections: one `VariableRows` of length N for each connected variable.
         r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,).
     """
 
     def __init__(self, residual: Residual, connections: Sequence[VariableRows], loss: Loss, name: str) -> None:
-        self.residual, self.loss, self.name = residual, loss, name
+        self.residual, self.name = residual, name
         self.connections = tuple(_broadcast(rows, residual.count) for rows in connections)
         self.r = np.zeros((residual.count, residual.dim))
         self.jacobians = tuple(np.zeros((residual.count, residual.dim, c.block.manifold.dof)) for c in self.connections)
@@ -68,12 +69,17 @@ class Group:
         ]
         whitening = residual.whitening
         self._is_white = bool(len(whitening.factors) == 1 and np.array_equal(whitening.factors[0], np.eye(residual.dim)))
-        scaled = residual.count if loss.code != SQUARED else 0
-        self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
+        self.set_loss(loss)
         self._sums = np.zeros((-(-residual.count // _CHUNK), 4))
 
     def __repr__(self) -> str:
         return f"{self.name!r} ({self.residual.count} × {type(self.residual).__name__})"
+
+    def set_loss(self, loss: Loss) -> None:
+        """Weigh the residuals by another loss from the next linearisation on."""
+        self.loss = loss
+        scaled = self.residual.count if loss.code != SQUARED else 0
+        self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
 
     def linearize(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
         """Fill `r`, `jacobians` and `valid` at the point `values` (one array a block of the problem)."""

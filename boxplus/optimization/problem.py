@@ -101,7 +101,7 @@ class Problem:
 
     def cost(self, values: Solution | Sequence[NDArray[np.float64]] | None = None) -> float:
         """½ Σ ρ(‖W r‖²) at `values`, by default the variables' own."""
-        at = self._values(values)
+        at = self.values_at(values)
         return float(sum(group.evaluate(at, 1).cost for group in self.groups))
 
     def defects(self) -> list[str]:
@@ -135,7 +135,7 @@ class Problem:
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0
-        model.start(self._values(start))
+        model.start(self.values_at(start))
         cost_initial = model.cost.cost
         strategy = strategy_of(options)
         try:
@@ -157,7 +157,12 @@ class Problem:
             _problem=model,
         )
 
-    def _values(self, given: Solution | Sequence[NDArray[np.float64]] | None) -> list[NDArray[np.float64]]:
+    def values_at(self, given: Solution | Sequence[NDArray[np.float64]] | None = None) -> list[NDArray[np.float64]]:
+        """Values (n, size) of every block at a solution or as given, fixed variables at theirs; by default the blocks' own.
+
+        Raises:
+            InputError: another number of blocks or variables, points that are not on their manifolds.
+        """
         if given is None:
             return [block.values for block in self.blocks]
         values = given.values if isinstance(given, Solution) else given
