@@ -208,7 +208,7 @@ def _data(number: int, array: ArrayLike) -> NDArray[Any]:
             f"{values.dtype} of shape {values.shape}",
             "give one row for each residual; a constant is written into the function or taken from around it",
         )
-    return np.ascontiguousarray(values, dtype=np.float64 if values.dtype.kind == "f" else np.int64)
+    return np.array(values, dtype=np.float64 if values.dtype.kind == "f" else np.int64, order="C")
 
 
 def _count(data: tuple[NDArray[Any], ...], count: int | None) -> int:

@@ -230,6 +230,13 @@ def test_none_may_stand_for_several_numbers(has_jacobian: bool) -> None:
     assert report.passed and report.invalid == 1, report
 
 
+def test_data_are_copied() -> None:
+    measured = np.ones(4)
+    residual = UserResidual(lambda x, z: x[0] - z, dim=1, manifolds=(Euclidean(1),), data=(measured,))
+    measured[:] = 5.0
+    assert np.array_equal(residual.evaluate([1.0]), np.zeros((4, 1)))
+
+
 def test_data_come_as_scalars_rows_and_matrices() -> None:
     def affine(x, scale, matrix, which):
         return scale * (matrix[0, 0] * x[0] + matrix[0, 1] * x[1]), x[which]
