@@ -30,6 +30,8 @@ from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
 from boxplus.residuals.reprojection import Reprojection
 from boxplus.residuals.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
 
+# Points far away creep on for many steps that change nothing but their distance.
+_COST_TOLERANCE = 1e-8
 # The scale of a COLMAP model is arbitrary: only what lies behind a camera is behind it.
 _Z_MIN = 1e-9
 # Which of COLMAP's parameters stands where in `Pinhole.parameters`; −1: a coefficient that is zero.
@@ -54,7 +56,9 @@ class BundleAdjustmentConfig(BaseModel):
     principal_point: Literal["held", "refined"] = Field(
         "held", description="of COLMAP's cameras where the intrinsics are refined; few scenes determine it well"
     )
-    solver: SolverOptions = Field(SolverOptions(), description="see SolverOptions")
+    solver: SolverOptions = Field(
+        SolverOptions(cost_tolerance=_COST_TOLERANCE), description="see SolverOptions; stops once the cost settles to 8 digits"
+    )
 
 
 @dataclass(frozen=True, slots=True)
