@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from boxplus.residuals.inverse_depth import InverseDepthReprojection
     from boxplus.residuals.inverse_depth_intrinsics import InverseDepthIntrinsics
     from boxplus.residuals.line_reprojection import LineReprojection
+    from boxplus.residuals.marginal_prior import MarginalPrior
     from boxplus.residuals.photometric import DSO_PATTERN, Photometric
     from boxplus.residuals.point_to_plane import PointToPlane
     from boxplus.residuals.point_to_point import PointToPoint
