@@ -3,7 +3,9 @@
 A loss enters Gauss-Newton through Triggs' scaling (Triggs et al., Bundle adjustment – a modern synthesis, 2000, section 4.3):
 the gradient is exact, ρ′ Jᵀr, and so is the curvature, Jᵀ(ρ′ I + 2 ρ″ r rᵀ) J, as long as half of it or more is left along r.
 Further out, where it would vanish or turn negative and steps along r would know no bound, the curvature is that of
-reweighted least squares, ρ′ JᵀJ.
+reweighted least squares, ρ′ JᵀJ, which converges linearly.
+
+A loss is a code that the compiled kernels branch on, so that others than these cannot be given from outside.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from boxplus._jit import kernel
 from boxplus.errors import InputError
 
 SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH = 0, 1, 2, 3, 4, 5
-# Share of ρ′ that must be left along the residual for its second-order term to be used. Halves the iterations of inliers at no
-# loss for outliers; with less, steps grow until the damping stops them and take three times the iterations.
+# Share of ρ′ that must be left along the residual for its second-order term to be used. It matters little: over pose graphs and
+# bundle adjustments with 0 to 20 % outliers and all losses below, 0.5 took 0 to 10 % fewer iterations than reweighted least
+# squares alone in most cases. 0.1 saved a quarter in one (Cauchy at half a standard deviation), but its steps were often too
+# long: up to a fifth of them rejected (Welsch), against next to none with 0.5.
 _LEAST_CURVATURE = 0.5
 
 
@@ -55,22 +59,22 @@ def Huber(scale: float) -> Loss:
 
 
 def Cauchy(scale: float) -> Loss:
-    """ρ = c² ln(1 + s/c²)."""
+    """ρ = c² ln(1 + s/c²): large residuals count by their logarithm (Cauchy's or Lorentz' distribution)."""
     return _loss(CAUCHY, scale, "Cauchy")
 
 
 def Tukey(scale: float) -> Loss:
-    """ρ = c²/3 (1 − (1 − s/c²)³) up to c², then c²/3: residuals beyond c do not count."""
+    """ρ = c²/3 (1 − (1 − s/c²)³) up to c², then c²/3: residuals beyond c do not count at all (Beaton and Tukey 1974)."""
     return _loss(TUKEY, scale, "Tukey")
 
 
 def GemanMcClure(scale: float) -> Loss:
-    """ρ = c² s/(c² + s)."""
+    """ρ = c² s/(c² + s): never costs more than c² (Geman and McClure 1987); `graduate` starts from afar with it."""
     return _loss(GEMAN_MCCLURE, scale, "GemanMcClure")
 
 
 def Welsch(scale: float) -> Loss:
-    """ρ = c² (1 − exp(−s/c²))."""
+    """ρ = c² (1 − exp(−s/c²)): never costs more than c² (Dennis and Welsch 1978)."""
     return _loss(WELSCH, scale, "Welsch")
 
 
