@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, product
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.components import Components
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.null_space import SharedDirections
+from boxplus.optimization.null_space import OwnDirections, SharedDirections
 from boxplus.optimization.variable_names import variable_names
 from boxplus.optimization.variables import Variables
 from boxplus.optimization.world_motions import DOF, kinds_of, motions_of, positions_of
@@ -41,11 +41,15 @@ def vector_text(v: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{x:.2f}".rstrip("0").rstrip(".") if abs(x) >= 0.005 else "0" for x in v) + ")"
 
 
-def describe_shared(problem: LeastSquares, shared: SharedDirections) -> list[str]:
-    """What one set of free directions does to its variables, and which residuals touch them."""
+def describe_shared(problem: LeastSquares, shared: SharedDirections, own: Sequence[OwnDirections]) -> list[str]:
+    """What one set of free directions does to its variables, and which residuals touch them.
+
+    Args:
+        own: directions that variables have alone; the shared ones leave them out.
+    """
     names = variable_names(problem.layout, shared.number)
     Q = np.linalg.qr(shared.directions * shared.scale[:, None])[0]
-    world = _world_motions(problem, shared, Q)
+    world = _world_motions(problem, shared, own, Q)
     seen = f"residuals touching them: {touching_groups(problem, shared.number)}"
     sentences = []
     if world.free.shape[1]:
@@ -88,12 +92,14 @@ class _World:
     is_planar: bool
 
 
-def _world_motions(problem: LeastSquares, shared: SharedDirections, Q: NDArray[np.float64]) -> _World:
+def _world_motions(
+    problem: LeastSquares, shared: SharedDirections, own: Sequence[OwnDirections], Q: NDArray[np.float64]
+) -> _World:
     """The similarities of the world that lie in the span of Q, under the reading of the variables that explains most."""
     parts = _parts(problem, shared)
     best = _World(np.zeros((DOF, 0)), np.zeros((len(Q), 0)), np.zeros(3), 1.0, False)
     for reading in islice(product(*(part.kinds for part in parts)), _READINGS):
-        found = _test(problem, shared, Q, parts, reading)
+        found = _test(problem, shared, own, Q, parts, reading)
         if found.free.shape[1] > best.free.shape[1]:
             best = found
         if best.free.shape[1] == min(DOF, Q.shape[1]):
@@ -124,7 +130,12 @@ def _parts(problem: LeastSquares, shared: SharedDirections) -> list[_Part]:
 
 
 def _test(
-    problem: LeastSquares, shared: SharedDirections, Q: NDArray[np.float64], parts: list[_Part], reading: tuple[str, ...]
+    problem: LeastSquares,
+    shared: SharedDirections,
+    own: Sequence[OwnDirections],
+    Q: NDArray[np.float64],
+    parts: list[_Part],
+    reading: tuple[str, ...],
 ) -> _World:
     B = np.zeros((len(Q), DOF))
     places = []
@@ -145,6 +156,7 @@ def _test(
     change[3:6, 6] = -centre
     change[:, [0, 1, 2, 6]] /= extent
     B = shared.scale[:, None] * (B @ change)
+    _leave_out(problem, shared, own, B)
     weight, basis = np.linalg.eigh(B.T @ B)
     able = weight > _IS_DEPENDENT * weight[-1]
     onto = basis[:, able] / np.sqrt(weight[able])
@@ -154,6 +166,17 @@ def _test(
     if not motions.shape[1]:
         return _World(motions, np.zeros((len(Q), 0)), centre, extent, planar)
     return _World(np.linalg.qr(motions)[0], np.linalg.qr(B @ motions)[0], centre, extent, planar and bool(places))
+
+
+def _leave_out(problem: LeastSquares, shared: SharedDirections, own: Sequence[OwnDirections], B: NDArray[np.float64]) -> None:
+    """Take out of scaled tangents what variables can do alone."""
+    for alone in own:
+        moved = np.isin(alone.number, shared.number)
+        if moved.any():
+            start = np.searchsorted(shared.index, problem.layout.start[alone.number[moved]])
+            places = start[:, None] + np.arange(alone.directions.shape[1])
+            normal = alone.directions[moved] * shared.scale[places][:, :, None]
+            B[places] -= normal @ (np.swapaxes(normal, 1, 2) @ B[places])
 
 
 def _within(free: NDArray[np.float64], zero: list[int]) -> NDArray[np.float64]:

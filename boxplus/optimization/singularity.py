@@ -52,7 +52,7 @@ def describe_null_space(problem: LeastSquares, space: NullSpace) -> list[str]:
     """A sentence for every way in which the variables can move freely."""
     sentences = describe_own(problem, space.own)
     for shared in space.shared:
-        sentences += describe_shared(problem, shared)
+        sentences += describe_shared(problem, shared, space.own)
     if len(sentences) > _SENTENCES:
         sentences = [*sentences[:_SENTENCES], f"and {len(sentences) - _SENTENCES} more free motions"]
     return sentences

@@ -17,8 +17,10 @@ class MarginalPrior(Residual):
     """r(x) = r₀ + J (x ⊟ x₀), whitened, over several variables together; `marginalize` makes it.
 
     The rows are d residuals of dimension 1 that share their variables. J and x₀ stay as they were where the variables were
-    marginalised: only ∂(x ⊟ x₀)/∂x follows x (Jacobian J_k · `boxminus_jacobian(x_k, x₀_k)` for variable k). As ½ ‖r‖² is a
-    Gaussian already, it takes no robust loss: one would weigh each row alone.
+    marginalised: only ∂(x ⊟ x₀)/∂x follows x (Jacobian J_k · `boxminus_jacobian(x_k, x₀_k)` for variable k). Other residuals
+    take their Jacobians where x is now; where the two points drift apart, a direction that nothing measures may seem measured
+    (first-estimates Jacobians would avoid it). As ½ ‖r‖² is a Gaussian already, it takes no robust loss: one would weigh each
+    row alone.
 
     Args:
         manifolds: of the variables.

@@ -112,6 +112,20 @@ def test_points_seen_by_one_camera_move_along_their_rays(linear_solver):
     )
 
 
+def test_a_free_gauge_is_recognised_beside_points_that_are_free_alone():
+    scene = make_scene(cameras=4, points=30)
+    T, p = scene.truth
+    problem = Problem()
+    cameras = problem.add_variables(SE3Left, T, name="cameras")
+    points = problem.add_variables(Euclidean(3), p + 0.01, name="points")
+    seen = [(c, k) for k in range(30) for c in range(4) if k != 7 or c == 1]
+    observe(problem, cameras, points, T, p, seen)
+    text = message(problem)
+    assert "points[7] can move along its viewing ray" in text
+    assert "to the world, only to each other: any rigid motion and the scale of them are unconstrained" in text
+    assert "can move freely" not in text
+
+
 def test_one_such_point_is_told_in_the_singular():
     problem = Problem()
     cameras = problem.add_variables(SE3Left, SE3.identity()[None], name="cameras")
