@@ -99,17 +99,42 @@ def find_null_space(problem: LeastSquares) -> NullSpace:
     own, projectors = _own_directions(problem, scale)
     shared = _shared_directions(problem, scale, projectors)
     moves = np.zeros(len(layout.sizes), dtype=np.bool_)
-    pivots = []
-    for alone in own:
-        moves[alone.number] = True
-        pivots.append(_own_pivots(alone, layout.start))
-    held = np.repeat(moves, layout.sizes)
-    for together in shared:
-        moves[together.number] = True
-        # Variables with directions of their own have their pivots already.
-        weights = together.directions * np.where(held[together.index], 0.0, together.scale)[:, None]
-        pivots.append(together.index[_pivot_rows(weights)])
+    for number in [*(alone.number for alone in own), *(together.number for together in shared)]:
+        moves[number] = True
+    rows = [_own_pivots(alone) for alone in own]
+    pivots = [(layout.start[alone.number][:, None] + r).reshape(-1) for alone, r in zip(own, rows, strict=True)]
+    for component in sorted({together.component for together in shared}):
+        parts = [together for together in shared if together.component == component]
+        index = np.unique(np.concatenate([part.index for part in parts]))
+        weights = np.zeros((len(index), sum(part.directions.shape[1] for part in parts)))
+        column = 0
+        for part in parts:
+            end = column + part.directions.shape[1]
+            weights[np.searchsorted(index, part.index), column:end] = part.directions
+            column = end
+        for alone, r in zip(own, rows, strict=True):
+            _vanish_at_pivots(weights, index, alone, r, layout.start)
+        pivots.append(index[_pivot_rows(weights * scale[index][:, None])])
     return NullSpace(own, shared, moves, np.concatenate(pivots) if pivots else np.zeros(0, dtype=np.int64))
+
+
+def _vanish_at_pivots(
+    weights: NDArray[np.float64],
+    index: NDArray[np.int64],
+    alone: OwnDirections,
+    rows: NDArray[np.intp],
+    start: NDArray[np.int64],
+) -> None:
+    """Add own directions to shared ones (d, k) so that these vanish where the own ones have their pivots."""
+    place = np.searchsorted(index, start[alone.number])
+    met = place < len(index)
+    met[met] = index[place[met]] == start[alone.number[met]]
+    if met.any():
+        places = place[met][:, None] + np.arange(alone.directions.shape[1])
+        own, at = alone.directions[met], rows[met][:, :, None]
+        part = weights[places]
+        share = np.linalg.solve(np.take_along_axis(own, at, axis=1), np.take_along_axis(part, at, axis=1))
+        weights[places] = part - own @ share
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,9 +349,8 @@ def _pivot_rows(basis: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.asarray(order[: basis.shape[1]], dtype=np.intp)
 
 
-def _own_pivots(alone: OwnDirections, start: NDArray[np.int64]) -> NDArray[np.int64]:
+def _own_pivots(alone: OwnDirections) -> NDArray[np.intp]:
+    """(m, k) tangents that tell the own directions of each variable apart."""
     if alone.directions.shape[2] == 1:
-        rows = np.abs(alone.directions[:, :, 0]).argmax(axis=1)[:, None]
-    else:
-        rows = np.array([_pivot_rows(basis) for basis in alone.directions])
-    return np.asarray((start[alone.number][:, None] + rows).reshape(-1))
+        return np.asarray(np.abs(alone.directions[:, :, 0]).argmax(axis=1)[:, None])
+    return np.array([_pivot_rows(basis) for basis in alone.directions])
