@@ -11,6 +11,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds._batch import pair_rows
 from boxplus.manifolds.manifold import Manifold
 
+_ROUNDED = 4e-16
 _UNIT_TOLERANCE = 1e-3  # quaternions this far from unit length come from rounded files, not from a mistake
 
 
@@ -102,4 +103,5 @@ def normalize_quaternions(name: str, rows: NDArray[np.float64]) -> None:
             f"length {length[row]:.6g} in row {row}",
             "check the order of the columns, or normalise the quaternions",
         )
-    rows[:, :4] /= length[:, None]
+    rounded = np.abs(length - 1.0) > _ROUNDED  # what is of unit length already keeps its digits
+    rows[rounded, :4] /= length[rounded, None]

@@ -137,6 +137,15 @@ class BlockPattern:
         """(m,) block column of each block."""
         return np.repeat(np.arange(len(self.sizes)), np.diff(self.col_start))
 
+    def dense_places(self) -> NDArray[np.int64]:
+        """Where each value lies in the matrix (N, N) laid out row by row; the lower triangle and the diagonal blocks."""
+        column = self.column
+        block = np.repeat(np.arange(len(self.row)), np.diff(self.value_start))
+        within = np.arange(int(self.value_start[-1])) - self.value_start[block]
+        width = self.sizes[column[block]]
+        rows = self.start[self.row[block]] + within // width
+        return np.asarray(rows * self.start[-1] + self.start[column[block]] + within % width)
+
     def to_scipy(self, values: ArrayLike) -> csc_matrix:
         """The whole symmetric matrix, both triangles, (N, N)."""
         from scipy.sparse import coo_matrix

@@ -16,10 +16,10 @@ from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.strategy import Step, Strategy, inner
 
-_LEAST_DIAGONAL = 1e-6
+_LEAST_DIAGONAL = 1e-14  # as a share of the largest
 _LEAST_RADIUS = 1e-12
 # Where H is singular the Gauss-Newton step is taken with this share of the diagonal added, then ten times more, and so on.
-_FIRST_REGULARIZATION, _LARGEST_REGULARIZATION = 1e-10, 1.0
+_FIRST_REGULARIZATION, _LARGEST_REGULARIZATION = 1e-14, 1.0
 
 
 class Dogleg(Strategy):
@@ -92,7 +92,8 @@ def _length(vector: NDArray[np.float64]) -> float:
 
 def _legs(problem: LeastSquares) -> _Legs | None:
     gradient = problem.system.gradient
-    squared = np.maximum(problem.system.diagonal, _LEAST_DIAGONAL)
+    diagonal = problem.system.diagonal
+    squared = np.maximum(diagonal, _LEAST_DIAGONAL * (float(diagonal.max(initial=0.0)) or 1.0))
     descent = -gradient / squared
     along = problem.curvature(descent)
     share = 0.0

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import NotFiniteError
+from boxplus.errors import InputError, NotFiniteError
 from boxplus.optimization.group import Group, GroupCost
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import LinearSystem
@@ -45,9 +45,13 @@ class LeastSquares:
         cost = self.linearize(values)
         if not np.isfinite(cost.cost):
             self._explain_not_finite(values)
+        if cost.valid == 0 and any(group.residual.count for group in self.groups):
+            raise InputError(
+                "a start where residuals can be evaluated",
+                "none that can",
+                "start from values where points lie before their cameras",
+            )
         self.accept(values, cost)
-        if not (np.isfinite(self.system.gradient).all() and np.isfinite(self.system.diagonal).all()):
-            self._explain_not_finite(values)
 
     def linearize(self, values: Values) -> GroupCost:
         """Linearise every group at `values`, without accepting them: the linear system keeps the accepted point."""
@@ -60,12 +64,18 @@ class LeastSquares:
         return total
 
     def accept(self, values: Values, cost: GroupCost) -> None:
-        """Take the point just linearised: assemble the linear system there."""
+        """Take the point just linearised: assemble the linear system there.
+
+        Raises:
+            NotFiniteError: a Jacobian is NaN or infinite there.
+        """
         begin = time.perf_counter()
         for group in self.groups:
             group.accept()
         self.values, self.cost = values, cost
         self.system.assemble()
+        if not (np.isfinite(self.system.gradient).all() and np.isfinite(self.system.diagonal).all()):
+            self._explain_not_finite(values)
         self.timing_s["normal equations"] += time.perf_counter() - begin
 
     def solve(self, damping: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -82,6 +92,12 @@ class LeastSquares:
             return self.system.solve(-self.system.gradient)
         finally:
             self.timing_s["linear solve"] += time.perf_counter() - begin
+
+    def slope(self) -> float:
+        """Largest |cos| of the angle between the residuals and a column of the Jacobian: zero at a minimum, free of units."""
+        reach = np.sqrt(2.0 * self.cost.cost * np.maximum(self.system.diagonal, 0.0))
+        steep = np.abs(self.system.gradient)
+        return float(np.divide(steep, reach, out=np.zeros_like(steep), where=reach > 0.0).max(initial=0.0))
 
     def moved(self, delta: NDArray[np.float64]) -> Values:
         """The accepted point moved by δ."""
@@ -113,8 +129,8 @@ class LeastSquares:
                 for role, c in zip(group.residual.roles, group.connections, strict=True)
             )
             raise NotFiniteError(
-                "finite residuals and Jacobians at the start",
+                "finite residuals and Jacobians",
                 f"NaN or infinity in the {what} of residual {row} of group {group!r}, at {inputs}",
-                "repair that measurement, or start from values where it can be evaluated",
+                "repair that measurement, or the residual, or start elsewhere",
             )
         raise NotFiniteError("a finite cost", "an overflow in the sum", "scale the residuals by their standard deviations")

@@ -11,8 +11,8 @@ from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.strategy import Step, Strategy, inner
 
-# Entries of diag(H) beyond these do not scale the damping: a direction without information is damped all the same.
-_LEAST_DIAGONAL, _LARGEST_DIAGONAL = 1e-6, 1e32
+# Smaller entries of diag(H), as a share of the largest, do not scale the damping: a direction without information is damped too.
+_LEAST_DIAGONAL = 1e-14
 _LARGEST_DAMPING = 1e16
 
 
@@ -31,7 +31,7 @@ class LevenbergMarquardt(Strategy):
         diagonal = problem.system.diagonal
         if self.parameter == 0.0:
             largest = float(diagonal.max(initial=0.0))
-            self.parameter = self._initial * (1.0 if self._damping == "diagonal" else max(largest, _LEAST_DIAGONAL))
+            self.parameter = self._initial * (1.0 if self._damping == "diagonal" else (largest or 1.0))
         while self.parameter <= _LARGEST_DAMPING * max(1.0, float(diagonal.max(initial=0.0))):
             D = self.parameter * self._scale(diagonal)
             try:
@@ -44,7 +44,7 @@ class LevenbergMarquardt(Strategy):
 
     def _scale(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
         if self._damping == "diagonal":
-            return np.clip(diagonal, _LEAST_DIAGONAL, _LARGEST_DIAGONAL)
+            return np.maximum(diagonal, _LEAST_DIAGONAL * (float(diagonal.max(initial=0.0)) or 1.0))
         return np.ones_like(diagonal)
 
     def _grow(self) -> None:

@@ -58,22 +58,28 @@ class DenseSystem(LinearSystem):
         self._equations = NormalEquations(layout, groups)
         self._layout, self._threads = layout, threads
         self._factor: NDArray[np.float64] = np.zeros((0, 0))
+        self._dense = np.zeros((layout.dof, layout.dof))
+        self._places = self._equations.pattern.dense_places()
         self.description = f"dense Cholesky of {layout.dof} degrees of freedom"
 
     def assemble(self) -> None:
         """See `LinearSystem.assemble`."""
         self._equations.assemble(self._threads)
         self.gradient, self.diagonal = self._equations.gradient, self._equations.diagonal
-        self._dense = self._equations.pattern.to_scipy(self._equations.values).toarray()
+        self._dense.reshape(-1)[self._places] = self._equations.values
 
     def factorize(self, damping: NDArray[np.float64] | None) -> None:
         """See `LinearSystem.factorize`."""
         from scipy.linalg.lapack import dpotrf
 
-        matrix = self._dense if damping is None else self._dense + np.diag(damping)
-        self._factor, info = dpotrf(matrix, lower=1, clean=1)
+        matrix = self._dense.copy()
+        if damping is not None:
+            matrix[np.diag_indices_from(matrix)] += damping
+        diagonal = np.diag(matrix).copy()
+        # The lower triangle of rows is LAPACK's upper one of columns, which spares a transposition.
+        self._factor, info = dpotrf(matrix.T, lower=0, clean=1, overwrite_a=1)
         pivots = np.diag(self._factor) ** 2
-        rounded = np.flatnonzero(pivots <= SINGULAR * np.diag(matrix))
+        rounded = np.flatnonzero(pivots <= SINGULAR * diagonal)
         row = info - 1 if info > 0 else int(rounded[0]) if len(rounded) else -1
         if row >= 0:
             block = int(np.searchsorted(self._layout.start, row, side="right")) - 1
@@ -83,13 +89,13 @@ class DenseSystem(LinearSystem):
         """See `LinearSystem.solve`."""
         from scipy.linalg import cho_solve
 
-        return np.asarray(cho_solve((self._factor, True), right))
+        return np.asarray(cho_solve((self._factor, False), right))
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """See `LinearSystem.inverse_blocks`."""
         from scipy.linalg import cho_solve
 
-        inverse = cho_solve((self._factor, True), np.eye(self._layout.dof))
+        inverse = cho_solve((self._factor, False), np.eye(self._layout.dof))
         start = self._layout.start
         return [inverse[start[i] : start[i + 1], start[j] : start[j + 1]] for i, j in zip(first, second, strict=True)]
 

@@ -47,20 +47,21 @@ def minimize(
         gradient = float(np.abs(problem.system.gradient).max(initial=0.0))
         elapsed = time.perf_counter() - begin
         history.append(Iteration(number, problem.cost.cost, tried, gradient, step, parameter, accepted, elapsed))
-        return callback is not None and callback(history[-1]) is True
+        return callback is not None and bool(callback(history[-1]))
 
     stop = record(0, problem.cost.cost, 0.0, strategy.parameter, True)
+    rejected, lost = 0, 0  # steps rejected since the last that was taken, and the most residuals one of them lost
     for number in range(1, options.max_iterations + 1):
         last = history[-1]
         if stop:
             return "stopped", f"the callback asked to stop after iteration {last.number}", history
-        if last.gradient <= options.gradient_tolerance:
-            return "converged", f"gradient {last.gradient:.2g} ≤ {options.gradient_tolerance:.2g}", history
+        if (slope := problem.slope()) <= options.gradient_tolerance:
+            return "converged", _flat(slope, options), history
         if options.time_limit_s is not None and last.time_s >= options.time_limit_s:
             return "stopped", f"time limit of {options.time_limit_s:g} s reached", history
         step = strategy.propose(problem)
         if step is None:
-            return "stalled", f"no step lowers the cost any more ({strategy.name} at {strategy.parameter:.2g})", history
+            return "stalled", _stall(strategy, rejected, lost), history
         parameter, cost = strategy.parameter, problem.cost.cost
         size = float(np.abs(step.delta).max(initial=0.0))
         values = problem.moved(step.delta)
@@ -71,14 +72,36 @@ def minimize(
         ratio = decrease / step.predicted if usable and step.predicted > 0.0 else None
         # At the bottom of the valley both decreases are rounding: the step is converged whatever their ratio says.
         settled = usable and abs(decrease) <= options.cost_tolerance * cost and step.predicted <= options.cost_tolerance * cost
+        small = usable and size <= options.step_tolerance
         accepted = strategy.judge(ratio)
         if accepted:
             problem.accept(values, tried)
         stop = record(number, tried.cost if np.isfinite(tried.cost) else np.inf, size, parameter, accepted)
-        if settled:
-            return "converged", f"the cost changed by {decrease:.2g}, {options.cost_tolerance:.2g} of it or less", history
-        if usable and size <= options.step_tolerance:
+        if settled or small:
+            # After rejections a step is small because it was made so, not because the minimum is near.
+            if rejected:
+                return "stalled", _stall(strategy, rejected, lost), history
+            if settled:
+                return "converged", f"the cost changed by {decrease:.2g}, {options.cost_tolerance:.2g} of it or less", history
             return "converged", f"the step moved nothing by more than {size:.2g}", history
+        rejected, lost = (0, 0) if accepted else (rejected + 1, max(lost, tried.lost))
     if stop:
         return "stopped", f"the callback asked to stop after iteration {history[-1].number}", history
+    if (slope := problem.slope()) <= options.gradient_tolerance:
+        return "converged", _flat(slope, options), history
     return "stopped", f"iteration limit of {options.max_iterations} reached", history
+
+
+def _flat(slope: float, options: SolverOptions) -> str:
+    return f"the residuals are at right angles to every tangent (cosine {slope:.2g} ≤ {options.gradient_tolerance:.2g})"
+
+
+def _stall(strategy: Strategy, rejected: int, lost: int) -> str:
+    if lost:
+        return (
+            f"every step of the last {rejected} that were tried makes residuals invalid ({lost} at most): the way down is blocked"
+        )
+    return (
+        f"{rejected} steps in a row were rejected and the next is too small to matter ({strategy.name} at "
+        f"{strategy.parameter:.2g}): the cost does not fall where the Jacobians say; check those of your own with check_jacobian"
+    )

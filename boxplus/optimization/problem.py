@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
@@ -77,11 +78,10 @@ class Problem:
             )
         rows = [c[:] if isinstance(c, Variables) else c for c in connections]
         for connection in rows:
-            if not any(connection.block is block for block in self.blocks):
-                raise InputError(
-                    "variables of this problem", f"{connection.block!r} of another one", "add them with `add_variables` first"
-                )
+            self._require_own(connection)
         label = name if name is not None else f"{type(residual).__name__}_{len(self.groups)}"
+        if any(group.name == label for group in self.groups):
+            raise InputError("a new name", f"{label!r}, which another group has", "choose another name")
         self.groups.append(Group(residual, rows, loss if loss is not None else Squared(), label))
         self._analysed = None
         return self.groups[-1]
@@ -96,8 +96,17 @@ class Problem:
 
     def _set_fixed(self, selected: VariableRows | Variables, fixed: bool) -> None:
         rows = selected[:] if isinstance(selected, Variables) else selected
-        rows.block.is_fixed[rows.rows] = fixed
+        self._require_own(rows)
+        is_fixed = rows.block.is_fixed.copy()
+        is_fixed[rows.rows] = fixed
+        is_fixed.flags.writeable = False
+        rows.block.is_fixed = is_fixed
         self._analysed = None
+
+    def _require_own(self, rows: VariableRows) -> None:
+        if not (isinstance(rows, VariableRows) and any(rows.block is block for block in self.blocks)):
+            what = f"{rows.block!r} of another one" if isinstance(rows, VariableRows) else f"{rows!r}"
+            raise InputError("variables of this problem", what, "use a block that `add_variables` returned, or rows of it")
 
     def cost(self, values: Solution | Sequence[NDArray[np.float64]] | None = None) -> float:
         """½ Σ ρ(‖W r‖²) at `values`, by default the variables' own."""
@@ -120,7 +129,8 @@ class Problem:
 
         Args:
             options: see `SolverOptions`; single settings may be given as keywords instead: `solve(max_iterations=20)`.
-            start: where to start, another solution or the values of every block; the variables' own values otherwise.
+            start: where to start, another solution or the values of every block; the variables' own values otherwise. Fixed
+                variables are held where it has them.
             callback: called with every `Iteration`; returns True to stop.
 
         Raises:
@@ -131,7 +141,7 @@ class Problem:
         begin = time.perf_counter()
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
-        options = options if options is not None else SolverOptions(**settings)
+        options = options if options is not None else _options(settings)
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0
@@ -158,13 +168,13 @@ class Problem:
         )
 
     def values_at(self, given: Solution | Sequence[NDArray[np.float64]] | None = None) -> list[NDArray[np.float64]]:
-        """Values (n, size) of every block at a solution or as given, fixed variables at theirs; by default the blocks' own.
+        """Values (n, size) of every block at a solution or as given, fixed variables too; by default copies of the blocks' own.
 
         Raises:
             InputError: another number of blocks or variables, points that are not on their manifolds.
         """
         if given is None:
-            return [block.values for block in self.blocks]
+            return [block.values.copy() for block in self.blocks]
         values = given.values if isinstance(given, Solution) else given
         if len(values) != len(self.blocks):
             raise InputError(f"values of {len(self.blocks)} blocks", f"{len(values)}", "give one array for each block")
@@ -174,7 +184,7 @@ class Problem:
                 raise InputError(
                     f"{block.name} of shape {block.values.shape}", f"shape {np.shape(array)}", "keep the block's shape"
                 )
-            checked.append(np.where(block.is_fixed[:, None], block.values, block.manifold.check(block.name, array)))
+            checked.append(block.manifold.check(block.name, array))
         return checked
 
     def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, tuple[str, ...], float]:
@@ -191,3 +201,13 @@ class Problem:
             model = LeastSquares(layout, self.groups, system, options.threads)
             self._analysed = (key, model, tuple(self.defects()))
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin
+
+
+def _options(settings: dict[str, Any]) -> SolverOptions:
+    try:
+        return SolverOptions(**settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = ", ".join(SolverOptions.model_fields)
+        raise InputError(f"settings of SolverOptions ({known})", f"{where}: {first['msg']}", "correct that setting") from None

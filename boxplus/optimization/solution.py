@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.variables import VariableRows, Variables
@@ -19,7 +20,7 @@ class Iteration:
 
     Attributes:
         number: from 1; 0 is the start.
-        cost: at the accepted point after it.
+        cost: at the accepted point after it. It falls from one to the next, but where residuals become valid that were not.
         tried_cost: at the point it led to; infinite where that could not be evaluated.
         gradient: largest entry of the gradient at the accepted point.
         step: largest entry of the step.
@@ -73,9 +74,17 @@ class Solution:
 
     def __getitem__(self, selected: Variables | VariableRows) -> NDArray[np.float64]:
         """Values (n, size) of a block, or (k, size) of rows of it."""
-        if isinstance(selected, Variables):
-            return self.values[selected.number]
-        return self.values[selected.block.number][selected.rows]
+        rows = self._own(selected)
+        values = self.values[rows.block.number]
+        return values if isinstance(selected, Variables) else values[rows.rows]
+
+    def _own(self, selected: VariableRows | Variables) -> VariableRows:
+        rows = selected[:] if isinstance(selected, Variables) else selected
+        if not (isinstance(rows, VariableRows) and any(rows.block is block for block in self._problem.layout.blocks)):
+            raise InputError(
+                "variables of the problem that was solved", f"{selected!r}", "use a block that `add_variables` returned"
+            )
+        return rows
 
     @property
     def iterations(self) -> int:
@@ -97,8 +106,8 @@ class Solution:
         Raises:
             SingularProblemError: an unobservable direction of the problem moves one of these variables.
         """
-        rows = _rows(first)
-        return self._covariances.blocks(rows, rows if second is None else _rows(second))
+        rows = self._own(first)
+        return self._covariances.blocks(rows, rows if second is None else self._own(second))
 
     def joint_covariance(self, *selected: VariableRows | Variables) -> NDArray[np.float64]:
         """Covariance (D, D) of all selected variables together, their tangents one after the other in the order given.
@@ -106,7 +115,7 @@ class Solution:
         Raises:
             InputError, SingularProblemError: as for `covariance`.
         """
-        return self._covariances.joint([_rows(rows) for rows in selected])
+        return self._covariances.joint([self._own(rows) for rows in selected])
 
     def standard_deviations(self, selected: VariableRows | Variables) -> NDArray[np.float64]:
         """Square roots (k, dof) of the diagonals of `covariance`, in the units of the tangents; zero where fixed.
@@ -127,7 +136,3 @@ class Solution:
         ]
         lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
         return "\n".join([*lines, *self.notes])
-
-
-def _rows(selected: VariableRows | Variables) -> VariableRows:
-    return selected[:] if isinstance(selected, Variables) else selected

@@ -21,7 +21,9 @@ class SolverOptions(BaseModel):
     time_limit_s: float | None = Field(None, gt=0, description="[s] no further step is begun after this time")
     cost_tolerance: float = Field(1e-9, ge=0, description="converged when a step changes the cost by less than this share of it")
     step_tolerance: float = Field(1e-10, ge=0, description="converged when no tangent moves by more than this")
-    gradient_tolerance: float = Field(1e-10, ge=0, description="converged when no entry of the gradient exceeds this")
+    gradient_tolerance: float = Field(
+        1e-10, ge=0, description="converged when no column of J encloses an angle with r whose |cos| exceeds this"
+    )
     initial_damping: float = Field(1e-5, gt=0, description="λ at the start of Levenberg-Marquardt, relative to the diagonal of H")
     damping: Literal["diagonal", "identity"] = Field(
         "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start as in SPEC 2.2"

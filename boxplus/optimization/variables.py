@@ -21,13 +21,14 @@ class Variables:
         manifold: of every variable of the block.
         name: for messages.
         values: (n, size) as given; a solution has its own.
-        is_fixed: (n,) bool, held at `values` by the solver.
+        is_fixed: (n,) bool, held where they start by the solver; set by `Problem.fix` and `free` only.
         number: of the block in its problem.
     """
 
     def __init__(self, number: int, name: str, manifold: Manifold, values: NDArray[np.float64]) -> None:
         self.number, self.name, self.manifold, self.values = number, name, manifold, values
         self.is_fixed = np.zeros(len(values), dtype=np.bool_)
+        self.is_fixed.flags.writeable = False
 
     def __len__(self) -> int:
         return len(self.values)
@@ -56,6 +57,8 @@ class VariableRows:
         given = np.asarray(rows)
         if given.dtype == np.bool_ and given.shape == (len(block),):
             given = np.flatnonzero(given)
+        if given.size == 0:
+            given = given.astype(np.int64)
         if given.ndim > 1 or not np.issubdtype(given.dtype, np.integer):
             raise InputError(
                 f"integer rows of {block.name!r}, one-dimensional",

@@ -103,6 +103,7 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
         measured, at = graph.measurements[:, 1:], slice(1, 3)
     steps = np.einsum("nab,nb->na", R[i], measured)
     start[:, at] = _translations(len(graph.ids), i, j, steps, tau, roots, start[roots, at])
+    start[roots] = _at_held(graph, roots)[roots]  # to the last bit
     return start
 
 

@@ -64,12 +64,10 @@ def test_schur_is_chosen_for_scenes_and_refused_where_it_is_impossible():
     assert "sparse" in make_ring(40).problem.solve().linear_solver
 
 
-def test_covariance_is_the_inverse_of_the_normal_matrix_and_zero_where_known(scene=None):
+def test_covariance_is_the_inverse_of_the_normal_matrix_and_zero_where_known():
     scene = make_scene()
     for solver in ("dense", "sparse", "schur"):
         solution = scene.problem.solve(linear_solver=solver)
-        scene.problem.cost(solution)
-        model_of(scene.problem, "dense")
         covariance = solution.covariance(scene.points[[0, 5]])
         cross = solution.covariance(scene.points[[0, 5]], scene.cameras[[3, 4]])
         known = solution.covariance(scene.cameras[[0]])

@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from boxplus import SE3, Euclidean, InputError, NotFiniteError, Problem, SE3Left, SingularProblemError, SolverOptions, losses
-from boxplus.residuals import Prior, RelativePose
+from boxplus.residuals import Prior, RelativePose, Residual
+from boxplus.residuals.whitening import Whitening
 from tests.optimization.conftest import make_ring, make_scene
 
 METHODS = ("levenberg_marquardt", "gauss_newton", "dogleg")
@@ -52,7 +53,7 @@ def test_scene_reaches_the_minimum_that_scipy_finds(linear_solver):
     scene = make_scene(cameras=4, points=15)
     solution = scene.problem.solve(linear_solver=linear_solver)
     assert solution.status == "converged"
-    assert linear_solver.split("_")[0] in solution.linear_solver.lower()
+    assert solution.linear_solver.lower().startswith(linear_solver)
     assert solution.cost == pytest.approx(scipy_minimum(scene.problem), rel=1e-7)
 
 
@@ -90,7 +91,7 @@ def test_accepted_cost_never_rises_and_history_tells_the_story(scene):
 def test_the_number_of_threads_does_not_change_a_bit(linear_solver):
     results = []
     for threads in (1, 2, 3):
-        scene = make_scene(cameras=8, points=300)
+        scene = make_scene(cameras=6, points=5000)
         solution = scene.problem.solve(linear_solver=linear_solver, threads=threads, max_iterations=6)
         results.append([values.tobytes() for values in solution.values])
     assert results[0] == results[1] == results[2]
@@ -113,7 +114,7 @@ def test_a_second_solve_starts_where_it_is_told(scene):
     assert again.cost == pytest.approx(first.cost, rel=1e-9)
 
 
-def test_points_behind_a_camera_are_counted_and_steps_do_not_push_them_there(scene):
+def test_points_behind_a_camera_are_counted(scene):
     values = scene.points.values.copy()
     values[3] = [0.0, 0.0, -5.0]
     solution = scene.problem.solve(start=[scene.cameras.values, values])
@@ -121,6 +122,104 @@ def test_points_behind_a_camera_are_counted_and_steps_do_not_push_them_there(sce
     assert solution.invalid == {"pixels": seen}
     assert f"{seen} residuals of group 'pixels' could not be evaluated" in solution.summary()
     np.testing.assert_array_equal(solution[scene.points[3]][0], values[3])
+
+
+class Walled(Residual):
+    """r = x − target where x > wall, else singular; `slope` is what its Jacobian claims, 1 in truth."""
+
+    def __init__(self, target: float, wall: float, slope: float = 1.0) -> None:
+        line = Euclidean(1)
+        super().__init__(dim=1, count=1, manifolds=(line,), roles=("x",), whitening=Whitening.of(1, 1))
+        self.target, self.wall, self.slope = target, wall, slope
+
+    def evaluate_into(self, begin, end, x, index, r, valid):
+        at = x[0][index[0][begin:end], 0]
+        valid[begin:end] = at > self.wall
+        r[begin:end, 0] = np.where(at > self.wall, at - self.target, 0.0)
+
+    def linearize_into(self, begin, end, x, index, r, jacobians, valid):
+        self.evaluate_into(begin, end, x, index, r, valid)
+        jacobians[0][begin:end, 0, 0] = np.where(valid[begin:end], self.slope, 0.0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_step_that_makes_a_residual_invalid_is_not_taken(method):
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[3.0]])
+    problem.add_residuals(Walled(target=-1.0, wall=0.0), x)
+    solution = problem.solve(method=method)
+    assert solution[x][0, 0] > 0.0
+    assert solution.status != "converged"
+    assert method == "gauss_newton" or "makes residuals invalid" in solution.reason
+
+
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "dogleg"])
+def test_a_wrong_jacobian_stalls_and_does_not_converge(method):
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[1.0]])
+    problem.add_residuals(Walled(target=5.0, wall=-1e9, slope=-1.0), x)
+    solution = problem.solve(method=method)
+    assert solution.status == "stalled" and "check_jacobian" in solution.reason
+    assert solution[x][0, 0] == 1.0
+
+
+def test_a_jacobian_that_becomes_nan_on_the_way_is_named():
+    class Breaking(Walled):
+        def linearize_into(self, begin, end, x, index, r, jacobians, valid):
+            super().linearize_into(begin, end, x, index, r, jacobians, valid)
+            jacobians[0][np.abs(r[:, 0]) < 1.0] = np.nan
+
+    for method in METHODS:
+        problem = Problem()
+        x = problem.add_variables(Euclidean(1), [[3.0]], name="x")
+        problem.add_residuals(Breaking(target=1.0, wall=-1e9), x, name="breaking")
+        with pytest.raises(NotFiniteError, match=r"Jacobian with respect to x .* of group 'breaking'"):
+            problem.solve(method=method)
+
+
+def test_a_start_where_nothing_can_be_evaluated_is_refused():
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[-3.0]])
+    problem.add_residuals(Walled(target=1.0, wall=0.0), x)
+    with pytest.raises(InputError, match="none that can"):
+        problem.solve()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
+def test_units_do_not_decide_what_is_converged(method, sigma):
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[0.0]])
+    problem.add_residuals(Prior(Euclidean(1), [[5.0], [7.0]], sigma=sigma), x[[0, 0]])
+    solution = problem.solve(method=method)
+    assert solution.status == "converged"
+    assert solution[x][0, 0] == pytest.approx(6.0, rel=1e-6)
+
+
+def test_values_are_nobody_elses(scene):
+    problem, points = scene.problem, scene.points
+    problem.fix(points)
+    solution = problem.solve(max_iterations=0)
+    assert not np.shares_memory(solution[points], points.values)
+    other = make_scene().points
+    for misuse in (lambda: solution[other], lambda: solution.covariance(other[0]), lambda: problem.fix(other)):
+        with pytest.raises(InputError, match="variables of th"):
+            misuse()
+    problem.free(points[[]])
+    assert points.is_fixed.all()
+    with pytest.raises(ValueError, match="read-only"):
+        points.is_fixed[0] = False
+
+
+def test_fixed_variables_are_held_where_the_start_has_them():
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[1.0], [1.0]])
+    problem.add_residuals(Prior(Euclidean(1), [[3.0], [5.0]]), x)
+    first = problem.solve()
+    problem.fix(x[0])
+    second = problem.solve(start=first)
+    assert second[x][0, 0] == first[x][0, 0] == pytest.approx(3.0)
+    assert problem.cost(first) == first.cost
 
 
 @pytest.mark.parametrize(

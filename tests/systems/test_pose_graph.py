@@ -63,7 +63,7 @@ def test_fixed_poses_of_the_file_are_held():
     held = PoseGraph(3, graph.ids, truth, graph.edges, graph.measurements, graph.information, np.array([4, 9]))
     result = optimize_pose_graph(held)
     np.testing.assert_array_equal(result.held, [4, 9])
-    np.testing.assert_allclose(result.graph.poses[[4, 9]], truth[[4, 9]], rtol=1e-15)
+    np.testing.assert_array_equal(result.graph.poses[[4, 9]], held.poses[[4, 9]])
     assert np.abs(SE3.boxminus(result.graph.poses, truth)).max() < 0.2
 
 
