@@ -55,10 +55,10 @@ def test_every_cell_runs_and_prints_what_is_shown(monkeypatch: pytest.MonkeyPatc
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(compile("".join(cell["source"]), f"cell {number}", "exec"), scope)
-        if "varies" in tags(cell):
-            assert "SingularProblemError: the problem does not determine its variables" in printed.getvalue()
-            continue
-        assert without_numbers(printed.getvalue()) == without_numbers(shown(cell)), f"cell {number}"
+        now, then = without_numbers(printed.getvalue()), without_numbers(shown(cell))
+        if "error" in tags(cell):  # its wording has tests of its own
+            now, then = now.splitlines()[-1][:40], then.splitlines()[-1][:40]
+        assert now == then, f"cell {number}"
     assert len(plt.get_fignums()) == 1
     plt.close("all")
     # What the text claims.
