@@ -4,9 +4,9 @@
 
 Each system gets the graph in its own form; reading and building it is not timed. Timed is everything from there to the optimum:
 boxplus builds its problem, initialises and solves (`optimize_pose_graph`); GTSAM initialises by its chordal relaxation and
-runs Gauss-Newton, or runs it from the file's poses where it has no initialisation (in the plane). An opponent that ends in another minimum has lost and is left
-out of the ratio. They take turns on one core, and the fastest round counts, as the machine is shared. GTSAM is left out with a
-message where it is not installed. g2o does not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11
+runs Gauss-Newton, or runs it from the file's poses where it has no initialisation (in the plane). An opponent that ends in another
+minimum has lost and is left out of the ratio. They take turns on one core, and the fastest round counts, as the machine is shared.
+GTSAM is left out with a message where it is not installed. g2o does not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11
 and 0.0.12).
 """
 

@@ -57,13 +57,13 @@ def _optimize_pose_graphs() -> None:
     count = 60  # more than the dense solver takes
     i = np.arange(count)
     edges = np.concatenate([np.stack([i, (i + 1) % count], 1), np.stack([i, (i + 7) % count], 1)])
-    for dimension, manifold, group in ((2, SE2, se2), (3, SE3, se3)):
+    for manifold, group in ((SE2, se2), (SE3, se3)):
         poses = manifold.random(np.random.default_rng(0), count)
         measured = group.compose(group.inverse(poses[edges[:, 0]]), poses[edges[:, 1]])
         measured = manifold.boxplus(measured, np.full((len(edges), manifold.dof), 0.01))
         information = np.tile(np.eye(manifold.dof), (len(edges), 1, 1))
         none = np.zeros(0, dtype=np.int64)
-        graph = PoseGraph(dimension, i, poses, edges, measured, information, none)
+        graph = PoseGraph(2 if manifold is SE2 else 3, i, poses, edges, measured, information, none)
         optimize_pose_graph(graph)
         problem, variables = pose_graph_problem(graph, loss=Huber(1.0))
         problem.solve().covariance(variables[[1]])
