@@ -2,12 +2,12 @@
 
     python benchmarks/bench_graphs.py [--graphs ../shared/data/graphs] [--only torus3D intel] [--rounds 5]
 
-Each system gets the graph in its own form; reading and building it is not timed. Timed is everything from there to the optimum:
-boxplus builds its problem, initialises and solves (`optimize_pose_graph`); GTSAM initialises by its chordal relaxation and
-runs Gauss-Newton, or runs it from the file's poses where it has no initialisation (in the plane). An opponent that ends in another
-minimum has lost and is left out of the ratio. They take turns on one core, and the fastest round counts, as the machine is shared.
-GTSAM is left out with a message where it is not installed. g2o does not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11
-and 0.0.12).
+Each system gets the graph in its own form; reading and building it is not timed. Timed is everything from there to
+the optimum: boxplus builds its problem, initialises and solves (`optimize_pose_graph`); GTSAM initialises by its
+chordal relaxation and runs Gauss-Newton, or runs it from the file's poses where it has no initialisation (in the
+plane). An opponent that ends in another minimum has lost and is left out of the ratio. They take turns on one core,
+and the fastest round counts, as the machine is shared. GTSAM is left out with a message where it is not installed.
+g2o does not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11 and 0.0.12).
 """
 
 from __future__ import annotations
