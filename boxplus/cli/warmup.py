@@ -63,7 +63,7 @@ def _optimize_pose_graphs() -> None:
         measured = manifold.boxplus(measured, np.full((len(edges), manifold.dof), 0.01))
         information = np.tile(np.eye(manifold.dof), (len(edges), 1, 1))
         none = np.zeros(0, dtype=np.int64)
-        graph = PoseGraph(2 if manifold is SE2 else 3, i, poses, edges, measured, information, none)
+        graph = PoseGraph(2 if manifold is SE2 else 3, i, None, edges, measured, information, none)
         optimize_pose_graph(graph)
         problem, variables = pose_graph_problem(graph, loss=Huber(1.0))
         problem.solve().covariance(variables[[1]])
@@ -73,6 +73,8 @@ def _adjust_bundle() -> None:
     import numpy as np
 
     from boxplus.formats.bal import BalProblem
+    from boxplus.formats.gbp import GbpProblem
+    from boxplus.manifolds import se3
     from boxplus.systems.bundle_adjustment import adjust_bundle
 
     rng = np.random.default_rng(0)
@@ -81,3 +83,5 @@ def _adjust_bundle() -> None:
     camera_of, point_of = (index.reshape(-1) for index in np.indices((20, 100)))
     pixels = -500.0 * points[point_of, :2] / points[point_of, 2:]
     adjust_bundle(BalProblem(cameras, points, camera_of, point_of, pixels))
+    poses = se3.exp(cameras[:, :6])
+    adjust_bundle(GbpProblem(np.array([500.0, 500.0, 0.0, 0.0]), poses, -points, camera_of, point_of, -pixels))

@@ -91,10 +91,17 @@ def optimize_pose_graph(
     """Minimise ½ Σ ρ(eᵀ Ω e) with e = Log(Z⁻¹ T_i⁻¹ T_j), or the chordal objective, over the poses.
 
     Raises:
-        InputError: the start asked for is not in the file; an information matrix is only semi-definite.
+        InputError: no edges; the start asked for is not in the file.
         SingularProblemError: see `Problem.solve`.
     """
     config = config if config is not None else PoseGraphConfig()
+    if not len(graph.edges):
+        raise InputError(
+            "a graph with edges", f"{len(graph.ids)} poses and none ({graph.source})", "measure relative poses first"
+        )
+    options = config.solver
+    if "initial_damping" not in options.model_fields_set:
+        options = options.model_copy(update={"initial_damping": _DAMPING})
     begin = time.perf_counter()
     held = held_poses(graph)
     problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
@@ -102,11 +109,10 @@ def optimize_pose_graph(
     costs = {name: problem.cost([start]) for name, start in candidates.items()}
     chosen = min(candidates, key=lambda name: costs[name])
     prepared = time.perf_counter()
-    solution = problem.solve(config.solver, start=[candidates[chosen]], callback=callback)
+    solution = problem.solve(options, start=[candidates[chosen]], callback=callback)
     solved = time.perf_counter()
-    squared_start, squared = (
-        _squared_errors(graph, poses_at, config.objective) for poses_at in (candidates[chosen], solution[poses])
-    )
+    residual = problem.groups[0].residual
+    squared_start, squared = (_squared_errors(residual, graph, at) for at in (candidates[chosen], solution[poses]))
     return PoseGraphResult(
         graph=replace(graph, poses=solution[poses]),
         start=chosen,
@@ -147,7 +153,7 @@ def pose_graph_problem(
 
 def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "logarithm") -> float:
     """The objective over the edges, for poses laid out as in the graph, without any robust loss and without ½."""
-    return float(_squared_errors(graph, poses, objective).sum())
+    return float(_squared_errors(_residual(graph, objective), graph, poses).sum())
 
 
 def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,15 +161,11 @@ def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float6
     return poses[:, 4:] if graph.dimension == 3 else np.column_stack([poses[:, 1:], np.zeros(len(poses))])
 
 
-def _squared_errors(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective) -> NDArray[np.float64]:
+def _squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m,) what every edge adds to chi2."""
     i, j = graph.edges.T
-    residual = _residual(graph, objective)
-    e = residual.evaluate(poses[i], poses[j])
-    if objective == "chordal":
-        weighted = np.einsum("nab,nb->na", residual.whitening.factors, e)
-        return np.asarray(np.einsum("na,na->n", weighted, weighted))
-    return np.asarray(np.maximum(np.einsum("na,nab,nb->n", e, graph.information, e, optimize=True), 0.0))
+    whitened = np.einsum("nab,nb->na", residual.whitening.factors, residual.evaluate(poses[i], poses[j]))
+    return np.asarray((whitened * whitened).sum(axis=1))
 
 
 def _residual(graph: PoseGraph, objective: Objective) -> Residual:
