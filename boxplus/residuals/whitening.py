@@ -40,8 +40,8 @@ class Whitening:
 
         Args:
             dim, count: d rows of a residual, N residuals.
-            sigma: standard deviation in the unit of the residual: a number, (d,) one for each row of a residual, (N, 1) one for each
-                residual, or (N, d).
+            sigma: standard deviation in the unit of the residual: a number, (d,) one for each row of a residual,
+                (N, 1) one for each residual, or (N, d).
             covariance, information: (d, d) or (N, d, d), symmetric and positive definite. An information matrix may be
                 semi-definite: along its null space the residual says nothing.
 
