@@ -215,7 +215,8 @@ def _shared_directions(
         is_complete = basis.shape[1] < min(_SUBSPACE, len(places))
         for part in _separated(basis) if basis.shape[1] else ():
             tangents = part / scale[places][:, None]
-            reach = np.abs(tangents) / np.abs(tangents).max(axis=0)
+            # In the units of the tangents or in those of their noise, whichever shows more.
+            reach = np.maximum(np.abs(tangents) / np.abs(tangents).max(axis=0), np.abs(part) / np.abs(part).max(axis=0))
             variable = np.repeat(np.arange(len(layout.sizes)), layout.sizes)[places]
             moved = np.unique(variable[reach.max(axis=1) > _MOVED])
             kept = np.isin(variable, moved)
