@@ -159,6 +159,13 @@ def _test(
     _leave_out(problem, shared, own, B)
     weight, basis = np.linalg.eigh(B.T @ B)
     able = weight > _IS_DEPENDENT * weight[-1]
+    if able.sum() >= len(B):
+        # So few tangents that some turn and scale explains any direction: only what is plainly a translation counts.
+        B[:, [0, 1, 2, 6]] = 0.0
+        weight, basis = np.linalg.eigh(B.T @ B)
+        able = weight > _IS_DEPENDENT * weight[-1]
+    if not able.any():
+        return _World(np.zeros((DOF, 0)), np.zeros((len(Q), 0)), centre, extent, planar)
     onto = basis[:, able] / np.sqrt(weight[able])
     inside = Q.T @ B @ onto
     outside, rotation = np.linalg.eigh(np.eye(inside.shape[1]) - inside.T @ inside)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.singularity import refuse_free_step
+from boxplus.optimization.singularity import refuse_free_step, refuse_singular
 from boxplus.optimization.strategy import Step, Strategy, inner
 
 _HALVINGS = 20
@@ -20,15 +20,19 @@ class GaussNewton(Strategy):
     def __init__(self) -> None:
         self.parameter = 1.0
         self._full: NDArray[np.float64] | None = None
+        self._is_tested = False
 
     def propose(self, problem: LeastSquares) -> Step | None:
         """See `Strategy.propose`.
 
         Raises:
-            SingularProblemError: the step goes where nothing is measured.
+            SingularProblemError: a direction is not measured by anything.
         """
         if self._full is None:
             full = problem.solve(None)
+            if not self._is_tested:
+                refuse_singular(problem)
+                self._is_tested = True
             refuse_free_step(problem, full)
             self._full = full
             self.parameter = 1.0

@@ -213,11 +213,11 @@ def _shared_directions(
     shared = []
     for component, places, basis in zip(active, index, bases, strict=True):
         is_complete = basis.shape[1] < min(_SUBSPACE, len(places))
-        for part in _separated(basis) if basis.shape[1] else ():
+        variable = np.repeat(np.arange(len(layout.sizes)), layout.sizes)[places]
+        for part in _separated(basis, variable) if basis.shape[1] else ():
             tangents = part / scale[places][:, None]
             # In the units of the tangents or in those of their noise, whichever shows more.
             reach = np.maximum(np.abs(tangents) / np.abs(tangents).max(axis=0), np.abs(part) / np.abs(part).max(axis=0))
-            variable = np.repeat(np.arange(len(layout.sizes)), layout.sizes)[places]
             moved = np.unique(variable[reach.max(axis=1) > _MOVED])
             kept = np.isin(variable, moved)
             shared.append(SharedDirections(int(component), moved, places[kept], tangents[kept], scale[places][kept], is_complete))
@@ -332,12 +332,13 @@ def _chunks(rows: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
         yield rows[begin : begin + _CHUNK]
 
 
-def _separated(basis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The same space as bases of motions that have no moving part in common."""
+def _separated(basis: NDArray[np.float64], variable: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """The same space as bases of motions that have no variable in common; `variable` (d,) is that of each tangent."""
     from scipy.sparse.csgraph import connected_components
 
     reduced = basis @ np.linalg.inv(basis[_pivot_rows(basis)])
-    moved = np.abs(reduced) > _MOVED * np.abs(reduced).max(axis=0)
+    moves = np.abs(reduced) > _MOVED * np.abs(reduced).max(axis=0)
+    moved = np.logical_or.reduceat(moves, np.flatnonzero(np.diff(variable, prepend=-1)), axis=0)
     _, label = connected_components(moved.T.astype(np.int64) @ moved.astype(np.int64) > 0, directed=False)
     return [reduced[:, label == k] for k in np.unique(label)]
 

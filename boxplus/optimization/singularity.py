@@ -74,6 +74,20 @@ def explain_singularity(problem: LeastSquares, error: NotPositiveDefinite | None
     return "the problem does not determine its variables: " + "; ".join(sentences)
 
 
+def refuse_singular(problem: LeastSquares) -> None:
+    """Refuse a system that was factorised without damping and that only rounding keeps from being singular.
+
+    A solve with a random right-hand side goes along the weakest direction; its curvature comes for the price of that solve.
+
+    Raises:
+        SingularProblemError: an unobservable direction was found.
+    """
+    scale = np.sqrt(problem.system.diagonal)
+    right = scale * np.random.default_rng(0).standard_normal(len(scale))
+    x = problem.system.solve(right)
+    _refuse_if_weak(problem, x, float(x @ right))
+
+
 def refuse_free_step(problem: LeastSquares, delta: NDArray[np.float64]) -> None:
     """Refuse an undamped step that goes along a direction which only rounding keeps H from being singular in.
 
@@ -82,9 +96,12 @@ def refuse_free_step(problem: LeastSquares, delta: NDArray[np.float64]) -> None:
     Raises:
         SingularProblemError: δ (dof,) is such a step.
     """
-    slope = -float(problem.system.gradient @ delta)
-    length = float(delta @ (problem.system.diagonal * delta))
-    if length == 0.0 or slope > _SUSPICIOUS * length:
+    _refuse_if_weak(problem, delta, -float(problem.system.gradient @ delta))
+
+
+def _refuse_if_weak(problem: LeastSquares, direction: NDArray[np.float64], curvature: float) -> None:
+    length = float(direction @ (problem.system.diagonal * direction))
+    if length == 0.0 or curvature > _SUSPICIOUS * length:
         return
     space = find_null_space(problem)
     if not space.is_empty:

@@ -214,6 +214,23 @@ def test_unknown_freedoms_are_given_by_their_tangents():
     assert "gains[0, 1] can move freely along (" in text and "residuals touching them: sum (1 UserResidual)" in text
 
 
+def test_a_direction_of_few_tangents_is_not_made_a_motion_of_the_world():
+    problem = Problem()
+    marks = problem.add_variables(Euclidean(3), [[1.0, 2.0, 3.0], [3.0, 1.0, 0.0]], name="marks")
+    A = np.random.default_rng(0).standard_normal((5, 3))
+    B = np.random.default_rng(1).standard_normal((5, 3))
+    mixed = UserResidual(
+        lambda a, b, A, B: A @ a + B @ b - 1.0, manifolds=(Euclidean(3), Euclidean(3)), dim=5, data=(A[None], B[None])
+    )
+    problem.add_residuals(mixed, marks[0], marks[1], name="mixed")
+    assert "marks[0, 1] can move freely along (" in message(problem)
+    sides = UserResidual(lambda a, b: b - a - 1.0, manifolds=(Euclidean(3), Euclidean(3)), dim=3, count=1)
+    other = Problem()
+    pair = other.add_variables(Euclidean(3), [[1.0, 2.0, 3.0], [3.0, 1.0, 0.0]], name="pair")
+    other.add_residuals(sides, pair[0], pair[1], name="sides")
+    assert "translation in any direction of them is unconstrained" in message(other)
+
+
 def test_variables_without_effect_are_told_from_variables_without_residuals():
     problem = Problem()
     x = problem.add_variables(Euclidean(2), np.ones((3, 2)), name="x")
