@@ -6,8 +6,8 @@ Each system gets the graph in its own form; reading it and building the problem 
 from there to the optimum, initialisation, ordering and symbolic analysis included. Both run from the file's poses where it has
 any, and from their own initialisation: the chordal relaxation, for GTSAM in space only, and a spanning tree in the plane. Whoever
 does not arrive at the known optimum has lost, boxplus included; the faster of each one's runs that do counts. They take turns on
-one core, and the fastest round counts, as the machine is shared. GTSAM is left out with a message where it is not installed. g2o does
-not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11 and 0.0.12).
+one core, and the fastest round counts, as the machine is shared. GTSAM is left out with a message where it is not installed. g2o
+does not take part: its wheels crash when an information matrix is set (g2o-python 0.0.11 and 0.0.12).
 """
 
 from __future__ import annotations

@@ -177,9 +177,20 @@ def run_chunks(work: Callable[[int, int, int], None], items: int, chunk: int, th
     """
     bounds = [(index, begin, min(begin + chunk, items)) for index, begin in enumerate(range(0, items, chunk))]
     if threads <= 1 or len(bounds) <= 1:
-        for index, begin, end in bounds:
-            work(index, begin, end)
-    else:
-        for future in [_pool(threads).submit(work, *bound) for bound in bounds]:
-            future.result()
+        for bound in bounds:
+            work(*bound)
+        return len(bounds)
+    pending = iter(bounds)  # taking the next one is atomic
+
+    def drain() -> None:
+        for bound in pending:
+            work(*bound)
+
+    # The caller works too: it need not wait for a thread to wake up, and a short piece of work is over before one does.
+    helpers = [_pool(threads).submit(drain) for _ in range(min(threads, len(bounds)) - 1)]
+    try:
+        drain()
+    finally:
+        for helper in helpers:
+            helper.result()
     return len(bounds)

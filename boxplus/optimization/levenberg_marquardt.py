@@ -13,7 +13,7 @@ from boxplus.optimization.strategy import Step, Strategy, inner
 
 # Smaller entries of diag(H), as a share of the largest, do not scale the damping: a direction without information is damped too.
 _LEAST_DIAGONAL = 1e-14
-_LARGEST_DAMPING = 1e16
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-16, 1e16
 
 
 class LevenbergMarquardt(Strategy):
@@ -56,6 +56,6 @@ class LevenbergMarquardt(Strategy):
         if ratio is None or not ratio > 0.0:
             self._grow()
             return False
-        self.parameter *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        self.parameter = max(self.parameter * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), _LEAST_DAMPING)
         self._growth = 2.0
         return True

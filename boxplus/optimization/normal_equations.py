@@ -20,7 +20,13 @@ from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.optimization.product_tiles import add_sums, tile_of
 
-_CHUNK = 512  # blocks of H that a thread gathers in one go
+# Pieces for every thread, so that one with more work does not hold up the others; more cost more calls than they even out.
+_PIECES = 4
+
+
+def piece(items: int, threads: int) -> int:
+    """How many of `items` a thread takes in one go, where the results do not depend on it."""
+    return max(1, -(-items // (_PIECES * threads)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +87,7 @@ def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> N
     def work(_: int, first: int, last: int) -> None:
         add_sums(tile, 1.0, first, last, gather.target, gather.begin, gather.residual, gather.residual, Ja, Jb, values)
 
-    run_chunks(work, len(gather.target), _CHUNK, threads)
+    run_chunks(work, len(gather.target), piece(len(gather.target), threads), threads)
 
 
 def add_gradient(gather: Gather, gradient: NDArray[np.float64], threads: int) -> None:
@@ -92,7 +98,7 @@ def add_gradient(gather: Gather, gradient: NDArray[np.float64], threads: int) ->
     def work(_: int, first: int, last: int) -> None:
         _accumulate_gradient(first, last, gather.target, gather.begin, gather.residual, J, group.r, gradient)
 
-    run_chunks(work, len(gather.target), _CHUNK, threads)
+    run_chunks(work, len(gather.target), piece(len(gather.target), threads), threads)
 
 
 class NormalEquations:

@@ -17,7 +17,7 @@ from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import LinearSystem
-from boxplus.optimization.normal_equations import Gather, NormalEquations, add_gradient, add_products
+from boxplus.optimization.normal_equations import Gather, NormalEquations, add_gradient, add_products, piece
 from boxplus.optimization.product_tiles import add_sums, tile_of
 from boxplus.optimization.schur_kernels import (
     factorize_eliminated,
@@ -29,9 +29,6 @@ from boxplus.optimization.schur_kernels import (
 )
 from boxplus.optimization.schur_structure import Entries, Products, build_entries, build_products, eliminated_numbers
 from boxplus.optimization.variables import Variables
-
-# Items that a thread takes in one go.
-_VARIABLES, _ENTRIES, _BLOCKS, _KEPT = 2048, 1024, 16, 4
 
 
 class SchurSystem(LinearSystem):
@@ -88,12 +85,13 @@ class SchurSystem(LinearSystem):
 
     def _eliminate(self, damping: NDArray[np.float64]) -> None:
         """C + D = L Lᵀ and Z = W L⁻ᵀ, W straight from the Jacobians: it is never stored."""
-        failed = np.full(max(1, -(-len(self._C) // _VARIABLES)), -1, dtype=np.int64)
+        size = piece(len(self._C), self._threads)
+        failed = np.full(max(1, -(-len(self._C) // size)), -1, dtype=np.int64)
 
         def invert(chunk: int, begin: int, end: int) -> None:
             failed[chunk] = factorize_eliminated(begin, end, self._C, damping, self._L)
 
-        run_chunks(invert, len(self._C), _VARIABLES, self._threads)
+        run_chunks(invert, len(self._C), size, self._threads)
         if (failed >= 0).any():
             row = int(failed[failed >= 0][0])
             raise NotPositiveDefinite(self._first + row, 0, float(np.linalg.eigvalsh(self._C[row])[0]))
@@ -108,12 +106,11 @@ class SchurSystem(LinearSystem):
         Je, Jf = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
         tile = tile_of(Je.shape[1], Je.shape[2], Jf.shape[2])
 
-        run_chunks(
-            lambda _, first, last: reduce_entries(
-                tile, first, last, entries.order, gather.begin, gather.residual, Je, Jf, entries.eliminated, self._L, entries.Z
-            ),
-            len(entries.eliminated), _ENTRIES, self._threads,
-        )  # fmt: skip
+        def work(first: int, last: int) -> None:
+            begin, residual, order, eliminated = gather.begin, gather.residual, entries.order, entries.eliminated
+            reduce_entries(tile, first, last, order, begin, residual, Je, Jf, eliminated, self._L, entries.Z)
+
+        self._run(len(entries.eliminated), work)
 
     def _add_and_substitute(self, entries: Entries) -> None:
         """Z of entries to which several groups add."""
@@ -121,7 +118,7 @@ class SchurSystem(LinearSystem):
         entries.Z[:] = 0.0
         for gather in entries.gathers:
             add_products(replace(gather, target=gather.target * size), entries.Z.reshape(-1), self._threads)
-        self._run(len(entries.eliminated), _ENTRIES, substitute_entries, entries.eliminated, self._L, entries.Z)
+        self._run(len(entries.eliminated), substitute_entries, entries.eliminated, self._L, entries.Z)
 
     def _reduce(self) -> None:
         """S = F − Z Zᵀ."""
@@ -133,10 +130,10 @@ class SchurSystem(LinearSystem):
     def _subtract(self, k: Products) -> None:
         tile = tile_of(k.a.Z.shape[1], k.a.dof, k.b.dof)
 
-        def work(_: int, first: int, last: int) -> None:
+        def work(first: int, last: int) -> None:
             add_sums(tile, -1.0, first, last, k.target, k.begin, k.entry_a, k.entry_b, k.a.Z, k.b.Z, self._values)
 
-        run_chunks(work, len(k.target), _BLOCKS, self._threads)
+        self._run(len(k.target), work)
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `LinearSystem.solve`."""
@@ -144,21 +141,21 @@ class SchurSystem(LinearSystem):
         y[:] = right[self._own].reshape(y.shape)
         self._substitute(y, transposed=False)
         for k in self._entries:
-            self._run(len(k.start), _KEPT, subtract_from_kept, k.start, k.begin, k.eliminated, k.Z, y, reduced)
+            self._run(len(k.start), subtract_from_kept, k.start, k.begin, k.eliminated, k.Z, y, reduced)
         kept = self._cholesky.solve(reduced)
         for k in self._entries:
-            self._run(len(y), _VARIABLES, subtract_from_eliminated, k.of_eliminated, k.order, k.start_of_entry, k.Z, kept, y)
+            self._run(len(y), subtract_from_eliminated, k.of_eliminated, k.order, k.start_of_entry, k.Z, kept, y)
         self._substitute(y, transposed=True)
         x = np.empty_like(right)
         x[self._own], x[self._others] = y.reshape(-1), kept
         return x
 
     def _substitute(self, y: NDArray[np.float64], *, transposed: bool) -> None:
-        self._run(len(y), _VARIABLES, solve_eliminated, self._L, transposed, y)
+        self._run(len(y), solve_eliminated, self._L, transposed, y)
 
-    def _run(self, items: int, chunk: int, run: Callable[..., None], *arguments: object) -> None:
-        """Call a kernel over chunks of `items`."""
-        run_chunks(lambda _, first, last: run(first, last, *arguments), items, chunk, self._threads)
+    def _run(self, items: int, run: Callable[..., None], *arguments: object) -> None:
+        """Call `run(first, last, *arguments)` over pieces of `items` whose results do not depend on each other."""
+        run_chunks(lambda _, first, last: run(first, last, *arguments), items, piece(items, self._threads), self._threads)
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """See `LinearSystem.inverse_blocks`.
