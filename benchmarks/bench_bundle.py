@@ -3,8 +3,8 @@
     python benchmarks/bench_bundle.py [--bal ../shared/data/bal] [--rounds 5] [--large]
 
 Ceres is compiled from ceres_bal.cpp against the headers of the system (Debian: libceres-dev) and left out with a message where
-that fails. Both get the problem in memory and one core; timed is everything after that, analysis included, until the cost is
-within 1e-5 of the known optimum. The faster of Ceres' dense and sparse Schur complement counts. They take turns, and the
+that fails. Both build the problem untimed and get one core; timed is the solver, analysis included, until the cost is within
+1e-5 of the known optimum. The faster of Ceres' dense and sparse Schur complement counts. They take turns, and the
 fastest round counts, as the machine is shared. `--large` adds synthetic problems of 50, 200 and 1000 cameras, each run in a
 process of its own for its peak memory, and compares ten iterations.
 """
@@ -151,11 +151,14 @@ def kernels(bal: BalProblem, rounds: int) -> list[Metric]:
     ]
 
 
-def threads(bal: BalProblem, name: str, rounds: int) -> Metric:
-    """Ten iterations on two threads against one."""
-    runs = {str(t): lambda t=t: ours(bal, t, _ITERATIONS)[-1][0] for t in (1, 2)}
+def threads(bal: BalProblem, problem: str, rounds: int) -> Metric:
+    """To the optimum on two threads against one."""
+    target = OPTIMA[problem] * (1.0 + _CLOSE)
+    runs = {str(t): lambda t=t: seconds_to(ours(bal, t, 60), target) for t in (1, 2)}
     best = least(runs, rounds)
-    return Metric(f"bundle/{name}: two threads", best["2"], "s", "lower", 0.65, "one thread", best["1"], gated=False)
+    return Metric(
+        f"bundle/{problem.split('-pre')[0]}: two threads", best["2"], "s", "lower", 0.65, "one thread", best["1"], gated=False
+    )
 
 
 def synthetic(cameras: int, points: int, seen: int, seed: int = 0) -> BalProblem:
@@ -205,7 +208,7 @@ def large(program: Path | None, folder: Path) -> list[Metric]:
 
 
 def worker(file: str) -> None:
-    """Solve one file in this process and print seconds, cost and peak memory, the interpreter's own memory taken off."""
+    """Solve one file in this process and print seconds, cost and the peak memory of the process."""
     import resource
 
     ours(synthetic(8, 200, 4), 1, 2)
@@ -238,7 +241,7 @@ def measure(options: argparse.Namespace) -> list[Metric]:
             if problem.startswith("ladybug"):
                 metrics += kernels(bal, options.rounds)
             os.sched_setaffinity(0, cores)
-            metrics.append(threads(bal, problem.split("-pre")[0], options.rounds))
+            metrics.append(threads(bal, problem, options.rounds))
         if options.large:
             metrics += large(program, folder)
     return metrics
