@@ -120,22 +120,25 @@ class _KeyedCache(FunctionCache):  # type: ignore[misc]
     _impl_class = _KeyedCacheImpl
 
 
-def kernel(function: _Function | None = None, *, fastmath: bool = False, inline: bool = False, borrow: bool = False) -> Any:
+def kernel(
+    function: _Function | None = None, *, fastmath: bool = False, inline: bool = False, borrow: bool = False, cached: bool = True
+) -> Any:
     """Compile a function to native code: releases the GIL, divides like C, and is cached on disk.
 
     `fastmath` allows contraction and reassociation only; NaN and infinity keep their meaning. `inline` asks LLVM to
     inline the function wherever it is called (small helpers of a hot loop). `borrow` leaves the reference counts of the
     arguments alone, which are otherwise raised and lowered, atomically, in every call of a function with a loop: for
-    kernels that are called once a point, or on the same arrays by several threads. Such a kernel cannot allocate.
+    kernels that are called once a point, or on the same arrays by several threads. Such a kernel cannot allocate. What is
+    not `cached` is compiled in every process: functions of users, whose sources the cache does not know.
     """
     if function is None:
-        return lambda f: kernel(f, fastmath=fastmath, inline=inline, borrow=borrow)
+        return lambda f: kernel(f, fastmath=fastmath, inline=inline, borrow=borrow, cached=cached)
     flags = {"contract", "reassoc"} if fastmath else False
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": flags, "_nrt": not borrow}
     if inline:
         options["forceinline"] = True
     dispatcher = numba.njit(**options)(function)
-    if not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if cached and not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
         # Without a writable cache folder the kernel still works; it compiles again in the next process.
         with contextlib.suppress(RuntimeError):
             dispatcher._cache = _KeyedCache(dispatcher.py_func)  # type: ignore[no-untyped-call]

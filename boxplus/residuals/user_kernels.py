@@ -14,17 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numba.core import config as numba_config
 from numba.core import types
 from numba.core.errors import NumbaError, UnsupportedBytecodeError
 from numba.extending import intrinsic
 
+from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.tangent_step import copy_into, step_into
-
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +100,7 @@ def _compiled(role: str, function: Callable[..., Any], arguments: tuple[types.Ty
     """The function in native code and the type it returns; None when compilation is switched off."""
     if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
         return (_as_sequence(function) if role == "function" else function), None
-    dispatcher: Any = function if hasattr(function, "py_func") else numba.njit(**_OPTIONS, forceinline=True)(function)
+    dispatcher: Any = function if hasattr(function, "py_func") else kernel(function, inline=True, cached=False)
     try:
         dispatcher.compile(arguments)
     except (NumbaError, UnsupportedBytecodeError) as error:
@@ -310,5 +308,5 @@ def _indent(text: str, width: int) -> str:
 def _loop(name: str, source: str, names: dict[str, Any]) -> Callable[..., int]:
     scope = dict(names)
     exec(compile(source, f"<boxplus {name} loop>", "exec"), scope)
-    loop: Callable[..., int] = numba.njit(**_OPTIONS)(scope[name])
+    loop: Callable[..., int] = kernel(scope[name], cached=False)
     return loop
