@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.residuals.residual import Residual
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 
@@ -68,16 +68,7 @@ class MarginalPrior(Residual):
             fixes_gauge=fixes_gauge,
         )
 
-    def linearize_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        jacobians: tuple[NDArray[np.float64], ...],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         self.evaluate_into(begin, end, x, index, r, valid)
         for k, (manifold, columns) in enumerate(zip(self.manifolds, self._columns, strict=True)):
             at = x[k][index[k][begin:end]]
@@ -85,15 +76,7 @@ class MarginalPrior(Residual):
             change = manifold.boxminus_jacobian(at[:1] if self._is_shared(at) else at, self.x0[k])
             jacobians[k][begin:end] = self.J[begin:end, None, columns] @ change
 
-    def evaluate_into(
-        self,
-        begin: int,
-        end: int,
-        x: tuple[NDArray[np.float64], ...],
-        index: tuple[NDArray[np.uint32], ...],
-        r: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-    ) -> None:
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         total = self.r0[begin:end].copy()
         for k, (manifold, columns) in enumerate(zip(self.manifolds, self._columns, strict=True)):
             at = x[k][index[k][begin:end]]

@@ -144,6 +144,12 @@ def _imu(rng: np.random.Generator) -> Case:
     return residuals.ImuPreintegration(preintegration), states
 
 
+def _marginal(rng: np.random.Generator) -> Case:
+    T, b = SE3.random(rng, 1), rng.normal(size=(1, 2))
+    prior = residuals.MarginalPrior([SE3, Euclidean(2)], [T[0], b[0]], rng.normal(size=(COUNT, 8)), rng.normal(size=COUNT))
+    return prior, [_near(rng, T)[0], rng.normal(size=2)]
+
+
 CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "BalReprojection": _bal,
     "ChordalPose": _relative(residuals.ChordalPose, SE3),
@@ -153,6 +159,7 @@ CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "InverseDepthIntrinsics": _inverse_depth_intrinsics,
     "InverseDepthReprojection": _inverse_depth,
     "LineReprojection": _line,
+    "MarginalPrior": _marginal,
     "Photometric": _photometric,
     "PointToPlane": _point_to_plane,
     "PointToPoint": _point_to_point,
