@@ -75,7 +75,8 @@ class Scan:
                     "give one value per point or None",
                 )
             strength = given.astype(np.float32)
-        xyz = points.astype(np.float32, copy=False)
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is counted so
+            xyz = points.astype(np.float32, copy=False)
         squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
         not_finite = ~np.isfinite(squared)
         zero = squared == 0.0

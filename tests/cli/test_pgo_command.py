@@ -151,3 +151,11 @@ def test_unknown_lines_are_left_out_on_request_and_counted(tmp_path: Path) -> No
     result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--ignore-unknown", "--no-report")
     assert result.exit_code == 0, result.output
     assert "warning: 1 lines EDGE_XY were left out" in words(result)
+
+
+def test_the_report_command_sends_back_to_the_page_that_is_there(tmp_path: Path) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    assert call(tmp_path / "loops.g2o", "-o", tmp_path / "out").exit_code == 0
+    result = CliRunner().invoke(app, ["report", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "one of 'boxplus pgo'" in words(result) and "open its report.html" in words(result)
