@@ -184,7 +184,9 @@ def read_summary(path: str | Path) -> RunSummary:
         where = ".".join(map(str, first["loc"])) or "the file"
         if where == "program":
             raise InputError(
-                "the output folder of 'boxplus lio'", f"one of {first['input']!r} ({path})", "open its report.html, or run that again"
+                "the output folder of 'boxplus lio'",
+                f"one of {first['input']!r} ({path})",
+                "open its report.html, or run that command again",
             ) from error
         raise InputError(
             "run.json as this version of boxplus writes it", f"{where}: {first['msg']} ({path})", "run 'boxplus lio' again"
