@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.optimization_terminal import LOSS_HELP, LinearSolverChoice, MethodChoice
+from boxplus.cli.optimization_terminal import (
+    LinearSolverChoice,
+    LinearSolverOption,
+    LossOption,
+    MaxIterationsOption,
+    MethodChoice,
+    MethodOption,
+    NoReportOption,
+    OutputOption,
+    OverwriteOption,
+    ThreadsOption,
+    TimeLimitOption,
+)
 
 if TYPE_CHECKING:
     from boxplus.formats.reconstruction import Reconstruction
@@ -29,10 +41,8 @@ class FormatChoice(StrEnum):
 
 def ba(
     file: Annotated[Path, typer.Argument(help="BAL file (plain or .bz2), or the folder of a COLMAP model (text or binary).")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")
-    ] = None,
-    loss: Annotated[str, typer.Option("--loss", help=f"Robust loss: {LOSS_HELP}")] = "none",
+    output: OutputOption = None,
+    loss: LossOption = "none",
     sigma: Annotated[float, typer.Option("--sigma", min=1e-9, help="Standard deviation of a pixel measurement [px].")] = 1.0,
     refine_intrinsics: Annotated[
         bool, typer.Option("--refine-intrinsics", help="Of COLMAP's cameras: focal lengths and distortion; BAL's always are.")
@@ -40,20 +50,14 @@ def ba(
     refine_principal_point: Annotated[
         bool, typer.Option("--refine-principal-point", help="Of COLMAP's cameras, with --refine-intrinsics.")
     ] = False,
-    method: Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")] = MethodChoice.levenberg_marquardt,
-    linear_solver: Annotated[
-        LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
-    ] = LinearSolverChoice.auto,
-    max_iterations: Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")] = 100,
-    time_limit: Annotated[
-        float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
+    method: MethodOption = MethodChoice.levenberg_marquardt,
+    linear_solver: LinearSolverOption = LinearSolverChoice.auto,
+    max_iterations: MaxIterationsOption = 100,
+    time_limit: TimeLimitOption = None,
+    threads: ThreadsOption = None,
     format: Annotated[FormatChoice, typer.Option("--format", help="Of the file; auto looks into it.")] = FormatChoice.auto,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Adjust cameras and points so that they explain best where the points were seen.
 

@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -29,7 +30,7 @@ _WIDTHS = (4, 16, 10, 10, 10, 10, 9)
 _LOSS_SCALE = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "geman_mcclure": 3.787, "welsch": 2.985}
 _LOSS_NAME = {"huber": "Huber", "cauchy": "Cauchy", "tukey": "Tukey", "geman_mcclure": "GemanMcClure", "welsch": "Welsch"}
 
-LOSS_HELP = (
+_LOSS_HELP = (
     "none, or huber, cauchy, tukey, geman_mcclure or welsch with its scale in standard deviations, as in huber:1.0; without one, "
     "the scale of 95 % efficiency."
 )
@@ -50,6 +51,21 @@ class LinearSolverChoice(StrEnum):
     dense = "dense"
     sparse = "sparse"
     schur = "schur"
+
+
+OutputOption = Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")]
+LossOption = Annotated[str, typer.Option("--loss", help=f"Robust loss: {_LOSS_HELP}")]
+MethodOption = Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")]
+LinearSolverOption = Annotated[
+    LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
+]
+MaxIterationsOption = Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")]
+TimeLimitOption = Annotated[float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")]
+ThreadsOption = Annotated[
+    int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+]
+NoReportOption = Annotated[bool, typer.Option("--no-report", help="Draw no report.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")]
 
 
 def parse_loss(text: str) -> Loss | None:

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.optimization_terminal import LOSS_HELP, LinearSolverChoice, MethodChoice
+from boxplus.cli.optimization_terminal import (
+    LinearSolverChoice,
+    LinearSolverOption,
+    LossOption,
+    MaxIterationsOption,
+    MethodChoice,
+    MethodOption,
+    NoReportOption,
+    OutputOption,
+    OverwriteOption,
+    ThreadsOption,
+    TimeLimitOption,
+)
 
 if TYPE_CHECKING:
     from boxplus.formats.pose_graph import PoseGraph
@@ -52,13 +64,11 @@ class CrossBlockChoice(StrEnum):
 
 def pgo(
     file: Annotated[Path, typer.Argument(help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")
-    ] = None,
+    output: OutputOption = None,
     start: Annotated[
         StartChoice, typer.Option("--start", help="Where to start; auto: the cheaper of the file's poses and the chordal start.")
     ] = StartChoice.auto,
-    loss: Annotated[str, typer.Option("--loss", help=f"Robust loss: {LOSS_HELP}")] = "none",
+    loss: LossOption = "none",
     objective: Annotated[
         ObjectiveChoice,
         typer.Option("--objective", help="logarithm: the error Log(Z⁻¹ Ti⁻¹ Tj) with its information; chordal: that of SE-Sync."),
@@ -76,19 +86,13 @@ def pgo(
     ignore_unknown: Annotated[
         bool, typer.Option("--ignore-unknown", help="Leave out lines that are no poses or edges, and count them.")
     ] = False,
-    method: Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")] = MethodChoice.levenberg_marquardt,
-    linear_solver: Annotated[
-        LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
-    ] = LinearSolverChoice.auto,
-    max_iterations: Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")] = 100,
-    time_limit: Annotated[
-        float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    method: MethodOption = MethodChoice.levenberg_marquardt,
+    linear_solver: LinearSolverOption = LinearSolverChoice.auto,
+    max_iterations: MaxIterationsOption = 100,
+    time_limit: TimeLimitOption = None,
+    threads: ThreadsOption = None,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Find the poses that agree best with the relative poses measured between them.
 
