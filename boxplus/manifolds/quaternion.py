@@ -19,8 +19,8 @@ from boxplus.manifolds.so3 import (
     SERIES_SWITCH,
     log_quaternion,
     quaternion_scalars,
-    right_jacobian_into,
-    right_jacobian_inverse_into,
+    right_jacobian_batch,
+    right_jacobian_inverse_batch,
 )
 
 
@@ -148,18 +148,6 @@ def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDAr
         out[i, 0], out[i, 1], out[i, 2] = log_quaternion(w, a, b, c)
 
 
-@kernel
-def _boxplus_jacobian_batch(delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-    for i in range(delta.shape[0]):
-        right_jacobian_into(delta[i, 0], delta[i, 1], delta[i, 2], J[i])
-
-
-@kernel
-def _boxminus_jacobian_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-    for i in range(w.shape[0]):
-        right_jacobian_inverse_into(w[i, 0], w[i, 1], w[i, 2], J[i])
-
-
 @dataclass(frozen=True, repr=False)
 class _UnitQuaternion(KernelManifold):
     """Rotations stored wxyz (4,), moved by rotation vectors (3,) on the right: q ⊗ Exp_q(w)."""
@@ -176,12 +164,12 @@ class _UnitQuaternion(KernelManifold):
         _boxminus_batch(x, base, out)
 
     def boxplus_jacobian_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-        _boxplus_jacobian_batch(delta, J)
+        right_jacobian_batch(delta, J)
 
     def boxminus_jacobian_into(self, x: NDArray[np.float64], base: NDArray[np.float64], J: NDArray[np.float64]) -> None:
         difference = np.empty((len(x), 3))
         _boxminus_batch(x, base, difference)
-        _boxminus_jacobian_batch(difference, J)
+        right_jacobian_inverse_batch(difference, J)
 
     def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
         rows = super().check(name, x)

@@ -153,13 +153,13 @@ def _log_batch(R: NDArray[np.float64], w: NDArray[np.float64]) -> None:
 
 
 @kernel
-def _right_jacobian_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+def right_jacobian_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
     for i in range(w.shape[0]):
         right_jacobian_into(w[i, 0], w[i, 1], w[i, 2], J[i])
 
 
 @kernel
-def _right_jacobian_inverse_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+def right_jacobian_inverse_batch(w: NDArray[np.float64], J: NDArray[np.float64]) -> None:
     for i in range(w.shape[0]):
         right_jacobian_inverse_into(w[i, 0], w[i, 1], w[i, 2], J[i])
 
@@ -176,7 +176,7 @@ def log(R: ArrayLike) -> NDArray[np.float64]:
 
 def right_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     """J_r (..., 3, 3) at w (..., 3): Exp(w + d) ≈ Exp(w) Exp(J_r(w) d)."""
-    return map_batch(_right_jacobian_batch, "w", w, (3,), (3, 3))
+    return map_batch(right_jacobian_batch, "w", w, (3,), (3, 3))
 
 
 def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
@@ -186,7 +186,7 @@ def left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
 
 def right_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
     """J_r⁻¹ (..., 3, 3) at w (..., 3): Log(Exp(w) Exp(d)) ≈ w + J_r⁻¹(w) d."""
-    return map_batch(_right_jacobian_inverse_batch, "w", w, (3,), (3, 3))
+    return map_batch(right_jacobian_inverse_batch, "w", w, (3,), (3, 3))
 
 
 def left_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
@@ -259,12 +259,12 @@ class _SO3(KernelManifold):
         _boxminus_batch(x, base, out)
 
     def boxplus_jacobian_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-        _right_jacobian_batch(delta, J)
+        right_jacobian_batch(delta, J)
 
     def boxminus_jacobian_into(self, x: NDArray[np.float64], base: NDArray[np.float64], J: NDArray[np.float64]) -> None:
         difference = np.empty((len(x), 3))
         _boxminus_batch(x, base, difference)
-        _right_jacobian_inverse_batch(difference, J)
+        right_jacobian_inverse_batch(difference, J)
 
     def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
         """As `Manifold.check`; takes (n, 3, 3) and (3, 3) as well."""
