@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.cholesky import NotPositiveDefinite
-from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.strategy import Step, Strategy, inner
+from boxplus.optimization.least_squares import LeastSquares, inner
+from boxplus.optimization.strategy import Step, Strategy
 
 _LEAST_DIAGONAL = 1e-14  # as a share of the largest
 _LEAST_RADIUS = 1e-12

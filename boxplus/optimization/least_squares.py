@@ -17,6 +17,11 @@ from boxplus.optimization.weighting import add_product_with_jacobian
 Values = Sequence[NDArray[np.float64]]
 
 
+def inner(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """aᵀb, summed pairwise: BLAS would wake its threads for it, and let the bits depend on their number."""
+    return float((a * b).sum())
+
+
 class LeastSquares:
     """Cost, linearisation and linear system of residual groups over a layout.
 
@@ -116,7 +121,7 @@ class LeastSquares:
     def curvature(self, delta: NDArray[np.float64]) -> float:
         """δᵀHδ = ‖Jδ‖²; see `product`."""
         product = self.product(delta)
-        return float((product * product).sum())  # not by BLAS, whose threads would show in the bits
+        return inner(product, product)
 
     def _explain_not_finite(self, values: Values) -> None:
         for group in self.groups:

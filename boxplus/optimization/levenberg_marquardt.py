@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.cholesky import NotPositiveDefinite
-from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.strategy import Step, Strategy, inner
+from boxplus.optimization.least_squares import LeastSquares, inner
+from boxplus.optimization.strategy import Step, Strategy
 
 # Smaller entries of diag(H), as a share of the largest, do not scale the damping: a direction without information is damped too.
 _LEAST_DIAGONAL = 1e-14

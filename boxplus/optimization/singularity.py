@@ -13,7 +13,7 @@ from boxplus.optimization.components import Components
 from boxplus.optimization.free_motions import describe_shared
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.least_squares import LeastSquares, inner
 from boxplus.optimization.null_space import NullSpace, find_null_space
 from boxplus.optimization.own_motions import describe_own
 from boxplus.optimization.variable_names import variable_names
@@ -85,7 +85,7 @@ def refuse_singular(problem: LeastSquares) -> None:
     scale = np.sqrt(problem.system.diagonal)
     right = scale * np.random.default_rng(0).standard_normal(len(scale))
     x = problem.system.solve(right)
-    _refuse_if_weak(problem, x, float(x @ right))
+    _refuse_if_weak(problem, x, inner(x, right))
 
 
 def refuse_free_step(problem: LeastSquares, delta: NDArray[np.float64]) -> None:
@@ -96,11 +96,11 @@ def refuse_free_step(problem: LeastSquares, delta: NDArray[np.float64]) -> None:
     Raises:
         SingularProblemError: δ (dof,) is such a step.
     """
-    _refuse_if_weak(problem, delta, -float(problem.system.gradient @ delta))
+    _refuse_if_weak(problem, delta, -inner(problem.system.gradient, delta))
 
 
 def _refuse_if_weak(problem: LeastSquares, direction: NDArray[np.float64], curvature: float) -> None:
-    length = float(direction @ (problem.system.diagonal * direction))
+    length = inner(direction, problem.system.diagonal * direction)
     if length == 0.0 or curvature > _SUSPICIOUS * length:
         return
     space = find_null_space(problem)

@@ -19,11 +19,6 @@ class Step:
     predicted: float
 
 
-def inner(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """aᵀb, summed pairwise: BLAS would wake its threads for it, and let the bits depend on their number."""
-    return float((a * b).sum())
-
-
 class Strategy(ABC):
     """Proposes steps from the accepted point and learns from their fate.
 
