@@ -26,8 +26,8 @@ from scipy.sparse import csc_matrix, tril
 from scipy.sparse.linalg import splu
 
 from boxplus.formats.g2o import read_g2o
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.cholesky import SparseCholesky
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.cholesky import SparseCholesky
 
 GRAPHS = ("torus3D", "cubicle", "sphere2500", "parking-garage", "slambook2_sphere", "manhattan", "intel", "CSAIL", "MIT")
 BARS = {"torus3D": (1.0, 0.1), "cubicle": (1.0, 0.1)}  # ratio to CHOLMOD, to SuperLU

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from boxplus.manifolds.so3 import SO3
     from boxplus.maps.ikd_tree import IkdTree
     from boxplus.optimization import losses
-    from boxplus.optimization.cholesky import SparseCholesky
     from boxplus.optimization.graduated import graduate
     from boxplus.optimization.jacobian_check import check_jacobian
     from boxplus.optimization.marginalization import marginalize
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from boxplus.sensors.imu import ImuSamples
     from boxplus.sensors.scan import Scan
     from boxplus.simulation.simulation import Simulation, simulate
+    from boxplus.sparse.cholesky import SparseCholesky
     from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
     from boxplus.systems.direct_alignment import Alignment, align_rgbd
     from boxplus.systems.estimate import Estimate
@@ -99,7 +99,7 @@ _HOME = {
     "SingularProblemError": "errors",
     "Solution": "optimization.solution",
     "SolverOptions": "optimization.solver_options",
-    "SparseCholesky": "optimization.cholesky",
+    "SparseCholesky": "sparse.cholesky",
     "Trajectory": "formats.trajectory",
     "UnitQuaternion": "manifolds.quaternion",
     "adjust_bundle": "systems.bundle_adjustment",

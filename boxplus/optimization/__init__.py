@@ -1,1 +1,1 @@
-"""Sparse least squares: block-sparse matrices, orderings and the Cholesky factorisation."""
+"""Nonlinear least squares: problems, their solvers, elimination and covariance."""

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, SingularProblemError
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares, Values
 from boxplus.optimization.null_space import NullSpace, find_null_space
 from boxplus.optimization.singularity import explain_singularity
 from boxplus.optimization.variable_names import variable_names
 from boxplus.optimization.variables import VariableRows
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 
 class Covariances:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares, inner
 from boxplus.optimization.strategy import Step, Strategy
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 _LEAST_DIAGONAL = 1e-14  # as a share of the largest
 _LEAST_RADIUS = 1e-12

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.least_squares import LeastSquares, inner
 from boxplus.optimization.strategy import Step, Strategy
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 # Smaller entries of diag(H), as a share of the largest, do not scale the damping: a direction without information is damped too.
 _LEAST_DIAGONAL = 1e-14

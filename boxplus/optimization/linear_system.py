@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
-from boxplus.optimization.multifrontal import SINGULAR
 from boxplus.optimization.normal_equations import NormalEquations
+from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.multifrontal import SINGULAR
 
 
 class LinearSystem(ABC):

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel, run_chunks
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.counting_sort import order_by
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
-from boxplus.optimization.product_tiles import add_sums, tile_of
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.counting_sort import order_by
+from boxplus.sparse.product_tiles import add_sums, tile_of
 
 # Pieces for every thread, so that one with more work does not hold up the others; more cost more calls than they even out.
 _PIECES = 4

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.components import Components
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import connected_numbers
 from boxplus.optimization.least_squares import LeastSquares
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 # A direction is unobservable when its curvature, scaled to a unit diagonal, is below this. Computed from J, gauges come out below
 # 1e-20; an odometry of 10,000 poses without any loop is down to 1e-16 and yet determined.

@@ -12,7 +12,6 @@ from pydantic import ValidationError
 
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.elimination import choose_system
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
@@ -24,6 +23,7 @@ from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import VariableRows, Variables
 from boxplus.residuals.residual import Residual
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 
 class Problem:

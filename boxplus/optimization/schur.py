@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
-from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import LinearSystem
 from boxplus.optimization.normal_equations import Gather, NormalEquations, add_gradient, add_products, piece
-from boxplus.optimization.product_tiles import add_sums, tile_of
 from boxplus.optimization.schur_kernels import (
     factorize_eliminated,
     reduce_entries,
@@ -29,6 +27,8 @@ from boxplus.optimization.schur_kernels import (
 )
 from boxplus.optimization.schur_structure import Entries, Products, build_entries, build_products, eliminated_numbers
 from boxplus.optimization.variables import Variables
+from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.product_tiles import add_sums, tile_of
 
 
 class SchurSystem(LinearSystem):

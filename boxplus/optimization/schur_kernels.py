@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.product_tiles import LANES, sum_products
+from boxplus.sparse.product_tiles import LANES, sum_products
 
 
 @kernel

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.counting_sort import order_by
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.optimization.normal_equations import Gather
 from boxplus.optimization.schur_kernels import count_pairs, list_pairs
 from boxplus.optimization.variables import Variables
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.counting_sort import order_by
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import SingularProblemError
-from boxplus.optimization.cholesky import NotPositiveDefinite
 from boxplus.optimization.components import Components
 from boxplus.optimization.free_motions import describe_shared
 from boxplus.optimization.group import Group
@@ -18,6 +17,7 @@ from boxplus.optimization.null_space import NullSpace, find_null_space
 from boxplus.optimization.own_motions import describe_own
 from boxplus.optimization.variable_names import variable_names
 from boxplus.optimization.variables import Variables
+from boxplus.sparse.cholesky import NotPositiveDefinite
 
 _SENTENCES = 6  # told before the rest is counted
 # A step whose curvature, scaled to a unit diagonal, is below this may be rounding along a free direction.

@@ -16,8 +16,8 @@ from boxplus._jit import kernel
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import compose_into, inverse_into
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.cholesky import SparseCholesky
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.cholesky import SparseCholesky
 
 _POLAR_ITERATIONS = 30
 

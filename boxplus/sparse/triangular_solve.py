@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus._jit import kernel
-from boxplus.optimization.dense_kernels import Buffer, update
-from boxplus.optimization.multifrontal import Indices, Table
-from boxplus.optimization.vector_tiles import (
+from boxplus.sparse.dense_kernels import Buffer, update
+from boxplus.sparse.multifrontal import Indices, Table
+from boxplus.sparse.vector_tiles import (
     TALL_FROM,
     TILE_ROWS,
     dots_1,

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
-from boxplus.optimization.minimum_degree import minimum_degree
+from boxplus.sparse.minimum_degree import minimum_degree
 
 Method = Literal["auto", "minimum_degree", "nested_dissection", "natural"]
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.subtrees import split_tree
-from boxplus.optimization.symbolic import (
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.subtrees import split_tree
+from boxplus.sparse.symbolic import (
     Indices,
     below_counts,
     elimination_tree,

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.dense_kernels import BLOCK, Buffer, update
-from boxplus.optimization.multifrontal import Indices, Table
-from boxplus.optimization.supernodes import DIAGONAL, STORED, TRANSPOSED, Fronts
-from boxplus.optimization.triangular_solve import forward
+from boxplus.sparse.dense_kernels import BLOCK, Buffer, update
+from boxplus.sparse.multifrontal import Indices, Table
+from boxplus.sparse.supernodes import DIAGONAL, STORED, TRANSPOSED, Fronts
+from boxplus.sparse.triangular_solve import forward
 
 _ZERO, _ONE = np.uint64(0), np.uint64(1)
 _SQUARE = np.uint64(8)

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import BoxplusError, InputError
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.inverse_blocks import SelectedInverse, locate_blocks
-from boxplus.optimization.numeric_factor import NumericFactor
-from boxplus.optimization.ordering import Method, order
-from boxplus.optimization.supernodes import lay_out
-from boxplus.optimization.triangular_solve import solve_many, solve_one
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.inverse_blocks import SelectedInverse, locate_blocks
+from boxplus.sparse.numeric_factor import NumericFactor
+from boxplus.sparse.ordering import Method, order
+from boxplus.sparse.supernodes import lay_out
+from boxplus.sparse.triangular_solve import solve_many, solve_one
 
 SOLVED_VARIABLES = 8
 """Covariances with up to so many variables are solved for, those with more come from a selected inversion."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse import random_array
 
 from boxplus.errors import InputError
-from boxplus.optimization.block_matrix import BlockPattern
+from boxplus.sparse.block_matrix import BlockPattern
 
 
 @given(seed=st.integers(0, 10**6), sizes=st.lists(st.integers(1, 4), min_size=1, max_size=8), pairs=st.integers(0, 20))

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
-from boxplus.optimization.dense_kernels import BLOCK, factor_block, update_rows
-from boxplus.optimization.multifrontal import begin_front, end_front, factorize
-from boxplus.optimization.supernodes import ALIGNMENT, Fronts
+from boxplus.sparse.dense_kernels import BLOCK, factor_block, update_rows
+from boxplus.sparse.multifrontal import begin_front, end_front, factorize
+from boxplus.sparse.supernodes import ALIGNMENT, Fronts
 
 LARGE = 3e8
 """Operations from which on a front is worth several threads."""

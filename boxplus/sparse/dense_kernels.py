@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.vector_tiles import (
+from boxplus.sparse.vector_tiles import (
     TALL_FROM,
     TILE_ROWS,
     factor_1,

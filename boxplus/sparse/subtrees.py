@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.symbolic import Indices, front_time
+from boxplus.sparse.symbolic import Indices, front_time
 
 WORTHWHILE = 2e6  # [ns] below it, threads cost more than they save
 SPLITS = 64  # subtrees that are split at most

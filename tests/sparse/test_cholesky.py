@@ -13,9 +13,9 @@ from scipy.sparse.linalg import splu
 
 from boxplus.errors import InputError
 from boxplus.formats.g2o import read_g2o
-from boxplus.optimization import numeric_factor, subtrees
-from boxplus.optimization.block_matrix import BlockPattern
-from boxplus.optimization.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.sparse import numeric_factor, subtrees
+from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
 
 
 def random_matrix(seed: int, sizes: list[int], pairs: int) -> tuple[BlockPattern, NDArray[np.float64], NDArray[np.float64]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.optimization import vector_tiles as tiles
+from boxplus.sparse import vector_tiles as tiles
 
 U = np.uint64
 COLUMNS = (6, 3, 1)

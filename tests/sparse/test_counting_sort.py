@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.optimization.counting_sort import order_by
-from boxplus.optimization.product_tiles import LOOPS, SIZES, add_sums, tile_of
+from boxplus.sparse.counting_sort import order_by
+from boxplus.sparse.product_tiles import LOOPS, SIZES, add_sums, tile_of
 
 
 @given(st.lists(st.integers(0, 8), max_size=60))

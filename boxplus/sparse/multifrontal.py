@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.dense_kernels import Buffer, factor_panel
-from boxplus.optimization.supernodes import DIAGONAL, STORED
-from boxplus.optimization.vector_tiles import add
+from boxplus.sparse.dense_kernels import Buffer, factor_panel
+from boxplus.sparse.supernodes import DIAGONAL, STORED
+from boxplus.sparse.vector_tiles import add
 
 Table = NDArray[np.void]
 Indices = NDArray[np.uint64]
