@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.optimization.least_squares import LeastSquares, Values
-from boxplus.optimization.null_space import NullSpace, find_null_space
-from boxplus.optimization.singularity import explain_singularity
-from boxplus.optimization.variable_names import variable_names
+from boxplus.optimization.observability.null_space import NullSpace, find_null_space
+from boxplus.optimization.observability.singularity import explain_singularity
+from boxplus.optimization.observability.variable_names import variable_names
 from boxplus.optimization.variables import VariableRows
 from boxplus.sparse.cholesky import NotPositiveDefinite
 

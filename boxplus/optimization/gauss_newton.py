@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.least_squares import LeastSquares, inner
-from boxplus.optimization.singularity import refuse_free_step, refuse_singular
+from boxplus.optimization.observability.singularity import refuse_free_step, refuse_singular
 from boxplus.optimization.strategy import Step, Strategy
 
 _HALVINGS = 20

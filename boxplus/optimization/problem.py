@@ -18,7 +18,7 @@ from boxplus.optimization.layout import Layout
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.minimize import Callback, minimize, strategy_of
-from boxplus.optimization.singularity import explain_singularity, structural_defects
+from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import VariableRows, Variables

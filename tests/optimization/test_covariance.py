@@ -7,8 +7,8 @@ import pytest
 
 from boxplus import SE3, Euclidean, InputError, Pinhole, Problem, SE3Left, SingularProblemError, losses
 from boxplus.manifolds import se3
-from boxplus.optimization import null_space
 from boxplus.optimization.losses import loss_at
+from boxplus.optimization.observability import null_space
 from boxplus.residuals import Prior, RelativePose, Reprojection
 from tests.optimization.conftest import dense_normal_equations, make_ring, make_scene
 

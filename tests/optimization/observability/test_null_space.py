@@ -11,7 +11,7 @@ from boxplus import Euclidean, Problem, SingularProblemError
 from boxplus.optimization.elimination import choose_system
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.least_squares import LeastSquares
-from boxplus.optimization.null_space import find_null_space
+from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.residual import Residual
 from boxplus.residuals.whitening import Whitening

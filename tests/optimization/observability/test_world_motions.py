@@ -7,7 +7,7 @@ import pytest
 
 from boxplus import SE2, SE3, SO3, Euclidean, Line3D, Product, SE3Left, UnitQuaternion
 from boxplus.manifolds import lines, quaternion, se2, se3, so3
-from boxplus.optimization.world_motions import kinds_of, motions_of, positions_of
+from boxplus.optimization.observability.world_motions import kinds_of, motions_of, positions_of
 
 H = 1e-5
 
