@@ -29,7 +29,7 @@ def _tiles(folder: Path) -> Path:
 @map_app.command("info")
 def info_command(folder: _Folder) -> None:
     """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
-    from boxplus.maps.tile_store import TileStore
+    from boxplus.maps.tiles.store import TileStore
 
     store = TileStore.open(_tiles(folder))
     size = store.manifest.tile_size_m
@@ -53,7 +53,7 @@ def merge_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Write all tiles of a map into one PLY and/or PCD file."""
-    from boxplus.maps.tile_store import TileStore, merge
+    from boxplus.maps.tiles.store import TileStore, merge
 
     tiles = _tiles(folder)
     for sentence in TileStore.open(tiles).report:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
-from boxplus.maps.ikd_search import IkdView, knn5
+from boxplus.maps.ikd_tree.search import IkdView, knn5
 from boxplus.maps.plane_fit import fit_plane_into
 
 NEIGHBOURS = 5

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory, read_trajectory
-from boxplus.maps.tile_store import TileStore
-from boxplus.maps.voxel_thinning import first_per_voxel
+from boxplus.maps.tiles.store import TileStore
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.systems.run_folder import RunFolder
 from boxplus.systems.run_summary import RunSummary, read_summary
 from boxplus.systems.scan_log import ScanLog, read_scan_log

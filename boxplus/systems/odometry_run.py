@@ -20,8 +20,8 @@ from boxplus._jit import on_compilation
 from boxplus.errors import BoxplusError, InputError, OutputError
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
-from boxplus.maps.tile_store import merge
-from boxplus.maps.tiles import TileWriter
+from boxplus.maps.tiles.store import merge
+from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.recording import Recording
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan

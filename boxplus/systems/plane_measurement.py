@@ -18,8 +18,8 @@ from boxplus.filtering.plane_information import (
     ONE_LINE,
     accumulate_planes,
 )
-from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 from boxplus.systems.lio_config import LioConfig
 

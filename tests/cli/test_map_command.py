@@ -12,7 +12,7 @@ from boxplus.cli.map import map_app
 from boxplus.errors import InputError
 from boxplus.formats.pcd import read_pcd
 from boxplus.formats.ply import read_ply
-from boxplus.maps.tiles import TileWriter
+from boxplus.maps.tiles.writer import TileWriter
 
 
 @pytest.fixture

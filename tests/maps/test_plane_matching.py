@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from boxplus.filtering.nav_state import NavState
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
 from boxplus.manifolds import so3
-from boxplus.maps.ikd_search import STACK, STACK_DEPTH
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 
 MAX_DISTANCE = 0.8

@@ -21,7 +21,7 @@ from boxplus.errors import InputError, OutputError
 from boxplus.formats.pcd import read_pcd
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
-from boxplus.maps.tile_store import TileStore
+from boxplus.maps.tiles.store import TileStore
 from boxplus.recordings.recording import Event, Recording
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan

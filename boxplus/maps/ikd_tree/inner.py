@@ -1,6 +1,6 @@
 """The inner node of an ikd-tree, and the distances from a point to the boxes of both its children: one LLVM vector.
 
-As in `ikd_leaf`, the plain Python function runs without the compiler, and its compiled counterpart gives the same bits.
+As in `leaf`, the plain Python function runs without the compiler, and its compiled counterpart gives the same bits.
 """
 
 from __future__ import annotations

@@ -10,16 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
-from boxplus.maps.ikd_batch import fill_operations, keep_near, update_batch
-from boxplus.maps.ikd_check import check_tree
-from boxplus.maps.ikd_collect import collect, nearest_batch
-from boxplus.maps.ikd_input import as_corner, as_points, round_down, round_up
-from boxplus.maps.ikd_job import Rebuilder, build_pool, new_work
-from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
-from boxplus.maps.ikd_rebuild import settle
-from boxplus.maps.ikd_search import STACK, STACK_DEPTH, IkdView
-from boxplus.maps.ikd_update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPTH, OPERATION, REVIVE
+from boxplus.maps.ikd_tree.batch import fill_operations, keep_near, update_batch
+from boxplus.maps.ikd_tree.check import check_tree
+from boxplus.maps.ikd_tree.collect import collect, nearest_batch
+from boxplus.maps.ikd_tree.input import as_corner, as_points, round_down, round_up
+from boxplus.maps.ikd_tree.job import Rebuilder, build_pool, new_work
+from boxplus.maps.ikd_tree.leaf import BUCKET
+from boxplus.maps.ikd_tree.pool import LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
+from boxplus.maps.ikd_tree.rebuild import settle
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, IkdView
+from boxplus.maps.ikd_tree.update import DELETE, INSERT, INSERT_DOWNSAMPLED, MAX_DEPTH, OPERATION, REVIVE
 
 MAX_EXTENT = 100_000.0  # [m] from the origin, per axis: float32 resolves 8 mm there
 DELETE_TOLERANCE = 1e-6  # [m] per axis

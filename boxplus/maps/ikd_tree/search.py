@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_inner import boxes_sq
-from boxplus.maps.ikd_leaf import BUCKET, lanes_within, trailing_zeros
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.inner import boxes_sq
+from boxplus.maps.ikd_tree.leaf import BUCKET, lanes_within, trailing_zeros
+from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,

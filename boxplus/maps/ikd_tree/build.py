@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.leaf import BUCKET
+from boxplus.maps.ikd_tree.pool import (
     FILL,
     LABEL_DEAD,
     LABEL_NONE,

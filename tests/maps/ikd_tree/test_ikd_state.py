@@ -11,8 +11,8 @@ from brute_force_map import BruteForceMap
 from hypothesis import HealthCheck, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from boxplus.maps import ikd_tree
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.ikd_tree import tree as ikd_tree
 
 MODES = ("incremental", "background", "inplace")
 CELL = 0.3

@@ -7,10 +7,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.maps.ikd_batch import update_batch
-from boxplus.maps.ikd_build import BUILDER, BUILT, build_step, start_build
-from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.batch import update_batch
+from boxplus.maps.ikd_tree.build import BUILDER, BUILT, build_step, start_build
+from boxplus.maps.ikd_tree.leaf import BUCKET
+from boxplus.maps.ikd_tree.pool import (
     FILL,
     LABEL_NONE,
     LEFT,
@@ -24,8 +24,8 @@ from boxplus.maps.ikd_pool import (
     slot_counts,
     take_inner,
 )
-from boxplus.maps.ikd_rebuild import copy_step
-from boxplus.maps.ikd_update import (
+from boxplus.maps.ikd_tree.rebuild import copy_step
+from boxplus.maps.ikd_tree.update import (
     BUILDING,
     COPYING,
     IDLE,

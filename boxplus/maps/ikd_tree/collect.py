@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_box import disjoint, in_box
-from boxplus.maps.ikd_leaf import BUCKET, trailing_zeros
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.box import disjoint, in_box
+from boxplus.maps.ikd_tree.leaf import BUCKET, trailing_zeros
+from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -23,7 +23,7 @@ from boxplus.maps.ikd_pool import (
     ROOT,
     ZERO,
 )
-from boxplus.maps.ikd_search import IkdView, five_nearest, knn, point_sq
+from boxplus.maps.ikd_tree.search import IkdView, five_nearest, knn, point_sq
 
 
 @kernel(borrow=True)

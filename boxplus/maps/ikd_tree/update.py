@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_box import contained, disjoint, in_box
-from boxplus.maps.ikd_leaf import BUCKET, count_bits
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.box import contained, disjoint, in_box
+from boxplus.maps.ikd_tree.leaf import BUCKET, count_bits
+from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_leaf import lanes_in_box
-from boxplus.maps.ikd_pool import all_bits
+from boxplus.maps.ikd_tree.leaf import lanes_in_box
+from boxplus.maps.ikd_tree.pool import all_bits
 
 
 @kernel(inline=True, borrow=True)

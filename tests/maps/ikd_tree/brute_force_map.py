@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus.maps.ikd_tree import DELETE_TOLERANCE, MAX_EXTENT
+from boxplus.maps.ikd_tree.tree import DELETE_TOLERANCE, MAX_EXTENT
 
 
 def round_up(value: float) -> np.float32:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_build import build_step, start_build
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.build import build_step, start_build
+from boxplus.maps.ikd_tree.pool import (
     FILL,
     INDEX_MASK,
     LABEL_NONE,
@@ -27,7 +27,7 @@ from boxplus.maps.ikd_pool import (
     live_bits,
     slot_size,
 )
-from boxplus.maps.ikd_update import BUILDING, IDLE, Work, save_leaf, unbalanced
+from boxplus.maps.ikd_tree.update import BUILDING, IDLE, Work, save_leaf, unbalanced
 
 
 @kernel(borrow=True)

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import LABEL_DEAD, LABEL_NONE, LEAF_BIT, ONE, ZERO, Pool, live_bits, slot_size
-from boxplus.maps.ikd_update import (
+from boxplus.maps.ikd_tree.leaf import BUCKET
+from boxplus.maps.ikd_tree.pool import LABEL_DEAD, LABEL_NONE, LEAF_BIT, ONE, ZERO, Pool, live_bits, slot_size
+from boxplus.maps.ikd_tree.update import (
     COPYING,
     DROP,
     IDLE,

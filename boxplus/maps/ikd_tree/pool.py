@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_inner import INNER
-from boxplus.maps.ikd_leaf import LEAF, count_bits
+from boxplus.maps.ikd_tree.inner import INNER
+from boxplus.maps.ikd_tree.leaf import LEAF, count_bits
 
 FILL = 26  # points in a leaf after a rebuild: leaves room for inserts
 NIL = np.uint32(0xFFFFFFFF)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_inner import INNER, boxes_sq
-from boxplus.maps.ikd_leaf import BUCKET, LEAF, count_bits, lanes_in_box, lanes_within, trailing_zeros
+from boxplus.maps.ikd_tree.inner import INNER, boxes_sq
+from boxplus.maps.ikd_tree.leaf import BUCKET, LEAF, count_bits, lanes_in_box, lanes_within, trailing_zeros
 
 
 @kernel

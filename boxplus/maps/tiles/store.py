@@ -16,8 +16,8 @@ from boxplus.formats.output import TEMPORARY_SUFFIX
 from boxplus.formats.pcd import PcdWriter
 from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
 from boxplus.formats.point_cloud import as_records
-from boxplus.maps.tile_journal import read_journal
-from boxplus.maps.tile_layout import (
+from boxplus.maps.tiles.journal import read_journal
+from boxplus.maps.tiles.layout import (
     Manifest,
     TileIndex,
     list_journals,
@@ -27,7 +27,7 @@ from boxplus.maps.tile_layout import (
     split_by_tile,
     tile_folder,
 )
-from boxplus.maps.voxel_thinning import first_per_voxel
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 
 
 @dataclass(frozen=True, slots=True)

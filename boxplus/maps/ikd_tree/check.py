@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import BoxplusError
-from boxplus.maps.ikd_leaf import BUCKET
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.leaf import BUCKET
+from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,

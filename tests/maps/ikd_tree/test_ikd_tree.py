@@ -14,9 +14,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
 
 from boxplus.errors import InputError
-from boxplus.maps.ikd_check import InvariantError
-from boxplus.maps.ikd_search import STACK, STACK_DEPTH, knn5
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.ikd_tree.check import InvariantError
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, knn5
 
 compiled = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
 needs_compiler = pytest.mark.skipif(not compiled, reason="too many points for interpreted kernels")

@@ -17,8 +17,8 @@ from boxplus.errors import InputError, OutputError
 from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
 from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
 from boxplus.formats.point_cloud import as_records
-from boxplus.maps.tile_journal import JournalWriter, read_journal
-from boxplus.maps.tile_layout import (
+from boxplus.maps.tiles.journal import JournalWriter, read_journal
+from boxplus.maps.tiles.layout import (
     MANIFEST,
     Manifest,
     TileIndex,
@@ -32,7 +32,7 @@ from boxplus.maps.tile_layout import (
     tile_folder,
     write_manifest,
 )
-from boxplus.maps.voxel_thinning import RecentVoxels, first_per_voxel
+from boxplus.maps.tiles.voxel_thinning import RecentVoxels, first_per_voxel
 
 _log = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.maps.ikd_box import disjoint, in_box
-from boxplus.maps.ikd_leaf import BUCKET, trailing_zeros
-from boxplus.maps.ikd_pool import (
+from boxplus.maps.ikd_tree.box import disjoint, in_box
+from boxplus.maps.ikd_tree.leaf import BUCKET, trailing_zeros
+from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
     LABEL_LIVE,
@@ -22,8 +22,8 @@ from boxplus.maps.ikd_pool import (
     all_bits,
     has_room,
 )
-from boxplus.maps.ikd_replace import log_operation, remove_point, replace_point
-from boxplus.maps.ikd_update import (
+from boxplus.maps.ikd_tree.replace import log_operation, remove_point, replace_point
+from boxplus.maps.ikd_tree.update import (
     DROP,
     IDLE,
     INSERT,

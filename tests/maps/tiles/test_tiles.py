@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.pcd import read_pcd
 from boxplus.formats.ply import read_ply
-from boxplus.maps.tile_journal import read_journal
-from boxplus.maps.tile_layout import list_journals
-from boxplus.maps.tile_store import TileStore, merge
-from boxplus.maps.tiles import TileWriter
-from boxplus.maps.voxel_thinning import RecentVoxels, first_per_voxel
+from boxplus.maps.tiles.journal import read_journal
+from boxplus.maps.tiles.layout import list_journals
+from boxplus.maps.tiles.store import TileStore, merge
+from boxplus.maps.tiles.voxel_thinning import RecentVoxels, first_per_voxel
+from boxplus.maps.tiles.writer import TileWriter
 
 
 def cloud(count: int, seed: int = 0, scale: float = 60.0) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_a_killed_run_loses_no_block_and_says_so(tmp_path: Path) -> None:
     script = textwrap.dedent(
         f"""
         import os, signal, numpy as np
-        from boxplus.maps.tiles import TileWriter
+        from boxplus.maps.tiles.writer import TileWriter
         writer = TileWriter({str(folder)!r}, max_buffered_points=1000)
         for seed in range(25):
             writer.append(np.random.default_rng(seed).uniform(-60, 60, (100, 3)).astype(np.float32))
