@@ -26,7 +26,9 @@ from numba.core import event as numba_event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
 _PACKAGE_ROOT = Path(__file__).resolve().parent
-_IMPORT = re.compile(r"^\s*(?:from\s+(boxplus[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+(boxplus[\w.]+))", re.MULTILINE)
+_IMPORT = re.compile(
+    r"^\s*(?:from\s+((?:boxplus|\.)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+(boxplus[\w.]+))", re.MULTILINE
+)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -44,12 +46,11 @@ def cache_root() -> Path:
     return base / "boxplus"
 
 
-def _module_file(dotted_name: str) -> Path | None:
+def _module_files(dotted_name: str) -> list[Path]:
+    """The file of a module; of a package also its stub, which says where the names come from that it imports on first use."""
     path = _PACKAGE_ROOT.joinpath(*dotted_name.split(".")[1:])
-    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
-        if candidate.is_file():
-            return candidate
-    return None
+    candidates = (path.with_suffix(".py"), path / "__init__.py", path / "__init__.pyi")
+    return [candidate for candidate in candidates if candidate.is_file()]
 
 
 @functools.cache
@@ -57,9 +58,13 @@ def _imported_files(file: Path) -> frozenset[Path]:
     """The boxplus files that `file` imports directly."""
     found: set[Path] = set()
     for package, names, module in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        if package.startswith("."):  # in the stubs; those of a user's file lead to no file of boxplus
+            if not file.is_relative_to(_PACKAGE_ROOT):
+                continue
+            package = ".".join(["boxplus", *file.parent.relative_to(_PACKAGE_ROOT).parts]) + package.rstrip(".")
         candidates = [module] if module else [package]
         candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
-        found.update(path for name in candidates if (path := _module_file(name)) is not None)
+        found.update(path for name in candidates for path in _module_files(name))
     return frozenset(found)
 
 

@@ -55,6 +55,16 @@ def test_the_key_follows_every_dependency(package: Path, changed: str) -> None:
     assert _key(package / "top.py") != before
 
 
+@pytest.mark.parametrize("changed", ["low/bottom.py", "low/__init__.pyi"])
+def test_the_key_follows_the_stub_of_a_package(package: Path, changed: str) -> None:
+    (package / "low" / "__init__.pyi").write_text("from .bottom import X as X\n")
+    (package / "middle.py").write_text("from boxplus.low import X\n")
+    before = _key(package / "top.py")
+    with (package / changed).open("a") as file:
+        file.write("Z = 2\n")
+    assert _key(package / "top.py") != before
+
+
 @pytest.mark.parametrize("changed", ["aside.py", "top.py"])
 def test_the_key_ignores_what_is_not_imported(package: Path, changed: str) -> None:
     before = _key(package / "middle.py")

@@ -17,6 +17,7 @@ import boxplus
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "boxplus").rglob("*.py"))
+STUBS = sorted((ROOT / "boxplus").rglob("*.pyi"))
 HEAVY = ["numba", "scipy", "matplotlib", "plotly", "rosbags", "pydantic", "typer", "rich", "yaml", "numpy"]
 # From the lowest room to the highest: each imports only from those before it.
 ROOMS = [
@@ -74,43 +75,28 @@ def test_public_names_are_what_they_are_in_their_homes() -> None:
     from boxplus.maps.ikd_tree import IkdTree
 
     assert boxplus.IkdTree is IkdTree
-    with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
+    with pytest.raises(AttributeError, match="No boxplus attribute Nothing"):
         boxplus.Nothing  # noqa: B018
 
 
-def test_type_checkers_see_the_same_names_as_programs() -> None:
-    tree = ast.parse((ROOT / "boxplus" / "__init__.py").read_text(encoding="utf-8"))
-    typed = {
-        alias.name: node.module
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.split(".")[0] == "boxplus"
+@pytest.mark.parametrize("stub", [pytest.param(path, id=path.parent.name) for path in STUBS])
+def test_a_package_has_the_names_of_its_stub(stub: Path) -> None:
+    package = ".".join(stub.parent.relative_to(ROOT).parts)
+    module = importlib.import_module(package)
+    homes = {
+        alias.name: f"{package}.{node.module}" if node.module else package
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    modules = {name: f"boxplus.{home}".rpartition(".")[0] for name, home in boxplus._MODULES.items()}
-    assert typed == {name: f"boxplus.{home}" for name, home in boxplus._HOME.items()} | modules
-    assert set(boxplus.__all__) == {*typed, "__version__"}
-
-
-@pytest.mark.parametrize("package", ["formats", "residuals"])
-def test_names_of_a_package_are_what_they_are_in_their_homes(package: str) -> None:
-    module = importlib.import_module(f"boxplus.{package}")
-    tree = ast.parse((ROOT / "boxplus" / package / "__init__.py").read_text(encoding="utf-8"))
-    typed = {
-        alias.name: node.module
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("boxplus.")
-        for alias in node.names
-    }
-    assert typed == {name: f"boxplus.{package}.{home}" for name, home in module._HOME.items()}
-    assert set(module.__all__) == set(typed) and len(module.__all__) == len(typed)
-    for name in module.__all__:
-        assert getattr(module, name) is getattr(importlib.import_module(typed[name]), name)
-    with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):
-        module.Nothing  # noqa: B018
+    assert sorted(module.__all__) == sorted(homes)
+    for name, home in homes.items():
+        assert getattr(module, name) is getattr(importlib.import_module(home), name)
 
 
 def test_packages_of_names_pull_in_nothing_heavy() -> None:
-    assert not modules_after("import boxplus.formats, boxplus.residuals") & set(HEAVY)
+    packages = [".".join(stub.parent.relative_to(ROOT).parts) for stub in STUBS]
+    assert not modules_after(f"import {', '.join(packages)}") & set(HEAVY)
 
 
 def test_version_is_that_of_the_changelog() -> None:
@@ -125,7 +111,7 @@ def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
-    for path in [*SOURCES, ROOT / "boxplus" / "py.typed"]:
+    for path in [*SOURCES, *STUBS, ROOT / "boxplus" / "py.typed"]:
         target = source / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(path.read_bytes())
@@ -140,7 +126,7 @@ def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
         (entries,) = [archive.read(name).decode() for name in names if name.endswith("entry_points.txt")]
     assert "boxplus/py.typed" in names
     assert {name.split("/")[0] for name in names} == {"boxplus", f"boxplus-{boxplus.__version__}.dist-info"}
-    assert {str(path.relative_to(ROOT)) for path in SOURCES} <= set(names)
+    assert {str(path.relative_to(ROOT)) for path in [*SOURCES, *STUBS]} <= set(names)
     assert "License-Expression: MIT" in metadata
     assert "boxplus = boxplus.cli:main" in entries
 

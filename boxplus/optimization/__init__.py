@@ -1,1 +1,5 @@
 """Nonlinear least squares: problems, their solvers, elimination and covariance."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

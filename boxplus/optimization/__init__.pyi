@@ -1,0 +1,1 @@
+from . import losses as losses
