@@ -29,8 +29,8 @@ from boxplus.formats.g2o import read_g2o
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.systems.pose_graph import PoseGraphConfig, optimize_pose_graph
-from boxplus.systems.pose_graph_start import spanning_tree_start
+from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
+from boxplus.systems.pose_graph.start import spanning_tree_start
 
 # Bar, and the optimum of χ² = Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j); cubicle as `read_g2o` reads it by default.
 BARS = {

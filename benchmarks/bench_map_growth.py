@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.simulation import simulate
-from boxplus.systems.lio_config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 EVERY = 20
 

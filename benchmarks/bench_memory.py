@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from metrics import Metric, run_as_script
 
+from boxplus.runs.config import MapConfig, RunConfig
+from boxplus.runs.odometry_run import Progress, run_odometry
 from boxplus.simulation import as_recording, simulate
-from boxplus.systems.lio_config import LioConfig
-from boxplus.systems.odometry_run import Progress, run_odometry
-from boxplus.systems.run_config import MapConfig, RunConfig
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 BOX_SIDE, DETECTION_RANGE = 200.0, 50.0
 FULL_AFTER_MIN = 5.0

@@ -26,10 +26,10 @@ from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion
 from boxplus.recordings.recording import open_recording
+from boxplus.runs.config import RunConfig
+from boxplus.runs.odometry_run import run_odometry
 from boxplus.simulation import simulate
-from boxplus.systems.lio_config import LioConfig
-from boxplus.systems.odometry_run import run_odometry
-from boxplus.systems.run_config import RunConfig
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 KITTI = "kitti_0926_0005_ros2"
 KITTI_PATH_M = 70.8

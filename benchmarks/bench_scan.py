@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.simulation import Simulation, simulate
-from boxplus.systems.estimate import Estimate
-from boxplus.systems.lio_config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 
 VOXEL = 0.5
 EVERY = 20

@@ -19,9 +19,9 @@ from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.systems.estimate import Estimate
-from boxplus.systems.lidar_inertial_odometry import LidarInertialOdometry
-from boxplus.systems.lio_config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 
 Event = Scan | ImuSamples
 MAX_RANGE = 200.0

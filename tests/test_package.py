@@ -32,6 +32,7 @@ ROOMS = [
     "sensors",
     "recordings",
     "systems",
+    "runs",
     "evaluation",
     "simulation",
     "report",

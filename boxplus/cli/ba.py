@@ -26,8 +26,8 @@ from boxplus.cli.optimization_terminal import (
 if TYPE_CHECKING:
     from boxplus.formats.reconstruction import Reconstruction
     from boxplus.optimization.losses import Loss
-    from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, BundleAdjustmentResult
-    from boxplus.systems.optimization_summary import OptimizationSummary
+    from boxplus.runs.optimization_summary import OptimizationSummary
+    from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig, BundleAdjustmentResult
 
 
 class FormatChoice(StrEnum):
@@ -68,8 +68,8 @@ def ba(
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
-    from boxplus.systems.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
-    from boxplus.systems.output_folder import prepare_output_folder
+    from boxplus.runs.output_folder import prepare_output_folder
+    from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
@@ -107,7 +107,7 @@ def ba(
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
     from boxplus.formats import colmap_binary, colmap_text
-    from boxplus.systems.optimization_summary import PLOTS
+    from boxplus.runs.optimization_summary import PLOTS
 
     model, plots = folder / "adjusted", folder / "plots"
     files = [folder / name for name in ("report.html", "adjusted.txt", "adjusted.txt.bz2", "scene.ply", "run.json")]
@@ -147,7 +147,7 @@ def _summary(
     stopped: bool,
 ) -> OptimizationSummary:
     from boxplus.cli.optimization_terminal import state_and_reason, versions
-    from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+    from boxplus.runs.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
 
     solution = result.solution
     state, reason = state_and_reason(solution, stopped)

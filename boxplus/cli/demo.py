@@ -26,9 +26,9 @@ def demo(
     from boxplus.cli.lio import run
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
+    from boxplus.runs.config import load_run_config
+    from boxplus.runs.run_folder import RunFolder
     from boxplus.simulation.simulation import simulate
-    from boxplus.systems.run_config import load_run_config
-    from boxplus.systems.run_folder import RunFolder
 
     name = _SCENARIO if duration is None else f"{_SCENARIO}_{duration:g}s"
     recording = output / name

@@ -12,9 +12,9 @@ from boxplus.cli.options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.systems.odometry_run import View
-    from boxplus.systems.run_config import RunConfig
-    from boxplus.systems.run_summary import RunSummary
+    from boxplus.runs.config import RunConfig
+    from boxplus.runs.odometry_run import View
+    from boxplus.runs.run_summary import RunSummary
 
 
 @takes_recording_options
@@ -52,8 +52,8 @@ def lio(
     No configuration is needed: topics, times and units are found from the data, with the evidence printed. Exit codes: 0 done,
     1 the results could not be written, 2 bad input, 130 interrupted (results up to there are complete).
     """
-    from boxplus.systems.run_config import load_run_config
-    from boxplus.systems.run_transform import parse_transform
+    from boxplus.runs.config import load_run_config
+    from boxplus.runs.transform import parse_transform
 
     odometry: dict[str, object] = {}
     if T_imu_lidar is not None:
@@ -85,9 +85,9 @@ def run(
     """
     from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
     from boxplus.recordings import open_recording
-    from boxplus.systems.odometry_run import run_odometry
-    from boxplus.systems.run_extrinsic import choose_extrinsic
-    from boxplus.systems.run_folder import prepare_run_folder
+    from boxplus.runs.extrinsic import choose_extrinsic
+    from boxplus.runs.odometry_run import run_odometry
+    from boxplus.runs.run_folder import prepare_run_folder
 
     terminal = RunTerminal()
     shown: View | None = None

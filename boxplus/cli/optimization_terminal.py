@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from boxplus.optimization.losses import Loss
     from boxplus.optimization.solution import Iteration, Solution
     from boxplus.optimization.solver_options import SolverOptions
-    from boxplus.systems.optimization_summary import OptimizationSummary
+    from boxplus.runs.optimization_summary import OptimizationSummary
 
 _WIDTHS = (4, 16, 10, 10, 10, 10, 9)
 # Scales at which a robust loss is 95 % as good as least squares where all errors are Gaussian.

@@ -26,8 +26,8 @@ from boxplus.cli.optimization_terminal import (
 if TYPE_CHECKING:
     from boxplus.formats.pose_graph import PoseGraph
     from boxplus.optimization.losses import Loss
-    from boxplus.systems.optimization_summary import OptimizationSummary
-    from boxplus.systems.pose_graph import PoseGraphConfig, PoseGraphResult
+    from boxplus.runs.optimization_summary import OptimizationSummary
+    from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, PoseGraphResult
 
 
 class StartChoice(StrEnum):
@@ -103,8 +103,8 @@ def pgo(
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
-    from boxplus.systems.output_folder import prepare_output_folder
-    from boxplus.systems.pose_graph import PoseGraphConfig, optimize_pose_graph
+    from boxplus.runs.output_folder import prepare_output_folder
+    from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
@@ -148,7 +148,7 @@ def pgo(
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
-    from boxplus.systems.optimization_summary import PLOTS
+    from boxplus.runs.optimization_summary import PLOTS
 
     files = [folder / name for name in ("report.html", "optimized.g2o", "optimized.graph", "graph.ply", "run.json")]
     return files + [folder / "plots" / name for name in PLOTS], [folder / "plots"]
@@ -179,7 +179,7 @@ def _summary(
     stopped: bool,
 ) -> OptimizationSummary:
     from boxplus.cli.optimization_terminal import state_and_reason, versions
-    from boxplus.systems.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+    from boxplus.runs.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
 
     solution = result.solution
     state, reason = state_and_reason(solution, stopped)
@@ -217,8 +217,8 @@ def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
     import numpy as np
 
     from boxplus.formats.scene_ply import write_scene_ply
-    from boxplus.systems.pose_graph import positions
-    from boxplus.systems.pose_graph_start import held_poses
+    from boxplus.systems.pose_graph.pose_graph import positions
+    from boxplus.systems.pose_graph.start import held_poses
 
     if graph.poses is None:
         return

@@ -18,9 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 from boxplus.recordings.info import RecordingInfo
-from boxplus.systems.odometry_run import Progress
-from boxplus.systems.run_extrinsic import Extrinsic
-from boxplus.systems.run_summary import RunSummary
+from boxplus.runs.extrinsic import Extrinsic
+from boxplus.runs.odometry_run import Progress
+from boxplus.runs.run_summary import RunSummary
 
 _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red", "weak": "yellow", "lost": "bold red"}
 _SHOWN_WARNINGS = 8

@@ -32,10 +32,10 @@ def _run_odometry() -> None:
     import tempfile
     from pathlib import Path
 
+    from boxplus.runs.config import load_run_config
+    from boxplus.runs.odometry_run import run_odometry
     from boxplus.simulation import SpinningLidar, simulate
     from boxplus.simulation.live_recording import as_recording
-    from boxplus.systems.odometry_run import run_odometry
-    from boxplus.systems.run_config import load_run_config
 
     # A car in a map box so small that it slides: every kernel of a run is called.
     odometry = {"threads": 2, "box_side": 40.0, "detection_range": 5.0, "extrinsic_estimation": "on"}
@@ -52,7 +52,7 @@ def _optimize_pose_graphs() -> None:
     from boxplus.manifolds.se2 import SE2
     from boxplus.manifolds.se3 import SE3
     from boxplus.optimization.losses import Huber
-    from boxplus.systems.pose_graph import optimize_pose_graph, pose_graph_problem
+    from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph, pose_graph_problem
 
     count = 60  # more than the dense solver takes
     i = np.arange(count)
@@ -75,7 +75,7 @@ def _adjust_bundle() -> None:
     from boxplus.formats.bal import BalProblem
     from boxplus.formats.gbp import GbpProblem
     from boxplus.manifolds import se3
-    from boxplus.systems.bundle_adjustment import adjust_bundle
+    from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 
     rng = np.random.default_rng(0)
     cameras = np.hstack([0.05 * rng.standard_normal((20, 6)), np.tile([500.0, 0.0, 0.0], (20, 1))])

@@ -18,8 +18,8 @@ from boxplus.report.optimization_page import write_optimization_page
 from boxplus.report.optimization_plots import plain, write_optimization_plots
 from boxplus.report.palette import GRID, INK
 from boxplus.report.skeleton import figure_section, html_table
-from boxplus.systems.bundle_adjustment import BundleAdjustmentResult
-from boxplus.systems.optimization_summary import OptimizationSummary
+from boxplus.runs.optimization_summary import OptimizationSummary
+from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentResult
 
 ERROR_COLORS = ("#b9c7d4", "#6f93b8", "#2f5f9e", "#e09f3e", "#c1443c")
 """Of points, from small errors to large ones."""

@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
 from boxplus.report.run_data import RunData
-from boxplus.systems.estimate import AXES
+from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
-from boxplus.systems.estimate import AXES, Estimate
+from boxplus.systems.lidar_inertial_odometry.estimate import AXES, Estimate
 
 _STATUS_RGB = {"ok": (47, 125, 91), "weak": (224, 159, 62), "lost": (193, 68, 60)}
 _AXES_RGB = [(181, 68, 60), (58, 143, 77), (53, 104, 168)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from boxplus.report.palette import FAINT, GRID, INK, SERIES
-from boxplus.systems.optimization_summary import IterationFacts
+from boxplus.runs.optimization_summary import IterationFacts
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 BEFORE, AFTER = FAINT, SERIES[0]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus.report import optimization_figures as figures
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.systems.optimization_summary import OptimizationSummary
+from boxplus.runs.optimization_summary import OptimizationSummary
 
 _PARAMETER = {"Levenberg-Marquardt": "λ", "dogleg": "radius"}
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.optimization_figures import AFTER, BEFORE, counts_per_bin, error_bins
 from boxplus.report.palette import FAINT, GRID, SERIES
-from boxplus.systems.optimization_summary import PLOTS, IterationFacts
+from boxplus.runs.optimization_summary import PLOTS, IterationFacts
 
 _DPI = 130
 

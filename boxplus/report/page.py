@@ -8,7 +8,7 @@ from pathlib import Path
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.systems.run_summary import Gap, Matrix
+from boxplus.runs.run_summary import Gap, Matrix
 
 
 def write_page(data: RunData) -> Path:

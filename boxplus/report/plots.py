@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
 from boxplus.report.run_data import RunData
-from boxplus.systems.estimate import AXES
-from boxplus.systems.run_folder import PLOTS
+from boxplus.runs.run_folder import PLOTS
+from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _DPI = 130
 _HEADROOM_M = 1.0

@@ -12,9 +12,9 @@ from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
-from boxplus.systems.run_folder import RunFolder
-from boxplus.systems.run_summary import RunSummary, read_summary
-from boxplus.systems.scan_log import ScanLog, read_scan_log
+from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.run_summary import RunSummary, read_summary
+from boxplus.runs.scan_log import ScanLog, read_scan_log
 
 _MOST_POINTS = 150_000
 _THIN_FROM = 10 * _MOST_POINTS

@@ -1,0 +1,1 @@
+"""Whole estimators, one a folder."""

@@ -17,7 +17,7 @@ from boxplus.formats.bal import read_bal, write_bal
 from boxplus.formats.colmap import read_colmap, write_colmap
 from boxplus.formats.gbp import read_gbp, write_gbp
 from boxplus.formats.ply import read_ply
-from boxplus.systems.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 
 
 def call(*arguments: object) -> Result:

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.formats.trajectory import read_trajectory
+from boxplus.runs.run_summary import read_summary
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.recording_writer import write_recording
-from boxplus.systems.run_summary import read_summary
 
 LIDAR = SpinningLidar(azimuth_steps=200)
 
@@ -124,7 +124,7 @@ def test_view_without_the_extra(bag: Path, tmp_path: Path, monkeypatch: pytest.M
 def test_ctrl_c_finishes_the_files_with_exit_code_130(tmp_path: Path) -> None:
     long = write_recording(simulate("walk", duration_s=30.0, lidar=LIDAR), tmp_path / "long", "ros1")
     out = tmp_path / "out"
-    code = "import boxplus.systems.odometry_run as r; r._SUMMARY_EVERY_S = 0.0; from boxplus.cli import main; main()"
+    code = "import boxplus.runs.odometry_run as r; r._SUMMARY_EVERY_S = 0.0; from boxplus.cli import main; main()"
     process = subprocess.Popen([sys.executable, "-c", code, "lio", str(long), "-o", str(out)], stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 300.0
     while process.poll() is None and time.monotonic() < deadline:

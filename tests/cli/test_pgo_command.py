@@ -17,8 +17,8 @@ from boxplus.formats.g2o import read_g2o, write_g2o
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.formats.toro import read_toro, write_toro
 from boxplus.manifolds.se3 import SE3
-from boxplus.systems import pose_graph
-from boxplus.systems.pose_graph import optimize_pose_graph
+from boxplus.systems.pose_graph import pose_graph
+from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
 
 
 def call(*arguments: object) -> Result:

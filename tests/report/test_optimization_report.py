@@ -17,9 +17,9 @@ from boxplus.formats.pose_graph import PoseGraph
 from boxplus.report.bundle_scene import Viewpoint, camera_centers, frustum_lines, scene_of
 from boxplus.report.graph_report import _kinds, _panels
 from boxplus.report.optimization_figures import cost_over_iterations, counts_per_bin, error_bins, error_histogram
-from boxplus.systems.bundle_adjustment import adjust_bundle
-from boxplus.systems.optimization_summary import ErrorFacts, IterationFacts
-from boxplus.systems.pose_graph import PoseGraphConfig, optimize_pose_graph
+from boxplus.runs.optimization_summary import ErrorFacts, IterationFacts
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
 
 
 def test_bins_hold_every_valid_error() -> None:

@@ -16,12 +16,12 @@ from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.report import palette, run_data, write_report
 from boxplus.report.run_data import load_run
+from boxplus.runs.config import load_run_config
+from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.run_folder import PLOTS
+from boxplus.runs.run_summary import Gap, WarningFacts, read_summary
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
-from boxplus.systems.odometry_run import run_odometry
-from boxplus.systems.run_config import load_run_config
-from boxplus.systems.run_folder import PLOTS
-from boxplus.systems.run_summary import Gap, WarningFacts, read_summary
 
 LIDAR = SpinningLidar(azimuth_steps=200)
 

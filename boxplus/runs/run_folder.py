@@ -1,0 +1,97 @@
+"""The output folder of a run: what lies where, who may write there, and what an earlier run left (docs/output_folder.md)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from boxplus.formats.output import TEMPORARY_SUFFIX
+from boxplus.runs.output_folder import SUMMARY, prepare_output_folder
+
+PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
+_MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The paths of a run's results.
+
+    Attributes:
+        path: the folder.
+    """
+
+    path: Path
+
+    @property
+    def summary(self) -> Path:
+        """Counts, timings, versions, warnings, and the state of the run."""
+        return self.path / SUMMARY
+
+    @property
+    def config(self) -> Path:
+        """The settings as used."""
+        return self.path / "config.yaml"
+
+    @property
+    def scans(self) -> Path:
+        """One row a scan: velocity, biases, diagnosis, timing."""
+        return self.path / "scans.csv"
+
+    @property
+    def trajectory(self) -> Path:
+        """The trajectory with covariance and status; `.tum` and `.kitti.txt` lie beside it."""
+        return self.path / "trajectory.csv"
+
+    @property
+    def tiles(self) -> Path:
+        """The map in tiles."""
+        return self.path / "map"
+
+    @property
+    def map_ply(self) -> Path:
+        """The merged map."""
+        return self.path / "map.ply"
+
+    @property
+    def map_pcd(self) -> Path:
+        """The merged map, in the other format."""
+        return self.path / "map.pcd"
+
+    @property
+    def report(self) -> Path:
+        """The report."""
+        return self.path / "report.html"
+
+    @property
+    def plots(self) -> Path:
+        """Folder of the pictures."""
+        return self.path / "plots"
+
+    def own_files(self) -> Iterator[Path]:
+        """The files in the folder that a run writes."""
+        top = [self.summary, self.config, self.scans, self.map_ply, self.map_pcd, self.report]
+        top += [self.trajectory.with_name(f"trajectory.{ending}") for ending in ("tum", "kitti.txt", "csv")]
+        top += [self.plots / name for name in PLOTS]
+        for path in top:
+            yield from (candidate for candidate in (path, path.with_name(path.name + TEMPORARY_SUFFIX)) if candidate.is_file())
+        for path in self.tiles.rglob("*"):
+            inside = path.relative_to(self.tiles).as_posix().removesuffix(TEMPORARY_SUFFIX)
+            if path.is_file() and _MAP_FILE.fullmatch(inside):
+                yield path
+
+
+def prepare_run_folder(folder: str | Path, *, overwrite: bool = False) -> RunFolder:
+    """A folder to write a run into: new, empty, or (with `overwrite`) cleared of an earlier run's own files.
+
+    Nothing that a run did not write is ever removed.
+
+    Raises:
+        InputError: the folder holds something else, or an earlier run and `overwrite` is not set.
+        OutputError: it cannot be created or cleared.
+    """
+    run = RunFolder(Path(folder))
+    inner = (*run.tiles.glob("tiles/*"), run.tiles / "tiles", run.tiles, run.plots)
+    prepare_output_folder(run.path, "boxplus lio", run.own_files(), inner, overwrite=overwrite)
+    return run

@@ -1,0 +1,3 @@
+from .bundle_adjustment import BundleAdjustmentConfig as BundleAdjustmentConfig
+from .bundle_adjustment import BundleAdjustmentResult as BundleAdjustmentResult
+from .bundle_adjustment import adjust_bundle as adjust_bundle

@@ -1,0 +1,2 @@
+from .direct_alignment import Alignment as Alignment
+from .direct_alignment import align_rgbd as align_rgbd

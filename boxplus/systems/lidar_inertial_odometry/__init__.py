@@ -1,0 +1,5 @@
+"""LiDAR-inertial odometry: an iterated error-state Kalman filter on a map of points."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,391 @@
+"""LiDAR-inertial odometry: FAST-LIO2 (Xu et al., IEEE T-RO 2022), corrected as in SPEC.md section 9."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions, project_out_weak
+from boxplus.filtering.iterated_update import map_step, move_covariance
+from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.nav_state import TANGENT, NavState, V, boxplus_into
+from boxplus.filtering.plane_information import ONE_LINE
+from boxplus.filtering.propagation import NODE, propagate_interval
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.sliding_box import SlidingBox
+from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.consistency import Consistency, Saturation
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
+from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
+from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import REASONS, PlaneMeasurement
+from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
+from boxplus.systems.lidar_inertial_odometry.start import Start, align, deskew_first, find_start, joined_imu
+
+_LONGEST_START_SCANS = 30
+_BLIND_PASSES = 3
+_BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
+_CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
+_GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
+_SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
+
+
+class LidarInertialOdometry:
+    """Estimates the pose of an IMU from its samples and the scans of a LiDAR rigidly attached to it.
+
+    Push IMU samples and scans in the order in which they arrive; each call returns the estimates that have become ready
+    (a scan waits until IMU samples cover it, and the first scans until the start is found). Call `flush` at the end.
+
+    Args:
+        config: the settings; every one has a default.
+    """
+
+    def __init__(self, config: LioConfig | None = None) -> None:
+        self.config = config or LioConfig()
+        self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
+        self.start: Start | None = None
+        self.start_problem: str | None = None
+        self._sequencer = Sequencer()
+        self._waiting: list[Frame] = []
+        self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
+        self._box = SlidingBox(self.config.box_side, self.config.detection_range)
+        self._excitation = RotationExcitation()
+        self._standstill: Standstill | None = None
+        self._consistency = Consistency(self.config.min_matched_share)
+        self._saturation = Saturation()
+        self._warnings: list[str] = []
+        self._x_before: NDArray[np.float64] = np.zeros(0)
+        self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
+        self._x: NDArray[np.float64] = np.zeros(0)
+        self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
+        self._datum = MapDatum(NavState.identity().pack(), self._cov)
+        self._time_ns = 0
+        c = self.config
+        self._density = np.array([c.gyro_noise, c.accel_noise, c.gyro_bias_walk, c.accel_bias_walk]) ** 2
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What could not be used before it reached the filter, by reason."""
+        return Counter({reason: count for reason, count in self._sequencer.rejected.items() if count})
+
+    @property
+    def contradiction(self) -> str | None:
+        """What makes the estimate not to be trusted, whatever its status: gyroscope and LiDAR turn differently; a sentence."""
+        return self._consistency.contradiction
+
+    @property
+    def time_steps(self) -> list[str]:
+        """Where the times of a sensor stepped back for good, and how much of it was left out: one sentence each."""
+        return self._sequencer.time_steps
+
+    def push_imu(self, samples: ImuSamples) -> list[Estimate]:
+        """Take IMU samples; returns the estimates that became ready."""
+        self._sequencer.add_imu(samples)
+        return self._advance(self._sequencer.frames())
+
+    def push_scan(self, scan: Scan) -> list[Estimate]:
+        """Take a scan; returns the estimates that became ready."""
+        self._sequencer.add_scan(scan)
+        return self._advance(self._sequencer.frames())
+
+    def flush(self) -> list[Estimate]:
+        """No more data will come: process what still waits for IMU samples."""
+        estimates = self._advance(self._sequencer.frames(flush=True))
+        if self.start is None and self._waiting:
+            estimates += self._try_start(final=True)
+        return estimates
+
+    def predict(self) -> Prediction | None:
+        """The state now: the last posterior, carried through all IMU samples since. None before the start.
+
+        For control, at the rate of the IMU: call it after `push_imu`. The filter itself is not touched; when the next scan
+        arrives, its estimate replaces what was predicted over the same time.
+        """
+        if self.start is None:
+            return None
+        imu = self._sequencer.imu_since(self._time_ns)
+        x, cov = self._x.copy(), self._cov.copy()
+        newest = max(int(imu.time_ns[-1]), self._time_ns) if len(imu) else self._time_ns
+        if newest > self._time_ns:
+            self._carry(x, cov, imu, newest, self._density)
+        return Prediction(newest, NavState.unpack(x), cov)
+
+    def _advance(self, frames: list[Frame]) -> list[Estimate]:
+        estimates: list[Estimate] = []
+        for frame in frames:
+            if self.start is not None:
+                estimates.append(self._process(frame))
+                continue
+            self._waiting.append(frame)
+            seconds = (frame.scan.end_ns - self._waiting[0].scan.start_ns) * 1e-9
+            if seconds >= self.config.start_duration:
+                estimates += self._try_start()
+        return estimates
+
+    def _try_start(self, *, final: bool = False) -> list[Estimate]:
+        """Find the first state, then process every scan that waited for it: no scan is lost to the start."""
+        found = find_start(self._waiting, self.config)
+        if isinstance(found, str):
+            self.start_problem = found
+            # The oldest scans make room, so that a start that takes long stays cheap.
+            keep = 0 if final else _LONGEST_START_SCANS
+            forgotten = max(len(self._waiting) - keep, 0)
+            self._sequencer.rejected["scan before a start could be found"] += forgotten
+            del self._waiting[:forgotten]
+            return []
+        self.start, self.start_problem = found, None
+        self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
+        self._datum = MapDatum(self._x, self._cov)
+        self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
+        if found.kind == "static":
+            self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
+        first, *rest = self._waiting
+        self._waiting = []
+        p_lidar = deskew_first(first, found.state, self.config)
+        self._insert(self._voxel_filter(p_lidar)[1])
+        estimates = [self._estimate(first, p_lidar, status="ok")]
+        return estimates + [self._process(frame) for frame in rest]
+
+    def _process(self, frame: Frame) -> Estimate:
+        """One scan, line by line as in SPEC.md 9.11."""
+        clock = _Stopwatch()
+        if begins_blind(frame, self.config.max_imu_gap):
+            frame = self._see_motion(frame)
+        p_lidar = self._propagate(frame)
+        if self._standstill is not None and self._standstill.active:
+            self._standstill.update(frame.imu, self._x, self._cov)
+        clock.lap("propagate and deskew")
+        self._slide_map()
+        clock.lap("slide map")
+        voxel = self._voxel_filter.voxel_size
+        points, map_points = self._voxel_filter(p_lidar)
+        clock.lap("voxel filter")
+        return self._update(frame, p_lidar, points, map_points, voxel, clock)
+
+    def _see_motion(self, frame: Frame) -> Frame:
+        """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
+        x, cov = self._x.copy(), self._cov.copy()
+        seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
+        for _ in range(_BLIND_PASSES):
+            points = self._voxel_filter(self._deskew(frame, self._density)[0])[0]
+            fits = align(points, self.map, self._x, self.config)
+            # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
+            motion = 0.5 * (self._motion + mean_motion(x, self._x, seconds))
+            self._x[:], self._cov[:] = x, cov
+            if not fits:
+                break
+            frame = replace(frame, imu=with_turn_rate(frame, motion[0], x))
+            self._x[V : V + 3] = motion[1]
+        return frame
+
+    def _propagate(self, frame: Frame) -> NDArray[np.float32]:
+        """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
+        self._x_before = self._x.copy()
+        self._warnings = self._saturation.update(frame.imu)
+        density = np.maximum(self._density, _SATURATED_DENSITY) if self._warnings else self._density
+        p_lidar, nodes = self._deskew(frame, density)
+        self._time_ns = frame.scan.end_ns
+        self._excitation.add(nodes)
+        return p_lidar
+
+    def _deskew(self, frame: Frame, density: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """State and covariance move to the end of the scan; returns its points as seen from there, and the nodes."""
+        scan = frame.scan
+        nodes = self._carry(self._x, self._cov, frame.imu, scan.end_ns, density)
+        p_lidar = np.empty_like(scan.p_lidar)
+        deskew_into(scan.p_lidar, scan.time_ns, self._time_ns, nodes, len(nodes), self._x, p_lidar)
+        return p_lidar, nodes
+
+    def _carry(
+        self,
+        x: NDArray[np.float64],
+        cov: NDArray[np.float64],
+        imu: ImuSamples,
+        until_ns: int,
+        density: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Propagate x (36,) and cov (24, 24) in place from the last posterior to `until_ns`; returns the nodes."""
+        nodes = np.zeros((len(imu) + 3, NODE))
+        count = propagate_interval(
+            x,
+            cov,
+            (imu.time_ns - self._time_ns) * 1e-9,
+            imu.gyro,
+            imu.accel,
+            (until_ns - self._time_ns) * 1e-9,
+            density,
+            self.config.max_imu_gap,
+            _GAP_DENSITY,
+            nodes,
+        )
+        return nodes[:count]
+
+    def _slide_map(self) -> None:
+        state = NavState.unpack(self._x)
+        for low, high in self._box.follow(state.p_world_imu + state.R_world_imu @ state.p_imu_lidar):
+            self.map.delete_box(low, high)
+
+    def _update(
+        self,
+        frame: Frame,
+        p_lidar: NDArray[np.float32],
+        points: NDArray[np.float32],
+        map_points: NDArray[np.float32],
+        voxel: float,
+        clock: _Stopwatch,
+    ) -> Estimate:
+        """The iterated update (SPEC.md 9.8, 9.9), then the map takes the points at the posterior pose."""
+        config = self.config
+        x_prior, cov_prior = self._x.copy(), self._cov.copy()
+        with_extrinsic = config.extrinsic_estimation == "on" or (
+            config.extrinsic_estimation == "gated" and self._excitation.sufficient
+        )
+        measurement = PlaneMeasurement(points, self.map, config, voxel=voxel, with_extrinsic=with_extrinsic)
+        delta = np.zeros(TANGENT)
+        posterior = np.zeros((TANGENT, TANGENT))
+        directions: PoseDirections | None = None
+        rematch, converged_before, converged = True, False, False
+        steps = 0
+        lost = False
+        weight = _BLIND_WEIGHT if frame.largest_gap_s > config.max_imu_gap else 1.0
+        information = None
+        for iteration in range(config.max_iterations + 1):
+            information = measurement.at(self._x, rematch=rematch)
+            if information.used < config.min_points:
+                lost = True
+                break
+            directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
+            A, b = project_out_weak(information.A * weight, information.b * weight, directions)
+            if not map_step(self._x, x_prior, cov_prior, A, b, delta, posterior):
+                lost = True
+                break
+            boxplus_into(self._x, delta, self._x)
+            steps += 1
+            converged = bool(np.abs(delta).max() < _CONVERGED)
+            if converged and (converged_before or not measurement.has_moved(self._x)):
+                break
+            last_but_one = iteration == config.max_iterations - 1
+            rematch = converged or (last_but_one and not converged_before)
+            converged_before |= converged
+        used = information.used if information is not None else 0
+        rejected = dict(measurement.rejected())
+        # A point among map points of one scan line is not used, but it does lie on the map.
+        on_map = (0 if lost else used + rejected.get(REASONS[ONE_LINE], 0)) / max(len(points), 1)
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, on_map)
+        # After a gap of the IMU nothing but the points says where the platform is: too few of them say nothing.
+        astray = frame.largest_gap_s > config.max_imu_gap and on_map < config.min_matched_share
+        lost |= astray or self._consistency.lost
+        if lost:
+            self._x[:] = x_prior
+            rejected["scan without an update"] = used
+            used = 0
+            self._datum.follow(self._x, cov_prior, self._cov)
+        else:
+            self._cov[:] = posterior
+            move_covariance(self._cov, delta)
+            self._datum.follow(self._x, cov_prior, self._cov, A, directions)
+        self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
+        clock.lap("update")
+        # Where the map has been left for good, a new one begins at the predicted pose.
+        if not lost or len(self.map) == 0 or self._consistency.lost:
+            self._insert(map_points)
+        clock.lap("map insertion")
+        status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
+        return self._estimate(
+            frame,
+            p_lidar,
+            status=status,
+            directions=directions,
+            share=np.zeros(6) if lost else _lidar_share(cov_prior, self._cov),
+            points_filtered=len(points),
+            points_used=used,
+            rejected=rejected,
+            residual_rms=information.residual_rms if information is not None else 0.0,
+            iterations=steps,
+            converged=converged,
+            timing_s=clock.laps,
+        )
+
+    def _insert(self, points: NDArray[np.float32]) -> None:
+        self._datum.insert(self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True).inserted)
+
+    def _estimate(
+        self,
+        frame: Frame,
+        p_lidar: NDArray[np.float32],
+        *,
+        status: Status,
+        directions: PoseDirections | None = None,
+        share: NDArray[np.float64] | None = None,
+        points_filtered: int = 0,
+        points_used: int = 0,
+        rejected: Mapping[str, int] | None = None,
+        residual_rms: float = 0.0,
+        iterations: int = 0,
+        converged: bool = True,
+        timing_s: Mapping[str, float] | None = None,
+    ) -> Estimate:
+        warnings = self._warnings
+        self._warnings = []
+        if not frame.covered:
+            warnings.append("no IMU sample at or after the end of the scan: the last one was held")
+        if frame.largest_gap_s > self.config.max_imu_gap:
+            warnings.append(
+                f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
+                "motion taken from the LiDAR alone, covariance widened"
+            )
+        weak: tuple[WeakDirection, ...] = ()
+        if directions is not None and status == "weak":
+            weak = tuple(
+                WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.shares[i]))
+                for i in np.flatnonzero(directions.weak)
+            )
+        return Estimate(
+            time_ns=frame.scan.end_ns,
+            state=NavState.unpack(self._x),
+            covariance=self._cov.copy(),
+            pose_covariance=self._datum.pose_covariance(self._x),
+            status=status,
+            weak_directions=weak,
+            lidar_share=np.zeros(6) if share is None else share,
+            points_raw=len(frame.scan) + sum(frame.scan.rejected.values()),
+            points_filtered=points_filtered,
+            points_used=points_used,
+            rejected=dict(rejected or {}),
+            residual_rms=residual_rms,
+            iterations=iterations,
+            converged=converged,
+            warnings=tuple(warnings),
+            timing_s=dict(timing_s or {}),
+            p_lidar=p_lidar,
+            intensity=frame.scan.intensity,
+        )
+
+
+def _lidar_share(cov_prior: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6,) 1 − posterior / prior variance of the pose."""
+    share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / cov_prior.diagonal()[:6], 0.0, 1.0)
+    return share
+
+
+class _Stopwatch:
+    """Seconds spent by stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.laps[stage] = now - self._last
+        self._last = now

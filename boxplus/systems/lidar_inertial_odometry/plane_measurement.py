@@ -1,0 +1,136 @@
+"""The LiDAR measurement: a scan against the map, point to plane, as information about the state (SPEC.md 9.6 to 9.8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import run_chunks
+from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
+from boxplus.filtering.plane_information import (
+    FEW_NEIGHBOURS,
+    GATED,
+    MEASURED_DOF,
+    NOT_A_PLANE,
+    ONE_LINE,
+    accumulate_planes,
+)
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
+from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_CHUNK = 512
+_SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
+_INDEPENDENT = 0.5  # m between points whose errors are independent
+REASONS = {
+    FEW_NEIGHBOURS: "fewer than five map points near",
+    NOT_A_PLANE: "neighbours not on a plane",
+    GATED: "too far from the plane",
+    ONE_LINE: "neighbours along one scan line",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """What a scan says about the components [θ, p, θ_L, p_L] at one state: A = Hᵀ R⁻¹ H (12, 12), b = Hᵀ R⁻¹ z (12,)."""
+
+    A: NDArray[np.float64]
+    b: NDArray[np.float64]
+    used: int
+    residual_rms: float
+
+
+class PlaneMeasurement:
+    """One scan against one map; keeps neighbours and planes from iteration to iteration.
+
+    Args:
+        p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame.
+        tree: the map, which must not change while the measurement lives.
+        config: noise, gates and threads.
+        voxel: side of the voxels that thinned the scan [m].
+        with_extrinsic: whether the extrinsic is measured.
+    """
+
+    def __init__(
+        self, p_lidar: NDArray[np.float32], tree: IkdTree, config: LioConfig, *, voxel: float, with_extrinsic: bool
+    ) -> None:
+        n = len(p_lidar)
+        self._p_lidar = p_lidar
+        self._tree = tree
+        self._config = config
+        self._with_extrinsic = with_extrinsic
+        self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
+        self._planes = np.zeros((n, PLANE))
+        self._fate = np.zeros(n, dtype=np.uint8)
+        self._matched = False
+        self._matched_at = np.zeros(PACKED)
+        # Points that share map neighbours share their error: finer voxels give more points, not more information.
+        self._range_variance = (config.range_sigma * max(1.0, _INDEPENDENT / voxel)) ** 2
+        squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
+        self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
+
+    def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
+        """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
+        if rematch or not self._matched:
+            self._match(x)
+        A = np.zeros((MEASURED_DOF, MEASURED_DOF))
+        b = np.zeros(MEASURED_DOF)
+        sums = np.zeros(2)
+        config = self._config
+        accumulate_planes(
+            x,
+            self._p_lidar,
+            self._planes,
+            self._fate,
+            self._range_variance,
+            config.map_sigma**2,
+            self._with_extrinsic,
+            A,
+            b,
+            sums,
+        )
+        A += np.triu(A, 1).T
+        used = int(sums[0])
+        return Information(A, b, used, float(np.sqrt(sums[1] / used)) if used else 0.0)
+
+    def has_moved(self, x: NDArray[np.float64]) -> bool:
+        """Whether the points have moved far enough since the last search for some to have other neighbours."""
+        delta = np.zeros(TANGENT)
+        boxminus_into(x, self._matched_at, delta)
+        shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
+        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._config.map_cell
+
+    def rejected(self) -> Mapping[str, int]:
+        """Points that were not used, by reason."""
+        counts = np.bincount(self._fate, minlength=5)
+        return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
+
+    def _match(self, x: NDArray[np.float64]) -> None:
+        view, origin, config = self._tree.view(), self._tree.origin, self._config
+        warm = self._matched
+
+        def work(_: int, begin: int, end: int) -> None:
+            match_planes(
+                view,
+                origin,
+                x,
+                self._p_lidar,
+                begin,
+                end,
+                config.max_neighbour_distance**2,
+                config.plane_threshold,
+                warm,
+                self._neighbours,
+                self._planes,
+                self._fate,
+                np.zeros(NEIGHBOURS, dtype=np.float32),
+                np.zeros(STACK_DEPTH, dtype=STACK),
+            )
+
+        run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
+        self._matched = True
+        self._matched_at = x.copy()

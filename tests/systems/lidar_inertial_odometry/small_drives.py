@@ -1,0 +1,58 @@
+"""Short simulated recordings with few rays, and the odometry run over them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate, trajectories, worlds
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+
+LIDAR = SpinningLidar(channels=16, azimuth_steps=150, vertical_fov_deg=(-30.0, 30.0))
+
+
+def room_walk(duration_s: float = 5.0, seed: int = 0, imu: ImuModel | None = None) -> Simulation:
+    """At rest for a moment, then on foot through a furnished room."""
+    path = trajectories.walk(((-2.5, 0.5), (1.0, 0.5), (1.0, -2.5)), seed=seed)
+    return simulate(Scenario("room_walk", worlds.room(seed=seed), path, LIDAR), seed, duration_s=duration_s, imu=imu)
+
+
+def config(simulation: Simulation, **settings: object) -> LioConfig:
+    """The default settings with the simulation's extrinsic."""
+    T_imu_lidar = tuple(tuple(float(value) for value in row) for row in simulation.T_imu_lidar)
+    return LioConfig.model_validate({"T_imu_lidar": T_imu_lidar, **settings})
+
+
+def run(odometry: LidarInertialOdometry, events: Iterable[Scan | ImuSamples]) -> list[Estimate]:
+    """Push everything, then flush."""
+    estimates: list[Estimate] = []
+    for event in events:
+        estimates += odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event)
+    return estimates + odometry.flush()
+
+
+def frames(events: Iterable[Scan | ImuSamples]) -> list[Frame]:
+    """The frames of a recording."""
+    sequencer = Sequencer()
+    for event in events:
+        if isinstance(event, Scan):
+            sequencer.add_scan(event)
+        else:
+            sequencer.add_imu(event)
+    return sequencer.frames(flush=True)
+
+
+def position_errors(simulation: Simulation, estimates: list[Estimate]) -> np.ndarray:
+    """Distances (N,) from the truth, with the first estimate laid on it (heading and position) [m]."""
+    truth = simulation.ground_truth(np.array([e.time_ns for e in estimates]))
+    R_align = truth.R_world_imu[0] @ estimates[0].state.R_world_imu.T
+    p = np.stack([e.state.p_world_imu for e in estimates])
+    moved = (p - p[0]) @ R_align.T + truth.p_world_imu[0]
+    errors: np.ndarray = np.linalg.norm(moved - truth.p_world_imu, axis=1)
+    return errors

@@ -1,0 +1,119 @@
+"""A scan against a map: the information it gives, its gradient, and the count of every point (SPEC.md 9.6 to 9.8)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from boxplus.filtering.degeneracy import pose_directions
+from boxplus.filtering.nav_state import NavState
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
+from boxplus.systems.lidar_inertial_odometry.start import align
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def _faces(random: np.random.Generator, count: int, open_x: bool = False) -> np.ndarray:
+    """Points on the walls, the floor and the ceiling of a room 12 × 6 × 4 m about the origin; `open_x`: without its ends."""
+    half = np.array([6.0, 3.0, 2.0])
+    points = random.uniform(-half, half, (count, 3))
+    axis = random.integers(1 if open_x else 0, 3, count)
+    points[np.arange(count), axis] = half[axis] * random.choice([-1.0, 1.0], count)
+    return points
+
+
+def _look(world: np.ndarray, x: NavState) -> np.ndarray:
+    p_imu = (world - x.p_world_imu) @ x.R_world_imu
+    return ((p_imu - x.p_imu_lidar) @ x.R_imu_lidar).astype(np.float32)
+
+
+def _pose(random: np.random.Generator, scale: float = 1.0) -> NavState:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = so3.exp(random.normal(size=3)), 0.1 * random.normal(size=3)
+    delta = np.zeros(24)
+    delta[:6] = scale * random.normal(size=6) * np.repeat([0.3, 0.5], 3)
+    return NavState.identity(T).boxplus(delta)
+
+
+def _measure(points: np.ndarray, tree: IkdTree, *, threads: int = 1, with_extrinsic: bool = False) -> PlaneMeasurement:
+    return PlaneMeasurement(points, tree, LioConfig(threads=threads), voxel=0.5, with_extrinsic=with_extrinsic)
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_every_point_is_used_or_counted(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    tree = IkdTree(_faces(random, 4000))
+    world = np.concatenate([_faces(random, 150), random.uniform(-1.5, 1.5, (30, 3)), [[50.0, 0.0, 0.0]]])
+    x = _pose(random)
+    measurement = _measure(_look(world, x), tree, with_extrinsic=True)
+    information = measurement.at(x.pack(), rematch=True)
+    assert information.used + sum(measurement.rejected().values()) == len(world)
+    assert information.used > 100
+    assert measurement.rejected()["fewer than five map points near"] >= 1
+    assert np.array_equal(information.A, information.A.T)
+    assert np.linalg.eigvalsh(information.A).min() > -1e-6 * np.trace(information.A)
+
+
+def test_the_number_of_threads_does_not_change_a_bit() -> None:
+    random = np.random.default_rng(0)
+    tree, x = IkdTree(_faces(random, 4000)), _pose(random)
+    points = _look(_faces(random, 1300) + 0.02 * random.normal(size=(1300, 3)), x)
+    one, two = (_measure(points, tree, threads=threads).at(x.pack(), rematch=True) for threads in (1, 2))
+    assert one.A.tobytes() == two.A.tobytes()
+    assert one.b.tobytes() == two.b.tobytes()
+
+
+def test_reusing_the_neighbours_where_nothing_moved() -> None:
+    random = np.random.default_rng(1)
+    tree, x = IkdTree(_faces(random, 4000)), _pose(random)
+    measurement = _measure(_look(_faces(random, 300), x), tree)
+    first = measurement.at(x.pack(), rematch=False)
+    again = measurement.at(x.pack(), rematch=False)
+    rematched = measurement.at(x.pack(), rematch=True)
+    for other in (again, rematched):
+        assert other.A.tobytes() == first.A.tobytes()
+        assert other.residual_rms == first.residual_rms
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_aligning_finds_the_pose(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    tree, truth = IkdTree(_faces(random, 6000)), _pose(random)
+    points = _look(_faces(random, 600), truth)
+    off = np.zeros(24)
+    off[:6] = 0.03 * random.normal(size=6)
+    packed = truth.boxplus(off).pack()
+    assert align(points, tree, packed, LioConfig())
+    found = NavState.unpack(packed).boxminus(truth)
+    assert np.abs(found[:6]).max() < 2e-3
+    assert not found[6:18].any()
+
+
+def test_aligning_to_nothing_is_refused() -> None:
+    assert not align(np.ones((50, 3), np.float32), IkdTree(), NavState.identity().pack(), LioConfig())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_corridor_is_weak_along_its_axis_only(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    tree, x = IkdTree(_faces(random, 6000, open_x=True)), _pose(random)
+    points = _look(_faces(random, 600, open_x=True) * [0.8, 1.0, 1.0], x)
+    measurement = _measure(points, tree)
+    information = measurement.at(x.pack(), rematch=True)
+    directions = pose_directions(information.A, measurement.lever_arm, LioConfig().weak_threshold)
+    assert directions.weak.tolist() == [True] + [False] * 5
+    assert abs(directions.vectors[3, 0]) > 0.99  # x of the world
+
+
+def test_no_points_give_no_information() -> None:
+    information = _measure(np.zeros((0, 3), np.float32), IkdTree()).at(NavState.identity().pack(), rematch=True)
+    assert information.used == 0
+    assert information.residual_rms == 0.0
+    assert not information.A.any()

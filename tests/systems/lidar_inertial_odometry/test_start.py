@@ -1,0 +1,84 @@
+"""The first state at rest and in motion, and what is said when there is none yet (SPEC.md 9.4)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_drives import LIDAR, config, frames, room_walk
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame
+from boxplus.simulation import simulate
+from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
+
+
+def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
+
+
+@pytest.mark.parametrize("gravity_aligned", [True, False])
+def test_at_rest(gravity_aligned: bool) -> None:
+    simulation = simulate("at_rest", duration_s=1.6, lidar=LIDAR)
+    found = find_start(frames(simulation.events()), config(simulation, gravity_aligned=gravity_aligned))
+    assert isinstance(found, Start)
+    assert found.kind == "static"
+    assert found.text.startswith("at rest: gyro std ")
+    state = found.state
+    true_bias = simulation.scenario.imu.gyro_bias
+    assert np.allclose(state.bias_gyro, true_bias, atol=5e-4)
+    assert not state.v_world_imu.any()
+    assert not state.p_world_imu.any()
+    down_imu = state.R_world_imu.T @ state.gravity_world
+    assert _angle_deg(down_imu, np.array([0.0, 0.0, -1.0])) < 0.5
+    assert np.isclose(np.linalg.norm(state.gravity_world), 9.81)
+    if gravity_aligned:
+        assert np.allclose(state.gravity_world, [0.0, 0.0, -9.81], atol=1e-12)
+    else:
+        assert np.array_equal(state.R_world_imu, np.eye(3))
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
+    # The reading at rest is explained: Rᵀ g + a_m − b_a = 0.
+    reading = np.concatenate([f.imu.accel for f in frames(simulation.events())]).mean(axis=0)
+    assert np.allclose(reading - state.bias_accel + down_imu, 0, atol=0.01)
+
+
+def test_moving() -> None:
+    simulation = simulate("moving_start", duration_s=1.6)
+    found = find_start(frames(simulation.events()), config(simulation))
+    assert isinstance(found, Start)
+    assert found.kind == "moving"
+    assert "moving at 1" in found.text
+    truth = simulation.ground_truth(np.array([found.time_ns]))
+    # The heading is free: compare in the IMU's own frame.
+    v_imu = found.state.R_world_imu.T @ found.state.v_world_imu
+    assert np.linalg.norm(v_imu - truth.R_world_imu[0].T @ truth.v_world_imu[0]) < 0.3
+    down_imu = found.state.R_world_imu.T @ found.state.gravity_world
+    assert _angle_deg(down_imu, truth.R_world_imu[0].T @ np.array([0.0, 0.0, -9.81])) < 1.0
+    assert np.isclose(np.linalg.norm(found.state.gravity_world), 9.81)
+
+
+def _shaken(frame: Frame, seed: int) -> Frame:
+    noise = 3.0 * np.random.default_rng(seed).normal(size=frame.imu.accel.shape)
+    return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + noise, frame.imu.accel + noise))
+
+
+def test_too_few_scans_in_motion_are_refused_with_the_evidence() -> None:
+    simulation = room_walk(1.0)
+    shaken = [_shaken(frame, seed) for seed, frame in enumerate(frames(simulation.events())[:4])]
+    refusal = find_start(shaken, config(simulation))
+    assert isinstance(refusal, str)
+    assert refusal.startswith("not at rest (gyro std ")
+    assert refusal.endswith("and 4 scans are not enough for a moving start; waiting for more data")
+
+
+def test_scans_that_do_not_overlap_are_refused() -> None:
+    simulation = room_walk(1.5)
+    apart = []
+    for index, frame in enumerate(frames(simulation.events())):
+        scan = Scan.from_arrays(frame.scan.p_lidar + np.float32(100.0 * index), frame.scan.time_ns)
+        apart.append(replace(_shaken(frame, index), scan=scan))
+    refusal = find_start(apart, config(simulation))
+    assert isinstance(refusal, str)
+    assert refusal.endswith("the first scans do not overlap enough for a moving start; waiting for more data")
