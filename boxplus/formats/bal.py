@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.bal_text import read_bal_text
-from boxplus.formats.number_writer import write_rows
+from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
 
 CAMERA_SIZE = 9

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.number_lines import NumberLines, read_number_lines
-from boxplus.formats.number_parser import OTHER
+from boxplus.formats.numbers.lines import NumberLines, read_number_lines
+from boxplus.formats.numbers.parser import OTHER
 
 _OBSERVATION = "an observation: camera index, point index, x, y"
 _ADVICE = "correct the line, or check that no line before it is missing"

@@ -11,9 +11,9 @@ import numpy as np
 from boxplus.errors import InputError
 from boxplus.formats.colmap_model import CAMERA_MODELS, ColmapModel
 from boxplus.formats.colmap_parts import ColmapParts
-from boxplus.formats.number_lines import NumberLines, read_number_lines, rest_of_line
-from boxplus.formats.number_parser import INTEGER, OTHER
-from boxplus.formats.number_writer import rows_to_text
+from boxplus.formats.numbers.lines import NumberLines, read_number_lines, rest_of_line
+from boxplus.formats.numbers.parser import INTEGER, OTHER
+from boxplus.formats.numbers.writer import rows_to_text
 from boxplus.formats.output import atomic_file
 
 FILES = ("cameras.txt", "images.txt", "points3D.txt")

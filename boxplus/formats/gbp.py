@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.bal_text import read_bal_text
-from boxplus.formats.number_writer import write_rows
+from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
 from boxplus.manifolds import quaternion, so3
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from boxplus.formats.graph_builder import GraphBuilder
 from boxplus.formats.information_matrix import triangle_index
-from boxplus.formats.number_lines import NumberLines, read_number_lines
-from boxplus.formats.number_writer import write_rows
+from boxplus.formats.numbers.lines import NumberLines, read_number_lines
+from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
-from boxplus.formats import number_lines
 from boxplus.formats.bal import BalProblem, read_bal, write_bal
 from boxplus.formats.gbp import read_gbp
+from boxplus.formats.numbers import lines as number_lines
 
 NAMES = ("cameras", "points", "camera_of", "point_of", "pixels")
 

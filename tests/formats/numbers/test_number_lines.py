@@ -12,9 +12,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError
-from boxplus.formats import number_lines
-from boxplus.formats.number_lines import read_number_lines
-from boxplus.formats.number_parser import INTEGER, NO_TAG, OTHER, REAL, UNKNOWN_TAG
+from boxplus.formats.numbers import lines as number_lines
+from boxplus.formats.numbers.lines import read_number_lines
+from boxplus.formats.numbers.parser import INTEGER, NO_TAG, OTHER, REAL, UNKNOWN_TAG
 
 
 def parse(folder: Path, text: str | bytes, tags: tuple[str, ...] = ()) -> list[number_lines.NumberLines]:

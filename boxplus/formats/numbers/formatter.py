@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.formats.number_parser import EXACT_POWERS, LOWEST_POWER, float_bits, long_product
+from boxplus.formats.numbers.parser import EXACT_POWERS, LOWEST_POWER, float_bits, long_product
 
 LONGEST_NUMBER = 26
 """Bytes of the longest number, with the space or newline behind it."""

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from boxplus.formats.number_writer import write_rows
+from boxplus.formats.numbers.writer import write_rows
 
 
 def written(prefix: str, whole: object, numbers: object) -> str:

@@ -8,8 +8,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.number_formatter import LONGEST_NUMBER, format_rows
-from boxplus.formats.number_parser import powers_of_five
+from boxplus.formats.numbers.formatter import LONGEST_NUMBER, format_rows
+from boxplus.formats.numbers.parser import powers_of_five
 
 _BLOCK = 8192
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.number_parser import INTEGER, LINE, OTHER, REAL, powers_of_five, tokenise
+from boxplus.formats.numbers.parser import INTEGER, LINE, OTHER, REAL, powers_of_five, tokenise
 
 CHUNK = 1 << 20
 """Bytes read at a time; everything made from a chunk stays in the processor's cache."""

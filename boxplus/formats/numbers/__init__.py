@@ -1,0 +1,1 @@
+"""Numbers in text, read and printed at the speed of the disk."""
