@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion
-from boxplus.recordings.recording import open_recording
+from boxplus.recordings.open import open_recording
 from boxplus.runs.config import RunConfig
 from boxplus.runs.odometry_run import run_odometry
 from boxplus.simulation import simulate

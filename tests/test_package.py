@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import importlib
 import importlib.metadata
 import re
@@ -162,3 +163,18 @@ def test_rooms_import_downwards_only(room: str) -> None:
                 if used in ROOMS:
                     assert ROOMS.index(used) <= ROOMS.index(room), f"{path.relative_to(ROOT)} imports {node.module}"
                     assert room != "sparse" or used == "sparse", f"{path.relative_to(ROOT)} imports {node.module}"
+
+
+def test_no_files_import_one_another_in_a_circle() -> None:
+    """Imports inside functions count; those for type checkers alone do not."""
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in SOURCES}
+    imported = graphlib.TopologicalSorter[str]()
+    for module, path in modules.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        guards = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+        typed = {node for guard in guards for node in ast.walk(guard)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node not in typed and node.module is not None:
+                submodules = {f"{node.module}.{alias.name}" for alias in node.names} & modules.keys()
+                imported.add(module, *(submodules or {node.module} & modules.keys()))
+    imported.prepare()  # raises CycleError, which names the files

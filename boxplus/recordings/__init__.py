@@ -1,7 +1,5 @@
 """Readers that turn a bag, an MCAP file, a pcap or a folder into scans and IMU samples, streaming."""
 
-from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
-from boxplus.recordings.options import RecordingOptions
-from boxplus.recordings.recording import Event, Recording, open_recording
+import lazy_loader
 
-__all__ = ["Event", "Evidence", "PointTimeReading", "Recording", "RecordingInfo", "RecordingOptions", "Topic", "open_recording"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ import numpy as np
 from boxplus.recordings import point_time
 from boxplus.recordings.bag_probe import CLOUD_PARSERS, find_out, interval
 from boxplus.recordings.clouds import coordinates, view_points
-from boxplus.recordings.containers import Container, open_container
+from boxplus.recordings.container import Container
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
 from boxplus.recordings.info import PointTimeReading, RecordingInfo
 from boxplus.recordings.messages import (
@@ -18,6 +18,7 @@ from boxplus.recordings.messages import (
     MalformedMessageError,
     parse_imu,
 )
+from boxplus.recordings.open_container import open_container
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.imu import ImuSamples

@@ -10,7 +10,7 @@ import numpy as np
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import point_time
 from boxplus.recordings.clouds import cloud_layout, view_points
-from boxplus.recordings.containers import Channel, Container
+from boxplus.recordings.container import Channel, Container
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
 from boxplus.recordings.messages import (

@@ -20,8 +20,9 @@ from boxplus.recordings.motion_checks import (
     check_saturation,
     liveliest_stretch,
 )
+from boxplus.recordings.open import open_recording
 from boxplus.recordings.options import RecordingOptions
-from boxplus.recordings.recording import Recording, open_recording
+from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_cover, check_points, check_rate, check_rejected
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.lidar_rotation import align_rotations

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.containers import READ_ERRORS
+from boxplus.recordings.container import READ_ERRORS
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
 from boxplus.recordings.options import RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally

@@ -15,7 +15,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from boxplus.recordings.containers import READ_ERRORS, Channel, foreign_errors
+from boxplus.recordings.container import READ_ERRORS, Channel, foreign_errors
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"

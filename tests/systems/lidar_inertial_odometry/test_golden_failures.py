@@ -10,7 +10,7 @@ from simulated_runs import SPARSE, Run, run
 
 from boxplus.errors import InputError
 from boxplus.recordings.doctor import diagnose
-from boxplus.recordings.recording import open_recording
+from boxplus.recordings.open import open_recording
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, trajectories, worlds, write_recording
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
