@@ -1,14 +1,19 @@
-"""Reprojection error of a point given by its pixel in an anchor camera and its inverse depth there (SPEC.md 8.3).
+"""Reprojection error of a point given by its bearing and inverse depth in an anchor camera (SPEC.md 8.3).
 
-Residual [px], with the ray m = [x, y, 1] of the anchor's pixel, T = T_observer_world T_anchor_world⁻¹ = (R, t) and the
-point Y = R m + ρ t, which is the point in the observer times ρ and is projected alike:
+The point is one variable, b = [x, y, ρ] = [X/Z, Y/Z, 1/Z] in the anchor. Residual [px], with the ray m = [x, y, 1],
+T = T_observer_world T_anchor_world⁻¹ = (R, t) and Y = R m + ρ t, which is the point in the observer times ρ and is projected alike:
 
     e = pixel − π(Y)
+
+The anchor's own pixel is a measurement like any other: the same residual with the anchor as its observer (R = I, t = 0), which
+is pixel − π(m) and does not move with the pose. Taking m from that pixel as exact instead would count its noise nowhere: it
+enters all residuals of the point alike, so that no covariance of single residuals could make up for it.
 
 Jacobians, with P = ∂π/∂Y, both poses moved on the left, T ← Exp([w, v]) T:
 
     ∂e/∂[w, v] of the observer = −P [−[Y]×  ρ I]
     ∂e/∂[w, v] of the anchor   = −P [R [m]×  −ρ R]
+    ∂e/∂[x, y]                 = −P [r₁ r₂]      columns of R
     ∂e/∂ρ                      = −P t            (without distortion −f (t_x − ũ t_z)/(ρ Z') etc., as in SPEC.md 8.3)
 
 Singular: ρ < 10⁻⁶ 1/m, also negative, stands for a point at infinity: Y = R m, and ∂e/∂ρ is the limit above, so that a
@@ -25,7 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus.cameras.pinhole import Pinhole, project_point
-from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
@@ -34,7 +38,7 @@ from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
 RHO_MIN = 1e-6  # inverse depth below which a point counts as at infinity [1/m]
-_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 1)))
+_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
 
 @kernel(inline=True)
@@ -49,7 +53,7 @@ def relative_pose(
 
 
 @kernel(inline=True)
-def write_anchor_observer_rho(
+def write_anchor_observer_point(
     n: np.uint64,
     m: tuple[float, float, float],
     Y: tuple[float, float, float],
@@ -57,11 +61,13 @@ def write_anchor_observer_rho(
     R: tuple[float, float, float, float, float, float, float, float, float],
     t: tuple[float, float, float],
     P: tuple[float, float, float, float, float, float],
+    unit_x: float,
+    unit_y: float,
     J_anchor: NDArray[np.float64],
     J_observer: NDArray[np.float64],
-    J_rho: NDArray[np.float64],
+    J_point: NDArray[np.float64],
 ) -> None:
-    """The rows of residual n of all three Jacobians, as in the head of this file."""
+    """The rows of residual n of all three Jacobians, as in the head of this file; by x/unit_x and y/unit_y."""
     for row in range(2):
         a, b, c = (P[0], P[1], P[2]) if row == 0 else (P[3], P[4], P[5])
         # −P (w × Y) = w · (row × Y) up to sign: rows of −P times −[Y]×.
@@ -80,7 +86,9 @@ def write_anchor_observer_rho(
         J_anchor[n, row, 3] = rho * g0
         J_anchor[n, row, 4] = rho * g1
         J_anchor[n, row, 5] = rho * g2
-        J_rho[n, row, 0] = -(a * t[0] + b * t[1] + c * t[2])
+        J_point[n, row, 0] = -g0 * unit_x
+        J_point[n, row, 1] = -g1 * unit_y
+        J_point[n, row, 2] = -(a * t[0] + b * t[1] + c * t[2])
 
 
 @kernel
@@ -91,28 +99,27 @@ def _inverse_depth(
     anchor_of: NDArray[np.uint32],
     observers: NDArray[np.float64],
     observer_of: NDArray[np.uint32],
-    rhos: NDArray[np.float64],
-    rho_of: NDArray[np.uint32],
-    rays: NDArray[np.float64],
+    points: NDArray[np.float64],
+    point_of: NDArray[np.uint32],
     pixels: NDArray[np.float64],
     c: NDArray[np.float64],
     z_min: float,
     r: NDArray[np.float64],
     J_anchor: NDArray[np.float64],
     J_observer: NDArray[np.float64],
-    J_rho: NDArray[np.float64],
+    J_point: NDArray[np.float64],
     valid: NDArray[np.bool_],
     with_jacobians: bool,
 ) -> None:
     for n in range(np.uint64(begin), np.uint64(end)):
         R, tx, ty, tz = relative_pose(anchors, anchor_of[n], observers, observer_of[n])
-        rho = rhos[rho_of[n], 0]
+        k = point_of[n]
+        m0, m1, rho = points[k, 0], points[k, 1], points[k, 2]
         if rho < RHO_MIN:
             rho = 0.0
-        m0, m1, m2 = rays[n, 0], rays[n, 1], rays[n, 2]
-        x = R[0] * m0 + R[1] * m1 + R[2] * m2 + rho * tx
-        y = R[3] * m0 + R[4] * m1 + R[5] * m2 + rho * ty
-        z = R[6] * m0 + R[7] * m1 + R[8] * m2 + rho * tz
+        x = R[0] * m0 + R[1] * m1 + R[2] + rho * tx
+        y = R[3] * m0 + R[4] * m1 + R[5] + rho * ty
+        z = R[6] * m0 + R[7] * m1 + R[8] + rho * tz
         # Written so that a NaN passes on into the residual, where it is seen and named.
         valid[n] = not z <= z_min * rho
         if z <= z_min * rho:
@@ -121,63 +128,52 @@ def _inverse_depth(
             if with_jacobians:
                 J_anchor[n] = 0.0
                 J_observer[n] = 0.0
-                J_rho[n] = 0.0
+                J_point[n] = 0.0
             continue
         u, v, p00, p01, p02, p10, p11, p12 = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
         r[n, 0] = pixels[n, 0] - u
         r[n, 1] = pixels[n, 1] - v
         if with_jacobians:
-            write_anchor_observer_rho(
-                n, (m0, m1, m2), (x, y, z), rho, R, (tx, ty, tz), (p00, p01, p02, p10, p11, p12), J_anchor, J_observer, J_rho
+            P = (p00, p01, p02, p10, p11, p12)
+            write_anchor_observer_point(
+                n, (m0, m1, 1.0), (x, y, z), rho, R, (tx, ty, tz), P, 1.0, 1.0, J_anchor, J_observer, J_point
             )
 
 
 class InverseDepthReprojection(Residual):
-    """Points of an anchor camera, by pixel and inverse depth, seen in another camera, as derived in the head of this file.
+    """Points by bearing and inverse depth in an anchor camera, seen in cameras, as derived in the head of this file.
 
-    Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera, `rho` on `Euclidean(1)`,
-    one over the depth z in the anchor [1/m].
+    Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera; `bearing_rho` on `Euclidean(3)`,
+    [X/Z, Y/Z, 1/Z] of the point in the anchor [1, 1, 1/m], which `Pinhole.unproject` gives from the anchor's pixel.
+
+    Every point wants the pixel in its anchor as well, as an observation in which both poses are the anchor's: without it
+    nothing ties the bearing to what the anchor saw.
 
     Args:
         camera: the observer.
-        anchor_pixels: (N, 2) where the anchor sees the points; exact, the noise is that of `pixels` [px].
         pixels: (N, 2) where the observer sees them [px].
-        anchor_camera: of the anchor, where it is not `camera`.
         sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
 
     Raises:
-        InputError: pixels of another shape, not finite or not as many of both; an anchor's pixel that its lens does not
-            reach; or noise that `Whitening.of` refuses.
+        InputError: pixels of another shape or not finite, or noise that `Whitening.of` refuses.
     """
 
     def __init__(
         self,
         camera: Pinhole,
-        anchor_pixels: ArrayLike,
         pixels: ArrayLike,
         *,
-        anchor_camera: Pinhole | None = None,
         sigma: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
         self.camera, self.pixels = camera, check_pixels("pixels", pixels)
-        anchors = check_pixels("anchor_pixels", anchor_pixels)
-        check_pairs(anchors, self.pixels)
-        self._rays, found = (camera if anchor_camera is None else anchor_camera).unproject(anchors)
-        if not found.all():
-            n = int(np.argmin(found))
-            raise InputError(
-                "anchor_pixels that the distortion of the anchor's camera reaches",
-                f"{anchors[n]} in row {n}",
-                "check the calibration, or leave the observation out",
-            )
         count = len(self.pixels)
         super().__init__(
             dim=2,
             count=count,
-            manifolds=(SE3Left, SE3Left, Euclidean(1)),
-            roles=("T_anchor_world", "T_observer_world", "rho"),
+            manifolds=(SE3Left, SE3Left, Euclidean(3)),
+            roles=("T_anchor_world", "T_observer_world", "bearing_rho"),
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
         self._parameters = camera.padded_parameters
@@ -194,14 +190,6 @@ class InverseDepthReprojection(Residual):
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _inverse_depth(
-            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self._rays, self.pixels, self._parameters,
-            self.camera.z_min, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self._parameters, self.camera.z_min,
+            r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
         )  # fmt: skip
-
-
-def check_pairs(anchors: NDArray[np.float64], pixels: NDArray[np.float64]) -> None:
-    """Raise InputError unless there is one anchor's pixel for each pixel."""
-    if len(anchors) != len(pixels):
-        raise InputError(
-            "as many anchor_pixels as pixels", f"{len(anchors)} and {len(pixels)}", "repeat an anchor's pixel for every observer"
-        )

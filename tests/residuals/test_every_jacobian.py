@@ -67,13 +67,13 @@ def _bal(rng: np.random.Generator) -> Case:
 
 
 def _inverse_depth(rng: np.random.Generator) -> Case:
-    T, rho = SE3.random(rng, COUNT), rng.uniform(0.1, 0.5, (COUNT, 1))
-    return residuals.InverseDepthReprojection(LENS, _pixels(rng), _pixels(rng)), [T, _near(rng, T), rho]
+    T, point = SE3.random(rng, COUNT), rng.uniform([-0.4, -0.3, 0.1], [0.4, 0.3, 0.5], (COUNT, 3))
+    return residuals.InverseDepthReprojection(LENS, _pixels(rng)), [T, _near(rng, T), point]
 
 
 def _inverse_depth_intrinsics(rng: np.random.Generator) -> Case:
-    T, rho = SE3.random(rng, COUNT), rng.uniform(0.1, 0.5, (COUNT, 1))
-    return residuals.InverseDepthIntrinsics(_pixels(rng), _pixels(rng)), [T, _near(rng, T), rho, CAMERA.parameters]
+    T, point = SE3.random(rng, COUNT), np.hstack([_pixels(rng), rng.uniform(0.1, 0.5, (COUNT, 1))])
+    return residuals.InverseDepthIntrinsics(_pixels(rng)), [T, _near(rng, T), point, CAMERA.parameters]
 
 
 def _line(rng: np.random.Generator) -> Case:

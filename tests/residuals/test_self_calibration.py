@@ -67,7 +67,7 @@ def test_inverse_depths_are_found_also_at_infinity() -> None:
     rho = 1.0 / (points[:, 2] + 5.0)
     rho[:10] = 0.0
     rays = camera.unproject(seen)[0]
-    view, point = (grid.ravel() for grid in np.mgrid[1:VIEWS, :POINTS])
+    view, point = (grid.ravel() for grid in np.mgrid[:VIEWS, :POINTS])  # the anchor, 0, sees them too
     # The anchor's frame is the world moved back by 5 m; Y = R m + ρ t also serves points at infinity.
     p_world_times_rho = rays - rho[:, None] * [0.0, 0.0, 5.0]
     R, t = quaternion.to_matrix(poses[view, :4]), poses[view, 4:]
@@ -78,11 +78,12 @@ def test_inverse_depths_are_found_also_at_infinity() -> None:
     start = bp.SE3Left.boxplus(poses, rng.normal(0.0, 0.01, (VIEWS, 6)))
     start[:2] = poses[:2]  # frame and scale
     T = problem.add_variables(bp.SE3Left, start)
-    inverse = problem.add_variables(bp.Euclidean(1), np.full((POINTS, 1), 0.15))
-    residual = bp.residuals.InverseDepthReprojection(camera, seen[point[ahead]], pixels[ahead])
+    inverse = problem.add_variables(bp.Euclidean(3), np.column_stack([rays[:, :2] + 0.01, np.full(POINTS, 0.15)]))
+    residual = bp.residuals.InverseDepthReprojection(camera, pixels[ahead])
     problem.add_residuals(residual, T[np.zeros(int(ahead.sum()), int)], T[view[ahead]], inverse[point[ahead]])
     problem.fix(T[:2])
     solution = problem.solve()
     assert solution.cost < 1e-9
-    np.testing.assert_allclose(np.maximum(solution[inverse][:, 0], 0.0), rho, atol=2e-6)  # any ρ < 10⁻⁶ is infinity
+    np.testing.assert_allclose(solution[inverse][:, :2], rays[:, :2], atol=1e-6)
+    np.testing.assert_allclose(np.maximum(solution[inverse][:, 2], 0.0), rho, atol=2e-6)  # any ρ < 10⁻⁶ is infinity
     np.testing.assert_allclose(np.abs(bp.SE3Left.boxminus(solution[T], poses)).max(), 0.0, atol=1e-6)

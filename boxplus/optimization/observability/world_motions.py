@@ -41,9 +41,11 @@ def kinds_of(manifold: Manifold) -> tuple[str, ...]:
             "constant",
         )
     if isinstance(manifold, Euclidean):
-        return {1: ("constant", "inverse_depth"), 2: ("point", "constant"), 3: ("point", "vector", "constant")}.get(
-            manifold.n, ("constant", "velocity_first")
-        )
+        return {
+            1: ("constant", "inverse_depth"),
+            2: ("point", "constant"),
+            3: ("point", "vector", "constant", "inverse_depth"),
+        }.get(manifold.n, ("constant", "velocity_first"))
     return ("line",) if manifold == Line3D else ("constant",)
 
 
@@ -75,7 +77,7 @@ def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
         B[:, :3] = _displacement(x[:, :3])
         B[:, :3, 3:6] = 0.0
     elif kind == "inverse_depth":
-        B[:, 0, 6] = -x[:, 0]
+        B[:, -1, 6] = -x[:, -1]  # a bearing before it does not know of the world
     return B
 
 

@@ -45,7 +45,9 @@ def moved(manifold, kind, x, tau):
         return (1 + s) * x @ R.T
     if kind == "velocity_first":
         return np.column_stack([(1 + s) * x[:, :3] @ R.T, x[:, 3:]])
-    return x / (1 + s) if kind == "inverse_depth" else x
+    if kind == "inverse_depth":  # after a bearing, if any
+        return np.column_stack([x[:, :-1], x[:, -1] / (1 + s)])
+    return x
 
 
 MANIFOLDS = (
