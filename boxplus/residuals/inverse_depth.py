@@ -1,7 +1,8 @@
 """Reprojection error of a point given by its bearing and inverse depth in an anchor camera (SPEC.md 8.3).
 
 The point is one variable, b = [x, y, ρ] = [X/Z, Y/Z, 1/Z] in the anchor. Residual [px], with the ray m = [x, y, 1],
-T = T_observer_world T_anchor_world⁻¹ = (R, t) and Y = R m + ρ t, which is the point in the observer times ρ and is projected alike:
+T = T_observer_world T_anchor_world⁻¹ = (R, t) and Y = R m + ρ t, which is the point in the observer times ρ and is projected
+alike:
 
     e = pixel − π(Y)
 

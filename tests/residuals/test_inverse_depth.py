@@ -182,7 +182,7 @@ class TestIntrinsicsThroughAWarp:
 def test_input_is_checked() -> None:
     with pytest.raises(InputError, match=r"pixels of shape \(N, 2\) \[px\] – got shape \(1, 3\)"):
         InverseDepthReprojection(CAMERA, [[1.0, 2.0, 3.0]])
-    with pytest.raises(InputError, match="pixels finite .* – got NaN or infinity in row 1"):
+    with pytest.raises(InputError, match=r"pixels finite .* – got NaN or infinity in row 1"):
         InverseDepthIntrinsics([[1.0, 2.0], [np.nan, 4.0]])
     with pytest.raises(InputError, match="z_min finite and not negative"):
         InverseDepthIntrinsics([[1.0, 2.0]], z_min=-1.0)
