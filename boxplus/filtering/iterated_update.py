@@ -1,104 +1,114 @@
-"""The iterated update of the error-state Kalman filter in information form (SPEC.md 9.8, 9.9).
+"""The iterated update of the error-state Kalman filter (SPEC.md 9.8, 9.9): a prior and a measurement give a posterior.
 
-A measurement enters only through its information over the twelve components it touches, `A = Hᵀ R⁻¹ H` (12, 12) and
-`b = Hᵀ R⁻¹ z` (12,): the cost is linear in the number of points, and nothing here knows what was measured.
+What was measured is not known here: planes of a growing map, a fixed one, features of an image. A measurement is asked for
+its information at one iterate after the other, and says itself which directions of the pose it determines; in the others
+the posterior keeps the prior.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._jit import kernel
-from boxplus.filtering.nav_state import MEASURED, T_THETA, T_THETA_L, TANGENT, boxminus_into
-from boxplus.filtering.small_linalg import cholesky_inverse_into
-from boxplus.manifolds.so3 import right_jacobian_into
+from boxplus.filtering.degeneracy import PoseDirections, project_out_weak
+from boxplus.filtering.nav_state import TANGENT, boxplus_into
+from boxplus.filtering.update_step import map_step, move_covariance
+
+_CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
 
 
-@kernel
-def _congruence(cov: NDArray[np.float64], J_theta: NDArray[np.float64], J_theta_L: NDArray[np.float64]) -> None:
-    """cov <- J cov Jᵀ for J the identity but for the blocks of the two rotations."""
-    new = np.empty(3)
-    for block in range(2):
-        offset = T_THETA if block == 0 else T_THETA_L
-        J = J_theta if block == 0 else J_theta_L
-        for c in range(TANGENT):
-            for i in range(3):
-                new[i] = J[i, 0] * cov[offset, c] + J[i, 1] * cov[offset + 1, c] + J[i, 2] * cov[offset + 2, c]
-            for i in range(3):
-                cov[offset + i, c] = new[i]
-        for c in range(TANGENT):
-            for i in range(3):
-                new[i] = J[i, 0] * cov[c, offset] + J[i, 1] * cov[c, offset + 1] + J[i, 2] * cov[c, offset + 2]
-            for i in range(3):
-                cov[c, offset + i] = new[i]
+@dataclass(frozen=True, slots=True)
+class Information:
+    """What a measurement says about the components [θ, p, θ_L, p_L] at one state.
+
+    Attributes:
+        A, b: (12, 12), (12,), Hᵀ R⁻¹ H and Hᵀ R⁻¹ z.
+        directions: which directions of the pose it determines.
+        used: how many of its parts (points, pixels) took part.
+        residual_rms: root mean square of their residuals [m].
+    """
+
+    A: NDArray[np.float64]
+    b: NDArray[np.float64]
+    directions: PoseDirections
+    used: int
+    residual_rms: float
 
 
-@kernel
-def map_step(
-    x: NDArray[np.float64],
+class Measurement(Protocol):
+    """What an update needs to know of a measurement."""
+
+    def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
+        """The information at the packed state x (36,); with `rematch`, after searching its correspondences anew."""
+
+    def has_moved(self, x: NDArray[np.float64]) -> bool:
+        """Whether a search at x could find other correspondences than the last one; always false where there are none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """The outcome of an update.
+
+    Attributes:
+        x: (36,) packed state; cov: (24, 24) its covariance. Both are the prior's where `valid` is false.
+        valid: false when fewer parts than wanted took part, or a matrix was not positive definite.
+        A: (12, 12) the information that was taken in, without the weak directions.
+        last: what the measurement said at the last iterate.
+        steps: Gauss-Newton steps taken.
+        converged: whether the last one was below 10⁻³ rad and m in every component.
+    """
+
+    x: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    valid: bool
+    A: NDArray[np.float64]
+    last: Information
+    steps: int
+    converged: bool
+
+
+def iterated_update(
     x_prior: NDArray[np.float64],
     cov_prior: NDArray[np.float64],
-    A: NDArray[np.float64],
-    b: NDArray[np.float64],
-    delta: NDArray[np.float64],
-    cov: NDArray[np.float64],
-) -> bool:
-    """One Gauss-Newton step of min Σ h²/r + ‖x ⊟ x_prior‖² (SPEC.md 9.8).
+    measurement: Measurement,
+    *,
+    max_iterations: int = 4,
+    min_used: int = 1,
+) -> Posterior:
+    """The minimum of the measurement's cost and ‖x ⊟ x_prior‖², by Gauss-Newton (Bell and Cathey, 1993).
+
+    Correspondences are searched in the first iteration, after one that converged, and once before the last. The iteration
+    ends with the second step that is small, or with the first if no search could find anything else.
 
     Args:
-        x, x_prior: (36,) the current iterate and the prior.
-        cov_prior: (24, 24).
-        A, b: (12, 12), (12,), the measurement's information at x.
-        delta: (24,) receives the step: x <- x ⊞ delta.
-        cov: (24, 24) receives S = (P⁻¹ + A)⁻¹, the covariance in the tangent space at x.
+        x_prior: (36,) packed state; cov_prior: (24, 24) in the tangent space there. Neither is changed.
+        measurement: what was measured.
+        max_iterations: most steps after the first.
+        min_used: fewest parts of the measurement that make an update.
 
-    Returns:
-        False when a matrix is not positive definite; delta and cov are then without meaning.
+    Example:
+        >>> posterior = iterated_update(x, cov, PlaneMeasurement(points, tree, config, voxel=0.5, with_extrinsic=False))
     """
-    d = np.empty(TANGENT)
-    J_theta = np.empty((3, 3))
-    J_theta_L = np.empty((3, 3))
-    prior_information = np.empty((TANGENT, TANGENT))
-    total = np.empty((TANGENT, TANGENT))
-    work = np.empty((TANGENT, TANGENT))
-    boxminus_into(x, x_prior, d)
-    right_jacobian_into(d[T_THETA], d[T_THETA + 1], d[T_THETA + 2], J_theta)
-    right_jacobian_into(d[T_THETA_L], d[T_THETA_L + 1], d[T_THETA_L + 2], J_theta_L)
-    total[:] = cov_prior
-    _congruence(total, J_theta, J_theta_L)
-    if not cholesky_inverse_into(total, prior_information, work):
-        return False
-    # Ji d = d: J_r(θ) θ = θ, so the prior's pull is P⁻¹ d at the iterate.
-    gradient = np.empty(TANGENT)
-    for i in range(TANGENT):
-        gradient[i] = 0.0
-        for j in range(TANGENT):
-            total[i, j] = prior_information[i, j]
-            gradient[i] += prior_information[i, j] * d[j]
-    for i in range(MEASURED.shape[0]):
-        gradient[MEASURED[i]] += b[i]
-        for j in range(MEASURED.shape[0]):
-            total[MEASURED[i], MEASURED[j]] += A[i, j]
-    if not cholesky_inverse_into(total, cov, work):
-        return False
-    for i in range(TANGENT):
-        delta[i] = 0.0
-        for j in range(TANGENT):
-            delta[i] -= cov[i, j] * gradient[j]
-    return True
-
-
-@kernel
-def move_covariance(cov: NDArray[np.float64], delta: NDArray[np.float64]) -> None:
-    """cov <- L cov Lᵀ, L = diag(J_r(δ_θ), I, J_r(δ_θL), I): to the tangent space at x ⊞ δ; then symmetrise (SPEC.md 9.9)."""
-    J_theta = np.empty((3, 3))
-    J_theta_L = np.empty((3, 3))
-    right_jacobian_into(delta[T_THETA], delta[T_THETA + 1], delta[T_THETA + 2], J_theta)
-    right_jacobian_into(delta[T_THETA_L], delta[T_THETA_L + 1], delta[T_THETA_L + 2], J_theta_L)
-    _congruence(cov, J_theta, J_theta_L)
-    for i in range(TANGENT):
-        for j in range(i):
-            mean = 0.5 * (cov[i, j] + cov[j, i])
-            cov[i, j] = mean
-            cov[j, i] = mean
+    x = x_prior.copy()
+    delta = np.zeros(TANGENT)
+    cov = np.zeros((TANGENT, TANGENT))
+    rematch, converged_before, converged = True, False, False
+    steps = 0
+    while True:
+        information = measurement.at(x, rematch=rematch)
+        A, b = project_out_weak(information.A, information.b, information.directions)
+        if information.used < min_used or not map_step(x, x_prior, cov_prior, A, b, delta, cov):
+            return Posterior(x_prior.copy(), cov_prior.copy(), False, np.zeros_like(A), information, steps, converged)
+        boxplus_into(x, delta, x)
+        steps += 1
+        converged = bool(np.abs(delta).max() < _CONVERGED)
+        settled = converged and (converged_before or not measurement.has_moved(x))
+        if settled or steps > max_iterations:
+            break
+        rematch = converged or (steps == max_iterations and not converged_before)
+        converged_before |= converged
+    move_covariance(cov, delta)
+    return Posterior(x, cov, True, A, information, steps, converged)

@@ -7,9 +7,9 @@ from the same estimates; what its covariance means there is said in docs/lidar_i
 import numpy as np
 
 from boxplus.evaluation.nees import nees, nees_band
-from boxplus.filtering.iterated_update import map_step, move_covariance
 from boxplus.filtering.nav_state import TANGENT, NavState, boxminus_into, boxplus_into
 from boxplus.filtering.propagation import NODE, propagate_interval
+from boxplus.filtering.update_step import map_step, move_covariance
 from boxplus.manifolds import so3
 
 RUNS, SCANS, IMU_RATE, SCAN_S = 200, 12, 200.0, 0.1

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from random_states import random_covariance, random_state
 
 from boxplus.filtering.degeneracy import pose_directions, project_out_weak, strong_step
-from boxplus.filtering.iterated_update import map_step
 from boxplus.filtering.nav_state import TANGENT, NavState
+from boxplus.filtering.update_step import map_step
 
 THRESHOLD = 0.004
 LEVER_ARM = 7.0

@@ -5,16 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, pose_directions, project_out_weak
-from boxplus.filtering.iterated_update import map_step, move_covariance
+from boxplus.filtering.iterated_update import Posterior, iterated_update
 from boxplus.filtering.map_datum import MapDatum
-from boxplus.filtering.nav_state import TANGENT, NavState, V, boxplus_into
-from boxplus.filtering.plane_information import ONE_LINE
+from boxplus.filtering.nav_state import TANGENT, NavState, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
@@ -28,14 +26,13 @@ from boxplus.systems.lidar_inertial_odometry.consistency import Consistency, Sat
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import REASONS, PlaneMeasurement
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, align, deskew_first, find_start, joined_imu
 
 _LONGEST_START_SCANS = 30
 _BLIND_PASSES = 3
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
-_CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
 
@@ -153,7 +150,7 @@ class LidarInertialOdometry:
         self._waiting = []
         p_lidar = deskew_first(first, found.state, self.config)
         self._insert(self._voxel_filter(p_lidar)[1])
-        estimates = [self._estimate(first, p_lidar, status="ok")]
+        estimates = [self._estimate(first, p_lidar)]
         return estimates + [self._process(frame) for frame in rest]
 
     def _process(self, frame: Frame) -> Estimate:
@@ -170,7 +167,26 @@ class LidarInertialOdometry:
         voxel = self._voxel_filter.voxel_size
         points, map_points = self._voxel_filter(p_lidar)
         clock.lap("voxel filter")
-        return self._update(frame, p_lidar, points, map_points, voxel, clock)
+        measurement = self._measurement(frame, points, voxel)
+        x_prior, cov_prior = self._x.copy(), self._cov.copy()
+        posterior = iterated_update(
+            x_prior, cov_prior, measurement, max_iterations=self.config.max_iterations, min_used=self.config.min_points
+        )
+        on_map = measurement.on_map_share if posterior.valid else 0.0
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, posterior.x, on_map)
+        taken = posterior.valid and not self._is_astray(frame, on_map)
+        if taken:
+            self._x, self._cov = posterior.x, posterior.cov
+            self._datum.follow(self._x, cov_prior, self._cov, posterior.A, posterior.last.directions)
+        else:
+            self._datum.follow(self._x, cov_prior, self._cov)
+        self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
+        clock.lap("update")
+        # Where the map has been left for good, a new one begins at the predicted pose.
+        if taken or len(self.map) == 0 or self._consistency.lost:
+            self._insert(map_points)
+        clock.lap("map insertion")
+        return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
@@ -235,86 +251,23 @@ class LidarInertialOdometry:
         for low, high in self._box.follow(state.p_world_imu + state.R_world_imu @ state.p_imu_lidar):
             self.map.delete_box(low, high)
 
-    def _update(
-        self,
-        frame: Frame,
-        p_lidar: NDArray[np.float32],
-        points: NDArray[np.float32],
-        map_points: NDArray[np.float32],
-        voxel: float,
-        clock: _Stopwatch,
-    ) -> Estimate:
-        """The iterated update (SPEC.md 9.8, 9.9), then the map takes the points at the posterior pose."""
+    def _measurement(self, frame: Frame, points: NDArray[np.float32], voxel: float) -> PlaneMeasurement:
         config = self.config
-        x_prior, cov_prior = self._x.copy(), self._cov.copy()
         with_extrinsic = config.extrinsic_estimation == "on" or (
             config.extrinsic_estimation == "gated" and self._excitation.sufficient
         )
-        measurement = PlaneMeasurement(points, self.map, config, voxel=voxel, with_extrinsic=with_extrinsic)
-        delta = np.zeros(TANGENT)
-        posterior = np.zeros((TANGENT, TANGENT))
-        directions: PoseDirections | None = None
-        rematch, converged_before, converged = True, False, False
-        steps = 0
-        lost = False
-        weight = _BLIND_WEIGHT if frame.largest_gap_s > config.max_imu_gap else 1.0
-        information = None
-        for iteration in range(config.max_iterations + 1):
-            information = measurement.at(self._x, rematch=rematch)
-            if information.used < config.min_points:
-                lost = True
-                break
-            directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
-            A, b = project_out_weak(information.A * weight, information.b * weight, directions)
-            if not map_step(self._x, x_prior, cov_prior, A, b, delta, posterior):
-                lost = True
-                break
-            boxplus_into(self._x, delta, self._x)
-            steps += 1
-            converged = bool(np.abs(delta).max() < _CONVERGED)
-            if converged and (converged_before or not measurement.has_moved(self._x)):
-                break
-            last_but_one = iteration == config.max_iterations - 1
-            rematch = converged or (last_but_one and not converged_before)
-            converged_before |= converged
-        used = information.used if information is not None else 0
-        rejected = dict(measurement.rejected())
-        # A point among map points of one scan line is not used, but it does lie on the map.
-        on_map = (0 if lost else used + rejected.get(REASONS[ONE_LINE], 0)) / max(len(points), 1)
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, self._x, on_map)
-        # After a gap of the IMU nothing but the points says where the platform is: too few of them say nothing.
-        astray = frame.largest_gap_s > config.max_imu_gap and on_map < config.min_matched_share
-        lost |= astray or self._consistency.lost
-        if lost:
-            self._x[:] = x_prior
-            rejected["scan without an update"] = used
-            used = 0
-            self._datum.follow(self._x, cov_prior, self._cov)
-        else:
-            self._cov[:] = posterior
-            move_covariance(self._cov, delta)
-            self._datum.follow(self._x, cov_prior, self._cov, A, directions)
-        self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        clock.lap("update")
-        # Where the map has been left for good, a new one begins at the predicted pose.
-        if not lost or len(self.map) == 0 or self._consistency.lost:
-            self._insert(map_points)
-        clock.lap("map insertion")
-        status: Status = "lost" if lost else "weak" if directions is not None and directions.weak.any() else "ok"
-        return self._estimate(
-            frame,
-            p_lidar,
-            status=status,
-            directions=directions,
-            share=np.zeros(6) if lost else _lidar_share(cov_prior, self._cov),
-            points_filtered=len(points),
-            points_used=used,
-            rejected=rejected,
-            residual_rms=information.residual_rms if information is not None else 0.0,
-            iterations=steps,
-            converged=converged,
-            timing_s=clock.laps,
-        )
+        weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
+        return PlaneMeasurement(points, self.map, config, voxel=voxel, with_extrinsic=with_extrinsic, weight=weight)
+
+    def _is_blind(self, frame: Frame) -> bool:
+        return frame.largest_gap_s > self.config.max_imu_gap
+
+    def _is_astray(self, frame: Frame, on_map: float) -> bool:
+        """Whether what fits the map may fit it by chance.
+
+        After a gap of the IMU nothing but the points says where the platform is: too few of them say nothing.
+        """
+        return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
 
     def _insert(self, points: NDArray[np.float32]) -> None:
         self._datum.insert(self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True).inserted)
@@ -323,48 +276,34 @@ class LidarInertialOdometry:
         self,
         frame: Frame,
         p_lidar: NDArray[np.float32],
-        *,
-        status: Status,
-        directions: PoseDirections | None = None,
-        share: NDArray[np.float64] | None = None,
-        points_filtered: int = 0,
-        points_used: int = 0,
-        rejected: Mapping[str, int] | None = None,
-        residual_rms: float = 0.0,
-        iterations: int = 0,
-        converged: bool = True,
+        outcome: _Outcome | None = None,
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
+        """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
         warnings = self._warnings
         self._warnings = []
         if not frame.covered:
             warnings.append("no IMU sample at or after the end of the scan: the last one was held")
-        if frame.largest_gap_s > self.config.max_imu_gap:
+        if self._is_blind(frame):
             warnings.append(
                 f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
                 "motion taken from the LiDAR alone, covariance widened"
-            )
-        weak: tuple[WeakDirection, ...] = ()
-        if directions is not None and status == "weak":
-            weak = tuple(
-                WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.shares[i]))
-                for i in np.flatnonzero(directions.weak)
             )
         return Estimate(
             time_ns=frame.scan.end_ns,
             state=NavState.unpack(self._x),
             covariance=self._cov.copy(),
             pose_covariance=self._datum.pose_covariance(self._x),
-            status=status,
-            weak_directions=weak,
-            lidar_share=np.zeros(6) if share is None else share,
+            status=outcome.status if outcome else "ok",
+            weak_directions=outcome.weak_directions if outcome else (),
+            lidar_share=outcome.lidar_share(self._cov) if outcome else np.zeros(6),
             points_raw=len(frame.scan) + sum(frame.scan.rejected.values()),
-            points_filtered=points_filtered,
-            points_used=points_used,
-            rejected=dict(rejected or {}),
-            residual_rms=residual_rms,
-            iterations=iterations,
-            converged=converged,
+            points_filtered=outcome.measurement.points if outcome else 0,
+            points_used=outcome.points_used if outcome else 0,
+            rejected=outcome.rejected if outcome else {},
+            residual_rms=outcome.posterior.last.residual_rms if outcome else 0.0,
+            iterations=outcome.posterior.steps if outcome else 0,
+            converged=outcome.posterior.converged if outcome else True,
             warnings=tuple(warnings),
             timing_s=dict(timing_s or {}),
             p_lidar=p_lidar,
@@ -372,10 +311,44 @@ class LidarInertialOdometry:
         )
 
 
-def _lidar_share(cov_prior: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6,) 1 − posterior / prior variance of the pose."""
-    share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / cov_prior.diagonal()[:6], 0.0, 1.0)
-    return share
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What became of one scan: `taken` says whether the posterior became the state."""
+
+    measurement: PlaneMeasurement
+    posterior: Posterior
+    taken: bool
+    cov_prior: NDArray[np.float64]
+
+    @property
+    def status(self) -> Status:
+        if not self.taken:
+            return "lost"
+        return "weak" if self.posterior.last.directions.weak.any() else "ok"
+
+    @property
+    def weak_directions(self) -> tuple[WeakDirection, ...]:
+        directions = self.posterior.last.directions
+        return tuple(
+            WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.shares[i]))
+            for i in np.flatnonzero(directions.weak if self.taken else [])
+        )
+
+    @property
+    def points_used(self) -> int:
+        return self.posterior.last.used if self.taken else 0
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        unused = {} if self.taken else {"scan without an update": self.posterior.last.used}
+        return {**self.measurement.rejected(), **unused}
+
+    def lidar_share(self, cov: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6,) 1 − posterior / prior variance of the pose."""
+        if not self.taken:
+            return np.zeros(6)
+        share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / self.cov_prior.diagonal()[:6], 0.0, 1.0)
+        return share
 
 
 class _Stopwatch:

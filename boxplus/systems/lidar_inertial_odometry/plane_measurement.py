@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
+from boxplus.filtering.degeneracy import pose_directions
+from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
 from boxplus.filtering.plane_information import (
     FEW_NEIGHBOURS,
@@ -16,6 +17,7 @@ from boxplus.filtering.plane_information import (
     MEASURED_DOF,
     NOT_A_PLANE,
     ONE_LINE,
+    USED,
     accumulate_planes,
 )
 from boxplus.maps.ikd_tree import IkdTree
@@ -34,16 +36,6 @@ REASONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Information:
-    """What a scan says about the components [θ, p, θ_L, p_L] at one state: A = Hᵀ R⁻¹ H (12, 12), b = Hᵀ R⁻¹ z (12,)."""
-
-    A: NDArray[np.float64]
-    b: NDArray[np.float64]
-    used: int
-    residual_rms: float
-
-
 class PlaneMeasurement:
     """One scan against one map; keeps neighbours and planes from iteration to iteration.
 
@@ -53,16 +45,25 @@ class PlaneMeasurement:
         config: noise, gates and threads.
         voxel: side of the voxels that thinned the scan [m].
         with_extrinsic: whether the extrinsic is measured.
+        weight: factor of the information, below 1 where the points are not where they seem.
     """
 
     def __init__(
-        self, p_lidar: NDArray[np.float32], tree: IkdTree, config: LioConfig, *, voxel: float, with_extrinsic: bool
+        self,
+        p_lidar: NDArray[np.float32],
+        tree: IkdTree,
+        config: LioConfig,
+        *,
+        voxel: float,
+        with_extrinsic: bool,
+        weight: float = 1.0,
     ) -> None:
         n = len(p_lidar)
         self._p_lidar = p_lidar
         self._tree = tree
         self._config = config
         self._with_extrinsic = with_extrinsic
+        self._weight = weight
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
@@ -95,7 +96,9 @@ class PlaneMeasurement:
         )
         A += np.triu(A, 1).T
         used = int(sums[0])
-        return Information(A, b, used, float(np.sqrt(sums[1] / used)) if used else 0.0)
+        directions = pose_directions(A, self.lever_arm, config.weak_threshold)
+        rms = float(np.sqrt(sums[1] / used)) if used else 0.0
+        return Information(A * self._weight, b * self._weight, directions, used, rms)
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""
@@ -103,6 +106,17 @@ class PlaneMeasurement:
         boxminus_into(x, self._matched_at, delta)
         shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
         return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._config.map_cell
+
+    @property
+    def points(self) -> int:
+        """Points of the scan."""
+        return len(self._p_lidar)
+
+    @property
+    def on_map_share(self) -> float:
+        """Share of the points that lie on the map, those counted that lie among map points of one scan line only."""
+        on_map = np.count_nonzero(self._fate == USED) + np.count_nonzero(self._fate == ONE_LINE)
+        return on_map / max(self.points, 1)
 
     def rejected(self) -> Mapping[str, int]:
         """Points that were not used, by reason."""
