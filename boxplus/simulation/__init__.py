@@ -7,7 +7,8 @@ from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import SCENARIOS, Scenario, make_scenario, mounting
 from boxplus.simulation.simulation import Simulation, SimulationConfig, simulate
-from boxplus.simulation.spline import Motion, SplineTrajectory
+from boxplus.simulation.spline import Motion, SplineTrajectory, Trajectory
+from boxplus.simulation.thrust import ThrustTrajectory
 from boxplus.simulation.world import World, box, cylinder, rectangle, sphere
 
 __all__ = [
@@ -22,6 +23,8 @@ __all__ = [
     "SimulationConfig",
     "SpinningLidar",
     "SplineTrajectory",
+    "ThrustTrajectory",
+    "Trajectory",
     "World",
     "as_recording",
     "box",

@@ -20,7 +20,10 @@ Times = NDArray[np.int64]
 _STANDARD_GRAVITY = 9.80665
 
 
-def _unchanged(T_imu_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+Transform = NDArray[np.float64]
+
+
+def _unchanged(T_imu_lidar: Transform | None) -> Transform | None:
     return T_imu_lidar
 
 
@@ -32,13 +35,13 @@ class Fault:
         name: short name.
         description: one line.
         events: turns the stream of events into the faulty one.
-        declared_extrinsic: turns the true T_imu_lidar (4, 4) into the one the recording declares.
+        declared_extrinsic: turns the T_imu_lidar (4, 4) the recording would declare into the one it does; None is none.
     """
 
     name: str
     description: str
     events: Callable[[Iterable[Event]], Iterator[Event]]
-    declared_extrinsic: Callable[[NDArray[np.float64]], NDArray[np.float64]] = _unchanged
+    declared_extrinsic: Callable[[Transform | None], Transform | None] = _unchanged
 
     def then(self, other: Fault) -> Fault:
         """This fault, and `other` on top of it."""
@@ -208,8 +211,8 @@ def gyro_in_deg() -> Fault:
 def inverted_extrinsic() -> Fault:
     """The mounting is declared the wrong way round: T_lidar_imu in place of T_imu_lidar."""
 
-    def inverse(T_imu_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.linalg.inv(T_imu_lidar), dtype=np.float64)
+    def inverse(T_imu_lidar: Transform | None) -> Transform | None:
+        return None if T_imu_lidar is None else np.asarray(np.linalg.inv(T_imu_lidar), dtype=np.float64)
 
     return Fault("inverted_extrinsic", "T_lidar_imu declared as T_imu_lidar", _Change(), inverse)
 
@@ -234,6 +237,107 @@ def wrong_time_unit(factor: float = 1e-3) -> Fault:
     return Fault("wrong_time_unit", f"point times multiplied by {factor:g}", _Change(scan))
 
 
+def gyro_in_rad_as_deg() -> Fault:
+    """The gyroscope reports in rad/s and is taken for one in deg/s."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, gyro=np.deg2rad(samples.gyro))
+
+    return Fault("gyro_in_rad_as_deg", "gyroscope in rad/s, declared as deg/s", _Change(imu=imu))
+
+
+def flip_gyro() -> Fault:
+    """The gyroscope reports every rate with the opposite sign."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, gyro=-samples.gyro)
+
+    return Fault("flip_gyro", "gyroscope with the opposite sign", _Change(imu=imu))
+
+
+def flip_accel() -> Fault:
+    """The accelerometer reports gravity in place of specific force: every value with the opposite sign."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, accel=-samples.accel)
+
+    return Fault("flip_accel", "accelerometer with the opposite sign", _Change(imu=imu))
+
+
+def clock_offset(offset_s: float = 0.1) -> Fault:
+    """The stamps of the IMU lie `offset_s` too late (too early when negative); the messages arrive as ever."""
+    shift_ns = round(offset_s * 1e9)
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, time_ns=samples.time_ns + shift_ns)
+
+    return Fault("clock_offset", f"IMU stamps {offset_s:+g} s off", _Change(imu=imu))
+
+
+def clock_drift(rate: float = 0.01) -> Fault:
+    """The clock of the IMU runs too fast by `rate` (0.01: 10 ms a second); both agree at the first event."""
+
+    def events(incoming: Iterable[Event]) -> Iterator[Event]:
+        origin_ns: int | None = None
+        for event in incoming:
+            if origin_ns is None:
+                origin_ns = event.start_ns if isinstance(event, Scan) else int(event.time_ns[0])
+            if isinstance(event, ImuSamples):
+                late_ns = np.rint((event.time_ns - origin_ns) * rate).astype(np.int64)
+                event = replace(event, time_ns=event.time_ns + late_ns)
+            yield event
+
+    return Fault("clock_drift", f"the IMU's clock runs {rate:+.3%} too fast", events)
+
+
+def other_imu(measured: Callable[[int, int, int], ImuSamples]) -> Fault:
+    """The samples are those of an IMU on another body.
+
+    Args:
+        measured: gives its samples in (begin_ns, end_ns], by begin, end and number of the block: `Simulation.imu_samples` of
+            another simulation over the same time.
+    """
+
+    def events(incoming: Iterable[Event]) -> Iterator[Event]:
+        begin_ns: int | None = None
+        block = 0
+        for event in incoming:
+            if isinstance(event, ImuSamples):
+                end_ns = int(event.time_ns[-1])
+                event = measured(int(event.time_ns[0]) - 1 if begin_ns is None else begin_ns, end_ns, block)
+                begin_ns, block = end_ns, block + 1
+                if not len(event):
+                    continue
+            yield event
+
+    return Fault("other_imu", "the IMU of another body", events)
+
+
+def declare(T_imu_lidar: Transform | None, text: str = "another T_imu_lidar declared") -> Fault:
+    """The recording declares this mounting (4, 4), whatever it is in truth; None: it declares none."""
+    return Fault("declare", text, _Change(), lambda _: T_imu_lidar)
+
+
+def scale_points(factor: float = 1.1) -> Fault:
+    """All coordinates of points are multiplied by `factor` (3.2808: feet for metres)."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        return replace(scan, p_lidar=(scan.p_lidar * np.float32(factor)))
+
+    return Fault("scale_points", f"points multiplied by {factor:g}", _Change(scan))
+
+
+def mirror_points(axis: int = 1) -> Fault:
+    """One coordinate of all points has the opposite sign, y by default: a left-handed frame."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        p_lidar = scan.p_lidar.copy()
+        p_lidar[:, axis] *= -1.0
+        return replace(scan, p_lidar=p_lidar)
+
+    return Fault("mirror_points", f"points mirrored along {'xyz'[axis]}", _Change(scan))
+
+
 FAULTS: dict[str, Callable[[], Fault]] = {
     "drop_imu": drop_imu,
     "drop_scans": drop_scans,
@@ -246,6 +350,13 @@ FAULTS: dict[str, Callable[[], Fault]] = {
     "inverted_extrinsic": inverted_extrinsic,
     "saturate_accel": saturate_accel,
     "wrong_time_unit": wrong_time_unit,
+    "gyro_in_rad_as_deg": gyro_in_rad_as_deg,
+    "flip_gyro": flip_gyro,
+    "flip_accel": flip_accel,
+    "clock_offset": clock_offset,
+    "clock_drift": clock_drift,
+    "scale_points": scale_points,
+    "mirror_points": mirror_points,
 }
 """Name → maker; without arguments the interval begins 10 s after the start."""
 

@@ -14,6 +14,10 @@ GRAVITY = 9.81
 """Free fall in simulated worlds [m/s²], along −z."""
 
 _BIAS_STEP_S = 0.1
+_PHASE_STEP_S = 0.02
+_PHASE_STEP_RAD = 0.5
+_HARMONICS = np.array([1.0, 2.0, 3.0])
+_WEIGHTS = np.array([0.8, 0.5, 0.33166247903554])  # squares add up to one
 
 
 class ImuModel(BaseModel):
@@ -34,6 +38,9 @@ class ImuModel(BaseModel):
     accel_bias: tuple[float, float, float] = Field((0.03, -0.04, 0.05), description="at the first instant [m/s²]")
     gyro_max: float = Field(35.0, gt=0, description="largest rate about an axis [rad/s]")
     accel_max: float = Field(176.0, gt=0, description="largest specific force along an axis [m/s²]")
+    accel_vibration: float = Field(0.0, ge=0, description="standard deviation of motor vibration along an axis [m/s²]")
+    gyro_vibration: float = Field(0.0, ge=0, description="the same about an axis [rad/s]")
+    vibration_hz: float = Field(70.0, gt=0, description="turns of the motors per second; twice and three times as well")
 
     def noise_free(self) -> Self:
         """The same sensor without noise and biases."""
@@ -46,6 +53,8 @@ class ImuModel(BaseModel):
                 "accel_bias_walk": 0.0,
                 "gyro_bias": zero,
                 "accel_bias": zero,
+                "accel_vibration": 0.0,
+                "gyro_vibration": 0.0,
             }
         )
 
@@ -72,6 +81,34 @@ class BiasWalk:
         columns = [np.interp(np.asarray(offset_s, dtype=np.float64), self._time, column) for column in self._values.T]
         values = np.stack(columns, axis=-1)
         return values[..., :3], values[..., 3:]
+
+
+class Vibration:
+    """What motors add to the readings: a tone and its two harmonics on each axis, with wandering phases.
+
+    At 70 Hz, 1 m/s² is 7 µm of motion; the pose does not follow it.
+
+    Args:
+        imu: strength and frequency.
+        duration_s: length [s].
+        random: source of the phases.
+    """
+
+    def __init__(self, imu: ImuModel, duration_s: float, random: np.random.Generator) -> None:
+        count = int(np.ceil(duration_s / _PHASE_STEP_S)) + 1
+        self._time = np.arange(count) * _PHASE_STEP_S
+        self._wander = np.cumsum(random.standard_normal(count)) * _PHASE_STEP_RAD
+        self._phase = random.uniform(0.0, 2.0 * np.pi, (3, 6))
+        self._hz = imu.vibration_hz
+        self._amplitude = np.sqrt(2.0) * np.repeat([imu.gyro_vibration, imu.accel_vibration], 3)
+
+    def at(self, offset_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Parts of the gyro's [rad/s] and accelerometer's [m/s²] readings (N, 3) `offset_s` (N,) after the first instant [s]."""
+        time = np.asarray(offset_s, dtype=np.float64)
+        turned = 2.0 * np.pi * self._hz * time + np.interp(time, self._time, self._wander)
+        tones = np.sin(turned[:, None, None] * _HARMONICS[:, None] + self._phase)
+        values = self._amplitude * np.einsum("k,nkc->nc", _WEIGHTS, tones)
+        return values[:, :3], values[:, 3:]
 
 
 def measure(

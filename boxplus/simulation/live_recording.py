@@ -35,7 +35,7 @@ def as_recording(simulation: Simulation, fault: Fault | None = None) -> Recordin
         gyro_unit="rad/s",
         accel_unit="m/s2",
         T_imu_lidar=T_imu_lidar,
-        T_imu_lidar_source="the simulation",
+        T_imu_lidar_source="" if T_imu_lidar is None else "the simulation",
         evidence=[Evidence("scenario", config.scenario, "ok", text)],
     )
 

@@ -1,7 +1,8 @@
 """Simulations as files: ROS 2 folders (MCAP) and ROS 1 bags, with the ground truth beside them.
 
 Clouds have the layout of the Velodyne driver (x, y, z, intensity, ring, time [s] from the stamp of the message, which is that of
-the first point). A message is stored at the time it would have arrived: a scan when it is complete.
+the first point). A message is stored at the time it would have arrived: a scan when it is complete. A fault of the stamps does
+not change when messages arrive.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
 from boxplus.formats.trajectory_rows import tum_row
 from boxplus.manifolds import quaternion
+from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation.faults import Fault
 from boxplus.simulation.live_recording import IMU_FRAME, IMU_TOPIC, LIDAR_FRAME, LIDAR_TOPIC, as_recording
@@ -133,21 +135,23 @@ class _Bag(AbstractContextManager["_Bag"]):
 
 
 def _write_messages(bag: _Bag, simulation: Simulation, fault: Fault | None, progress: Callable[[float], None] | None) -> None:
-    recording = as_recording(simulation, fault)
-    T_imu_lidar = recording.info.T_imu_lidar
+    T_imu_lidar = as_recording(simulation, fault).info.T_imu_lidar
+    measured = _Measured(simulation)
+    events = measured.events() if fault is None else fault.events(measured.events())
     if T_imu_lidar is not None:
         bag.write("/tf_static", simulation.start_ns, _transforms(bag, simulation.start_ns, T_imu_lidar))
     vector = "geometry_msgs/msg/Vector3"
     unknown, nowhere = np.zeros(9), bag.message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     no_orientation = np.array([-1.0, *np.zeros(8)])  # sensor_msgs/Imu: the first element −1 means there is no estimate
-    for event in recording.events():
+    for event in events:
         if isinstance(event, Scan):
             cloud = _cloud(bag, event, simulation.scenario.lidar.ring(event.p_lidar))
-            bag.write(LIDAR_TOPIC, event.end_ns + _SCAN_DELAY_NS, cloud)
+            bag.write(LIDAR_TOPIC, measured.at_ns + _SCAN_DELAY_NS, cloud)
             if progress is not None:
-                progress(recording.progress)
+                progress(measured.scans / simulation.scan_count)
             continue
-        for time_ns, gyro, accel in zip(event.time_ns.tolist(), event.gyro.tolist(), event.accel.tolist(), strict=True):
+        columns = (event.time_ns, event.gyro, event.accel, measured.sample_times(event))
+        for time_ns, gyro, accel, at_ns in zip(*(column.tolist() for column in columns), strict=True):
             sample = bag.message(
                 _IMU,
                 header=bag.header(time_ns, IMU_FRAME),
@@ -158,7 +162,34 @@ def _write_messages(bag: _Bag, simulation: Simulation, fault: Fault | None, prog
                 linear_acceleration=bag.message(vector, x=accel[0], y=accel[1], z=accel[2]),
                 linear_acceleration_covariance=unknown,
             )
-            bag.write(IMU_TOPIC, time_ns + _IMU_DELAY_NS, sample)
+            bag.write(IMU_TOPIC, at_ns + _IMU_DELAY_NS, sample)
+
+
+class _Measured:
+    """The events of a simulation, and when the one that a fault has just turned into another was measured.
+
+    Attributes:
+        at_ns: end of the last event [ns].
+        scans: scans so far.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._sample_ns = np.empty(0, np.int64)
+        self.at_ns = simulation.start_ns
+        self.scans = 0
+
+    def events(self) -> Iterator[Scan | ImuSamples]:
+        for event in self._simulation.events():
+            if isinstance(event, Scan):
+                self.at_ns, self.scans = event.end_ns, self.scans + 1
+            else:
+                self.at_ns, self._sample_ns = int(event.time_ns[-1]), event.time_ns
+            yield event
+
+    def sample_times(self, samples: ImuSamples) -> NDArray[np.int64]:
+        """When each of the samples was measured; by their stamps where some of the block are missing."""
+        return self._sample_ns if len(self._sample_ns) == len(samples) else samples.time_ns
 
 
 def _cloud(bag: _Bag, scan: Scan, ring: NDArray[np.uint16]) -> Any:

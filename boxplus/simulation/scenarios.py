@@ -13,7 +13,7 @@ from boxplus.manifolds import so3
 from boxplus.simulation import trajectories, worlds
 from boxplus.simulation.imu import ImuModel
 from boxplus.simulation.lidar import LidarModel, RosetteLidar, SpinningLidar
-from boxplus.simulation.spline import SplineTrajectory
+from boxplus.simulation.spline import SplineTrajectory, Trajectory
 from boxplus.simulation.world import World
 
 
@@ -40,7 +40,7 @@ class Scenario:
 
     name: str
     world: World
-    trajectory: SplineTrajectory
+    trajectory: Trajectory
     lidar: SpinningLidar | RosetteLidar = field(default_factory=SpinningLidar)
     imu: ImuModel = field(default_factory=ImuModel)
     T_imu_lidar: NDArray[np.float64] = field(default_factory=lambda: mounting(1.5, -2.0, 25.0, (0.06, -0.03, 0.11)))
@@ -64,15 +64,17 @@ def _walk_livox(seed: int) -> Scenario:
 
 def _drive(seed: int) -> Scenario:
     world = worlds.city(4, 3, pitch=75.0, seed=seed)
-    route = ((5.0, -1.8), (223.2, -1.8), (223.2, 148.2), (133.0, 148.2))
     lidar = SpinningLidar(channels=32, azimuth_steps=1200, vertical_fov_deg=(-25.0, 15.0), max_range=120.0)
     T_imu_lidar = mounting(-1.0, 2.0, -15.0, (0.6, 0.1, 0.4))
-    return Scenario("drive", world, trajectories.drive(route, seed=seed), lidar, T_imu_lidar=T_imu_lidar)
+    return Scenario("drive", world, _drive_trajectory(seed), lidar, T_imu_lidar=T_imu_lidar)
+
+
+def _drive_trajectory(seed: int) -> SplineTrajectory:
+    return trajectories.drive(((5.0, -1.8), (223.2, -1.8), (223.2, 148.2), (133.0, 148.2)), seed=seed)
 
 
 def _moving_start(seed: int) -> Scenario:
-    drive = _drive(seed)
-    return replace(drive, name="moving_start", trajectory=drive.trajectory.starting_at(9.0))
+    return replace(_drive(seed), name="moving_start", trajectory=_drive_trajectory(seed).starting_at(9.0))
 
 
 def _drive30(seed: int) -> Scenario:

@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation.imu import BiasWalk, ImuModel, measure
+from boxplus.simulation.imu import BiasWalk, ImuModel, Vibration, measure
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.scenarios import Scenario, make_scenario
 from boxplus.simulation.spline import Motion
@@ -20,7 +20,7 @@ from boxplus.simulation.world import World
 
 Event = Scan | ImuSamples
 
-_LIDAR_STREAM, _IMU_STREAM, _BIAS_STREAM = 1, 2, 3
+_LIDAR_STREAM, _IMU_STREAM, _BIAS_STREAM, _VIBRATION_STREAM = 1, 2, 3, 4
 _FIRST_SCAN_NS = 7_300_000
 """The first scan begins after the first IMU sample and at none of the others: sensors are not synchronised."""
 _LAST_MARGIN_NS = 20_000_000
@@ -83,6 +83,9 @@ class Simulation:
         available = self.end_ns - self.start_ns - _FIRST_SCAN_NS - _LAST_MARGIN_NS
         self.scan_count = max(available // self._scan_ns, 0)
         self._bias_walk = BiasWalk(scenario.imu, duration, self._random(_BIAS_STREAM, 0))
+        self._vibration: Vibration | None = None
+        if scenario.imu.accel_vibration or scenario.imu.gyro_vibration:
+            self._vibration = Vibration(scenario.imu, duration, self._random(_VIBRATION_STREAM, 0))
 
     def _random(self, stream: int, index: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64([self.config.seed, stream, index]))
@@ -126,9 +129,12 @@ class Simulation:
         first = (begin_ns - self.start_ns) // self._imu_ns + 1
         last = (end_ns - self.start_ns) // self._imu_ns
         time_ns = self.start_ns + np.arange(first, last + 1, dtype=np.int64) * self._imu_ns
-        gyro_bias, accel_bias = self.biases(time_ns)
+        gyro_offset, accel_offset = self.biases(time_ns)
+        if self._vibration is not None:
+            gyro_shaken, accel_shaken = self._vibration.at((time_ns - self.start_ns) * 1e-9)
+            gyro_offset, accel_offset = gyro_offset + gyro_shaken, accel_offset + accel_shaken
         motion = self.scenario.trajectory.evaluate(time_ns)
-        gyro, accel = measure(self.scenario.imu, motion, gyro_bias, accel_bias, self._random(_IMU_STREAM, block))
+        gyro, accel = measure(self.scenario.imu, motion, gyro_offset, accel_offset, self._random(_IMU_STREAM, block))
         return ImuSamples.from_arrays(time_ns, gyro, accel)
 
     def events(self) -> Iterator[Event]:

@@ -6,7 +6,7 @@ Position is a uniform cubic B-spline; rotation is a cumulative uniform cubic B-s
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,20 @@ class Motion(NamedTuple):
     v_world_imu: Floats
     a_world_imu: Floats
     omega_imu: Floats
+
+
+class Trajectory(Protocol):
+    """A motion of the IMU with exact derivatives, on `[start_ns, end_ns]`."""
+
+    start_ns: int
+    end_ns: int
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the motion [s]."""
+
+    def evaluate(self, time_ns: ArrayLike) -> Motion:
+        """Exact motion at `time_ns` (N,) integers [ns]."""
 
 
 @kernel(inline=True)
@@ -105,6 +119,28 @@ def _evaluate(
         omega[n, 0], omega[n, 1], omega[n, 2] = wx, wy, wz
 
 
+def checked_times(time_ns: ArrayLike, start_ns: int, end_ns: int) -> NDArray[np.int64]:
+    """`time_ns` as (N,) int64 within `[start_ns, end_ns]`.
+
+    Raises:
+        InputError: a time outside, or times that are not integers.
+    """
+    time = np.atleast_1d(np.asarray(time_ns))
+    if time.ndim != 1 or time.dtype.kind not in "iu":
+        raise InputError(
+            "time_ns as integer nanoseconds of shape (N,)",
+            f"{time.dtype} of shape {time.shape}",
+            "convert seconds with np.round(seconds * 1e9).astype(np.int64)",
+        )
+    if len(time) and not (start_ns <= time.min() and time.max() <= end_ns):
+        raise InputError(
+            f"times within [{start_ns}, {end_ns}] ns, the span of the trajectory",
+            f"times from {time.min()} to {time.max()}",
+            "ask for instants of the motion only",
+        )
+    return time.astype(np.int64)
+
+
 class SplineTrajectory:
     """A smooth motion of the IMU through the world.
 
@@ -152,20 +188,8 @@ class SplineTrajectory:
         Raises:
             InputError: a time outside of `[start_ns, end_ns]`, or times that are not integers.
         """
-        time = np.atleast_1d(np.asarray(time_ns))
-        if time.ndim != 1 or time.dtype.kind not in "iu":
-            raise InputError(
-                "time_ns as integer nanoseconds of shape (N,)",
-                f"{time.dtype} of shape {time.shape}",
-                "convert seconds with np.round(seconds * 1e9).astype(np.int64)",
-            )
-        if len(time) and not (self.start_ns <= time.min() and time.max() <= self.end_ns):
-            raise InputError(
-                f"times within [{self.start_ns}, {self.end_ns}] ns, the span of the trajectory",
-                f"times from {time.min()} to {time.max()}",
-                "ask for instants of the motion only",
-            )
-        offset_s = (time.astype(np.int64) - self.start_ns) * 1e-9
+        time = checked_times(time_ns, self.start_ns, self.end_ns)
+        offset_s = (time - self.start_ns) * 1e-9
         count = len(time)
         motion = Motion(np.empty((count, 3, 3)), *(np.empty((count, 3)) for _ in range(4)))
         _evaluate(offset_s, self.knot_s, self._R_control, self._step_control, self._p_control, *motion)

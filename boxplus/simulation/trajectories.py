@@ -33,7 +33,7 @@ def walk(
         standstill_s: rest before the first step [s].
         seed: phases of the sway.
     """
-    time, p, yaw, moving = _along_route(route_xy, speed, 1.2, 1.0, 2.0, standstill_s, 0.04)
+    time, p, yaw, moving = along_route(route_xy, speed, 1.2, 1.0, 2.0, standstill_s, 0.04)
     random = np.random.Generator(np.random.PCG64([seed, 0]))
     phase = random.uniform(0.0, 2.0 * np.pi, 6)
     step = 2.0 * np.pi * 1.8 * time
@@ -44,7 +44,7 @@ def walk(
     roll = moving * (0.03 * np.sin(0.5 * step + phase[2]) + 0.03 * np.sin(0.9 * time + phase[3]))
     pitch = moving * (0.02 * np.sin(step + phase[4]) + 0.04 * np.sin(0.7 * time + phase[5]))
     yaw = yaw + moving * 0.12 * np.sin(0.8 * time + phase[0])
-    return SplineTrajectory(START_NS, 0.04, _from_angles(roll, pitch, yaw), p)
+    return SplineTrajectory(START_NS, 0.04, from_angles(roll, pitch, yaw), p)
 
 
 def drive(
@@ -59,7 +59,7 @@ def drive(
         standstill_s: rest before starting [s].
         seed: phases of the vibration.
     """
-    time, p, yaw, moving = _along_route(route_xy, speed, 9.0, 2.0, 2.5, standstill_s, 0.05)
+    time, p, yaw, moving = along_route(route_xy, speed, 9.0, 2.0, 2.5, standstill_s, 0.05)
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     phase = random.uniform(0.0, 2.0 * np.pi, 4)
     velocity = np.gradient(p[:, :2], 0.05, axis=0)
@@ -71,12 +71,12 @@ def drive(
     )
     roll = 0.012 * leftward + moving * 0.006 * np.sin(2 * np.pi * 0.9 * time + phase[2])
     pitch = -0.010 * forward + moving * 0.008 * np.sin(2 * np.pi * 1.2 * time + phase[3])
-    return SplineTrajectory(START_NS, 0.05, _from_angles(roll, pitch, yaw), p)
+    return SplineTrajectory(START_NS, 0.05, from_angles(roll, pitch, yaw), p)
 
 
 def at_rest(duration_s: float = 10.0, p_world_imu: ArrayLike = (0.0, 0.0, 1.5)) -> SplineTrajectory:
     """No motion at all."""
-    time = _times(duration_s, 0.1)
+    time = control_times(duration_s, 0.1)
     p = np.broadcast_to(np.asarray(p_world_imu, dtype=np.float64), (len(time), 3))
     return SplineTrajectory(START_NS, 0.1, np.broadcast_to(np.eye(3), (len(time), 3, 3)), p)
 
@@ -85,11 +85,11 @@ def spin_in_place(
     duration_s: float = 20.0, rate: float = np.deg2rad(90.0), p_world_imu: ArrayLike = (0.0, 0.0, 1.5), standstill_s: float = 2.0
 ) -> SplineTrajectory:
     """A turn about the vertical at `rate` [rad/s] without leaving the spot."""
-    time = _times(duration_s, 0.05)
-    moving = _fade_in(time, standstill_s, 1.0)
+    time = control_times(duration_s, 0.05)
+    moving = fade_in(time, standstill_s, 1.0)
     yaw = np.concatenate([[0.0], np.cumsum(0.5 * (moving[1:] + moving[:-1]) * 0.05)]) * rate
     p = np.broadcast_to(np.asarray(p_world_imu, dtype=np.float64), (len(time), 3))
-    return SplineTrajectory(START_NS, 0.05, _from_angles(0.0 * yaw, 0.0 * yaw, yaw), p)
+    return SplineTrajectory(START_NS, 0.05, from_angles(0.0 * yaw, 0.0 * yaw, yaw), p)
 
 
 def flips(
@@ -98,14 +98,14 @@ def flips(
     """Full turns about the x and y axes in turn, with peak rate `rate` [rad/s] and a pause of 0.8 s between them."""
     knot_s, pause_s = 0.01, 0.8
     turn_s = 4.0 * np.pi / rate  # a raised cosine has twice its mean rate at the peak
-    time = _times(standstill_s + flips * (turn_s + pause_s) + 1.0, knot_s)
+    time = control_times(standstill_s + flips * (turn_s + pause_s) + 1.0, knot_s)
     R = np.broadcast_to(np.eye(3), (len(time), 3, 3)).copy()
     for number in range(flips):
         u = np.clip((time - standstill_s - number * (turn_s + pause_s)) / turn_s, 0.0, 1.0)
         angle = 2.0 * np.pi * u - np.sin(2.0 * np.pi * u)
         axis = np.array([1.0, 0.0, 0.0]) if number % 2 == 0 else np.array([0.0, 1.0, 0.0])
         R = R @ so3.exp(angle[:, None] * axis)
-    moving = _fade_in(time, standstill_s, 1.0)
+    moving = fade_in(time, standstill_s, 1.0)
     since = time - standstill_s
     sway = np.stack([0.5 * np.sin(1.7 * since), 0.4 * np.sin(1.3 * since), 0.5 * np.sin(2.1 * since)], axis=1)
     return SplineTrajectory(START_NS, knot_s, R, np.asarray(p_world_imu, dtype=np.float64) + moving[:, None] * sway)
@@ -116,8 +116,8 @@ def fast(
 ) -> SplineTrajectory:
     """A figure of eight with peak speed `speed` [m/s] while the heading swings with peak rate `rate` [rad/s]."""
     knot_s, pulse = 0.04, 0.5
-    time = _times(duration_s, knot_s)
-    moving = _fade_in(time, standstill_s, 3.0)
+    time = control_times(duration_s, knot_s)
+    moving = fade_in(time, standstill_s, 3.0)
     phase = pulse * np.concatenate([[0.0], np.cumsum(0.5 * (moving[1:] + moving[:-1]) * knot_s)])
     # (a sin φ, b sin 2φ) has its highest speed pulse·√(a² + 4 b²) at φ = 0.
     b = 4.0
@@ -125,14 +125,14 @@ def fast(
     p = np.stack([a * np.sin(phase), b * np.sin(2.0 * phase), 2.5 + 0.8 * np.sin(1.5 * phase)], axis=1)
     yaw = rate / (2.2 * pulse) * np.sin(2.2 * phase)
     roll, pitch = 0.35 * np.sin(2.0 * phase), 0.25 * np.sin(1.4 * phase)
-    return SplineTrajectory(START_NS, knot_s, _from_angles(roll, pitch, yaw), p)
+    return SplineTrajectory(START_NS, knot_s, from_angles(roll, pitch, yaw), p)
 
 
 def drone(duration_s: float = 60.0, speed: float = 3.0, height: float = 8.0, standstill_s: float = 2.0) -> SplineTrajectory:
     """A drone hovers, then flies loops with peak speed near `speed` [m/s], tilting as its thrust demands."""
     knot_s = 0.05
-    time = _times(duration_s, knot_s)
-    moving = _fade_in(time, standstill_s, 3.0)
+    time = control_times(duration_s, knot_s)
+    moving = fade_in(time, standstill_s, 3.0)
     travelled = np.concatenate([[0.0], np.cumsum(0.5 * (moving[1:] + moving[:-1]) * knot_s)]) * speed
     p = np.stack(
         [
@@ -147,24 +147,24 @@ def drone(duration_s: float = 60.0, speed: float = 3.0, height: float = 8.0, sta
     forward = acceleration[:, 0] * np.cos(yaw) + acceleration[:, 1] * np.sin(yaw)
     leftward = -acceleration[:, 0] * np.sin(yaw) + acceleration[:, 1] * np.cos(yaw)
     # A multicopter accelerates by tilting its thrust: specific force stays along the body's z axis.
-    return SplineTrajectory(START_NS, knot_s, _from_angles(-leftward / 9.81, forward / 9.81, yaw), p)
+    return SplineTrajectory(START_NS, knot_s, from_angles(-leftward / 9.81, forward / 9.81, yaw), p)
 
 
-def _times(duration_s: float, knot_s: float) -> Floats:
+def control_times(duration_s: float, knot_s: float) -> Floats:
     """Times of the control poses of a motion of `duration_s`, relative to its start."""
     if not duration_s > 0:
         raise InputError("a positive duration [s]", f"{duration_s}", "give the length of the motion")
     return np.arange(-1, int(np.ceil(duration_s / knot_s - 1e-9)) + 2, dtype=np.float64) * knot_s
 
 
-def _fade_in(time: Floats, start_s: float, ease_s: float = _EASE_S) -> Floats:
+def fade_in(time: Floats, start_s: float, ease_s: float = _EASE_S) -> Floats:
     """0 until `start_s`, 1 from `start_s + ease_s` on, with continuous acceleration between."""
     u = np.clip((time - start_s) / ease_s, 0.0, 1.0)
     faded: Floats = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     return faded
 
 
-def _from_angles(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
+def from_angles(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
     """R_world_imu (K, 3, 3): yaw about z, then pitch about y, then roll about x."""
     zero = np.zeros_like(yaw)
     R: Floats = (
@@ -175,7 +175,7 @@ def _from_angles(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
     return R
 
 
-def _along_route(
+def along_route(
     route_xy: ArrayLike, speed: float, radius: float, acceleration: float, lateral: float, standstill_s: float, knot_s: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Control positions along a polyline with rounded corners.
@@ -205,7 +205,7 @@ def _along_route(
     arrival = np.concatenate([[0.0], np.cumsum(2.0 * steps / (limit[1:] + limit[:-1]))])
 
     smooth_s = 0.6
-    time = _times(standstill_s + arrival[-1] + 0.5 * standstill_s + smooth_s, knot_s)
+    time = control_times(standstill_s + arrival[-1] + 0.5 * standstill_s + smooth_s, knot_s)
     departure = standstill_s + 0.5 * smooth_s
     window = np.hanning(round(smooth_s / knot_s) // 2 * 2 + 3)[1:-1]
     window /= window.sum()
@@ -213,7 +213,7 @@ def _along_route(
     columns = [np.interp(at, np.arange(len(path)), values) for values in (path[:, 0], path[:, 1], heading)]
     pad = len(window) // 2
     x, y, yaw = (np.convolve(np.pad(column, pad, mode="edge"), window, mode="valid") for column in columns)
-    moving = _fade_in(time, departure) * (1.0 - _fade_in(time, departure + arrival[-1] - _EASE_S))
+    moving = fade_in(time, departure) * (1.0 - fade_in(time, departure + arrival[-1] - _EASE_S))
     return time, np.stack([x, y, np.zeros_like(x)], axis=1), yaw, moving
 
 

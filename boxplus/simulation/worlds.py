@@ -110,7 +110,7 @@ def city(
                 solids += _square(random, low, high)
             else:
                 solids += _block(random, low, high)
-            solids += _pavements(random, low, high, street)
+            solids += pavements(random, low, high, street)
     for arcade in arcades:
         solids += _arcade(*arcade)
     return World(solids)
@@ -149,11 +149,12 @@ def _block(random: np.random.Generator, low: np.ndarray, high: np.ndarray) -> li
             set_back = random.uniform(0.0, 1.8, 4)
             corner_low = low + size * (i, j) + set_back[:2] * (i == 0, j == 0)
             corner_high = low + size * (i + 1, j + 1) - set_back[2:] * (i == lots[0] - 1, j == lots[1] - 1)
-            solids += _house(random, corner_low, corner_high)
+            solids += house(random, corner_low, corner_high)
     return solids
 
 
-def _house(random: np.random.Generator, low: np.ndarray, high: np.ndarray) -> list[Solid]:
+def house(random: np.random.Generator, low: np.ndarray, high: np.ndarray) -> list[Solid]:
+    """A house on the lot between two corners (2,): bays, balconies or pilasters on every front, a cornice."""
     storeys = int(random.integers(2, 7))
     height = 3.2 * storeys + 0.8
     centre, size = 0.5 * (low + high), high - low
@@ -210,7 +211,7 @@ def _car(random: np.random.Generator, x: float, y: float, yaw: float) -> list[So
     ]
 
 
-def _pavements(random: np.random.Generator, low: np.ndarray, high: np.ndarray, street: float) -> list[Solid]:
+def pavements(random: np.random.Generator, low: np.ndarray, high: np.ndarray, street: float) -> list[Solid]:
     """What stands along the four edges of a block: parked cars at the kerb, then trees, lamps, boxes and stalls."""
     solids: list[Solid] = []
     kerb, walkway = 0.5 * street - 5.2, min(1.5, 0.17 * street)

@@ -144,6 +144,61 @@ def test_inverted_extrinsic(simulation: Simulation) -> None:
     np.testing.assert_allclose(declared @ simulation.T_imu_lidar, np.eye(4), atol=1e-12)
 
 
+def test_signs_and_units_of_the_imu(simulation: Simulation) -> None:
+    scans, imu = run(simulation, None)
+    for fault, gyro, accel in (
+        (faults.flip_gyro(), -1.0, 1.0),
+        (faults.flip_accel(), 1.0, -1.0),
+        (faults.gyro_in_rad_as_deg(), np.pi / 180.0, 1.0),
+    ):
+        spoilt_scans, spoilt = run(simulation, fault)
+        same_scans(scans, spoilt_scans)
+        np.testing.assert_array_equal(spoilt.time_ns, imu.time_ns)
+        np.testing.assert_allclose(spoilt.gyro, gyro * imu.gyro)
+        np.testing.assert_allclose(spoilt.accel, accel * imu.accel)
+
+
+def test_clocks(simulation: Simulation) -> None:
+    scans, imu = run(simulation, None)
+    spoilt_scans, spoilt = run(simulation, faults.clock_offset(-0.25))
+    same_scans(scans, spoilt_scans)
+    np.testing.assert_array_equal(spoilt.time_ns, imu.time_ns - 250_000_000)
+    fault = faults.clock_drift(0.01)
+    for _ in range(2):
+        spoilt_scans, spoilt = run(simulation, fault)
+        same_scans(scans, spoilt_scans)
+        np.testing.assert_allclose(np.diff(spoilt.time_ns), 1.01 * np.diff(imu.time_ns), atol=1.0)
+        assert spoilt.time_ns[0] == imu.time_ns[0]
+
+
+def test_the_imu_of_another_body(simulation: Simulation) -> None:
+    scans, imu = run(simulation, None)
+    other = small("stress_drone", seed=1, duration_s=4.0)
+    spoilt_scans, spoilt = run(simulation, faults.other_imu(other.imu_samples))
+    same_scans(scans, spoilt_scans)
+    same_imu(run(other, None)[1], spoilt)
+    assert np.abs(spoilt.gyro - imu.gyro).max() > 0.1
+
+
+def test_scaled_and_mirrored_points(simulation: Simulation) -> None:
+    scans, imu = run(simulation, None)
+    for fault, factors in ((faults.scale_points(1.1), (1.1, 1.1, 1.1)), (faults.mirror_points(2), (1.0, 1.0, -1.0))):
+        spoilt_scans, spoilt = run(simulation, fault)
+        same_imu(imu, spoilt)
+        for scan, before in zip(spoilt_scans, scans, strict=True):
+            np.testing.assert_allclose(scan.p_lidar, before.p_lidar * np.float32(factors), rtol=1e-6)
+            np.testing.assert_array_equal(scan.time_ns, before.time_ns)
+
+
+def test_declared_mountings(simulation: Simulation) -> None:
+    other = np.linalg.inv(simulation.T_imu_lidar)
+    info = as_recording(simulation, faults.declare(other)).info
+    np.testing.assert_array_equal(info.T_imu_lidar, other)
+    silent = as_recording(simulation, faults.inverted_extrinsic().then(faults.declare(None))).info
+    assert (silent.T_imu_lidar, silent.T_imu_lidar_source) == (None, "")
+    assert faults.inverted_extrinsic().declared_extrinsic(None) is None
+
+
 def test_faults_compose(simulation: Simulation) -> None:
     both = faults.drop_scans(1.0, 0.3).then(faults.imu_in_g()).then(faults.inverted_extrinsic())
     assert both.name == "drop_scans+imu_in_g+inverted_extrinsic"
@@ -158,7 +213,7 @@ def test_registered_faults_leave_the_start_alone(simulation: Simulation) -> None
         fault = make()
         assert (fault.name, bool(fault.description)) == (name, True)
         # The intervals of the defaults begin after 10 s: nothing arrives at another time before.
-        if name != "wrong_time_unit":
+        if name not in ("wrong_time_unit", "clock_offset", "clock_drift"):
             assert repr([(len(event), event.time_ns[:3]) for event in fault.events(simulation.events())]) == clean
     with pytest.raises(InputError, match="expected a fault: drop_imu, drop_scans"):
         faults.make_fault("gremlins")

@@ -81,3 +81,16 @@ def test_saturation() -> None:
     samples = simulation.imu_samples(simulation.start_ns, simulation.end_ns, 0)
     assert np.abs(samples.gyro).max() == 10.0
     assert np.abs(samples.accel).max() == 9.0
+
+
+def test_motors_shake_the_readings_but_not_the_pose() -> None:
+    quiet = ImuModel(rate_hz=400.0).noise_free()
+    shaken = quiet.model_copy(update={"accel_vibration": 1.0, "gyro_vibration": 0.02})
+    simulation = imu_only(trajectories.at_rest(20.0), shaken)
+    samples = simulation.imu_samples(simulation.start_ns, simulation.end_ns, 0)
+    np.testing.assert_allclose(samples.accel.std(axis=0), 1.0, rtol=0.05)
+    np.testing.assert_allclose(samples.gyro.std(axis=0), 0.02, rtol=0.05)
+    np.testing.assert_allclose(samples.accel.mean(axis=0), [0.0, 0.0, GRAVITY], atol=0.05)
+    part = simulation.imu_samples(simulation.start_ns + 10_000_000_000, simulation.end_ns, 7)
+    np.testing.assert_allclose(part.accel, samples.accel[-len(part) :], atol=1e-12)
+    assert shaken.noise_free() == quiet

@@ -14,9 +14,11 @@ from boxplus.cli.simulate import simulate_command
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.recordings.open_container import open_container
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults
+from boxplus.simulation.live_recording import IMU_TOPIC, LIDAR_TOPIC
 from boxplus.simulation.recording_writer import Format, write_recording
 
 
@@ -113,3 +115,16 @@ def test_command(tmp_path: Path) -> None:
     assert "stress_flips        flips at 1000 deg/s" in listing
     assert "wrong_time_unit" in listing
     assert isinstance(CliRunner().invoke(app, []).exception, InputError)
+
+
+@pytest.mark.parametrize("fault", [faults.clock_offset(-0.3), faults.clock_offset(0.3), faults.wrong_time_unit(1000.0)])
+def test_wrong_stamps_do_not_change_when_messages_arrive(simulation: Simulation, tmp_path: Path, fault: faults.Fault) -> None:
+    received = []
+    for name, spoilt in (("sound", None), ("faulty", fault)):
+        container = open_container(write_recording(simulation, tmp_path / name, fault=spoilt))
+        topics = frozenset((IMU_TOPIC, LIDAR_TOPIC))
+        messages = container.messages(topics, container.start_ns, container.end_ns + 1)
+        received.append([(channel.topic, received_ns) for channel, received_ns, _ in messages])
+        container.close()
+    assert len(received[0]) > 800
+    assert received[0] == received[1]
