@@ -1,0 +1,97 @@
+"""Many random recordings through `boxplus lio`: is every run right, or does it say what is wrong?
+
+    python benchmarks/campaign.py                             # 40 runs, 2 processes
+    python benchmarks/campaign.py --nightly --out runs.jsonl  # 1000 runs
+    python benchmarks/campaign.py --seeds 17:18 -v            # one, with all it says
+    python benchmarks/campaign.py --only fault=clock_offset --only world=hall --seeds 0:1000
+    python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
+    python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run
+
+A seed draws world, motion, sensors, mounting and, in half of the runs, one fault. Every run ends `right`, flagged with the `right
+cause`, `flagged`, or `silent`ly wrong; lio_campaign/judge.py says what these mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # a spawned process knows the script, not its folder
+
+from lio_campaign.draws import draw_kinds
+from lio_campaign.report import describe, report
+from lio_campaign.run import run_seed
+
+_SMALL, _NIGHTLY = 40, 1000
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command."""
+    options = _parse(arguments)
+    if options.merge:
+        lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]
+        print(report(sorted(lines, key=lambda line: line["seed"])))
+        return
+    begin, end = options.seeds
+    seeds = [seed for seed in range(begin, end) if draw_kinds(seed).matches(dict(options.only))]
+    lines = []
+    for line in _runs(seeds, options.jobs, command_line=options.bag):
+        lines.append(line)
+        if options.out is not None:
+            with options.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+        if options.verbose:
+            print(describe(line))
+            print(json.dumps(line, indent=1), flush=True)
+        else:
+            print(f"[{len(lines)}/{len(seeds)}] {describe(line)}", flush=True)
+    print(report(sorted(lines, key=lambda line: line["seed"])))
+
+
+def _runs(seeds: Sequence[int], jobs: int, *, command_line: bool) -> Iterator[dict[str, Any]]:
+    """Results as they come, from `jobs` processes."""
+    if jobs == 1:
+        for seed in seeds:
+            yield run_seed(seed, command_line=command_line)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(run_seed, seed, command_line=command_line) for seed in seeds]):
+            yield future.result()
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=_range, help=f"A:B, without B; default 0:{_SMALL}")
+    parser.add_argument("--nightly", action="store_true", help=f"{_NIGHTLY} seeds")
+    parser.add_argument("--only", type=_pair, action="append", default=[], metavar="KEY=VALUE", help="world, motion, fault …")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes")
+    parser.add_argument("--bag", action="store_true", help="write bags and run the real command line")
+    parser.add_argument("--out", type=Path, help="append one JSON line a run")
+    parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")
+    parser.add_argument("-v", "--verbose", action="store_true", help="all that is known about every run")
+    options = parser.parse_args(arguments)
+    options.seeds = options.seeds or (0, _NIGHTLY if options.nightly else _SMALL)
+    return options
+
+
+def _range(text: str) -> tuple[int, int]:
+    begin, _, end = text.partition(":")
+    return int(begin), int(end or int(begin) + 1)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or key not in ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag"):
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE with a known key – got {text!r}")
+    return key, value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,231 @@
+"""The verdict on a run: right, flagged with the right cause, flagged, or silently wrong.
+
+Everything a user sees of a run is its exit code, its headline (`describe_state`), its warnings and, when it refuses, its message;
+the verdict looks at nothing else. What counts as naming the cause is fixed below, a fault at a time, before any result is seen.
+
+**Error.** Against the exact ground truth at the time of every estimate. The first estimate is laid upon the truth, then position
+and rotation of every other one are compared: e_p = p_est − p_true [m] in the estimate's world, e_R = Log(R_trueᵀ R_est). A run is
+right when at every scan
+
+- ‖e_p‖ ≤ max(5 cm, 2 % of the true way so far), and ‖e_R‖ ≤ 2 deg;
+- both lie within 5 σ of the covariance the run states for the pose (Mahalanobis distance of three components, with the
+  probability of 5 σ of one), or are below 3 cm and 0.3 deg, which nobody minds.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
+from boxplus.runs.run_summary import RunSummary
+from boxplus.simulation import Simulation
+from lio_campaign.draws import Draw
+
+FLOOR_M, SHARE_OF_WAY, LIMIT_DEG = 0.05, 0.02, 2.0
+NOBODY_MINDS_M, NOBODY_MINDS_DEG = 0.03, 0.3
+FIVE_SIGMA = 5.64
+"""√χ²₃ whose probability is that of 5 σ in one dimension, 5.7e-7."""
+_WEAK_SCANS_BEFORE = 10
+
+_CLOCKS = r"clock|time offset|synchron|stamps?\b.*(early|late|apart|shift)|(early|late|apart|offset).* ms\b"
+_MOUNTING = r"T_imu_lidar|extrinsic|mount"
+CAUSES: dict[str, str] = {
+    "gyro_unit": r"deg/s|rad/s|gyro.unit|unit of the gyro",
+    "accel_unit": r"accel.unit|in g\b|\(g\)|m/s2 or g|unit of the accel",
+    "time_unit": r"unit of the point times|point.time|points of a scan span|times in the field",
+    "gyro_sign": r"gyro\w*\b.*(sign|negat|invert|opposite|mirror|handed)|(sign|negat|invert|opposite|mirror|handed).*gyro",
+    "accel_sign": r"accel\w*\b.*(sign|negat|invert|opposite|gravity instead)|(sign|negat|invert|opposite).*accel|upside down",
+    "clock_offset": _CLOCKS,
+    "clock_drift": _CLOCKS + r"|drift",
+    "other_imu": r"imu.topic|another (body|imu|platform)|other imu|different bod|same body|unrelated|no rotation fits",
+    "other_lidar": _MOUNTING + r"|lidar.topic|another lidar",
+    "point_scale": r"\bscale\b|feet|metres|unit of the (points|coordinates|ranges)",
+    "mirrored": r"mirror|handed|reflect|sign of",
+    "imu_gap": r"IMU gap|without IMU|no IMU sample|IMU samples? (is|are) missing|gaps?\b.*IMU",
+    "nan_burst": r"not finite|NaN|IMU gap|dropped",
+    "inverted_extrinsic": _MOUNTING,
+    "extrinsic_off": _MOUNTING,
+}
+"""Fault → what a message must say to name its cause (searched in every message, upper or lower case)."""
+_OPTION_CAUSES = {
+    "gyro_unit": r"gyro.unit|deg/s|rad/s",
+    "accel_unit": r"accel.unit",
+    "point_time_unit": r"point.time|unit of the point times|points of a scan span",
+    "point_time_reference": r"point.time|scan_end|scan_start|reference|" + _CLOCKS,
+}
+_UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
+_WEAK = re.compile(r"scans are weak")
+
+
+@dataclass
+class Outcome:
+    """What a user gets from a run.
+
+    Attributes:
+        exit_code: of the command line.
+        error: the message of a run that refused or failed.
+        summary: `run.json`; None when there is none.
+        estimate: `trajectory.csv`; None when it is missing or empty.
+        cpu_s: processor time of simulation, odometry and all.
+    """
+
+    exit_code: int
+    error: str | None = None
+    summary: RunSummary | None = None
+    estimate: Trajectory | None = None
+    cpu_s: float = 0.0
+
+
+@dataclass
+class Errors:
+    """Errors of every scan; see the top of the file.
+
+    Attributes:
+        position_m, rotation_deg, position_sigmas, rotation_sigmas, limit_m: (N,) each.
+        way_m: true length of the way.
+        nees: normalised estimation error squared of the pose, mean over scans after the first, per degree of freedom.
+    """
+
+    position_m: NDArray[np.float64]
+    rotation_deg: NDArray[np.float64]
+    position_sigmas: NDArray[np.float64]
+    rotation_sigmas: NDArray[np.float64]
+    limit_m: NDArray[np.float64]
+    way_m: float
+    nees: float
+
+    @property
+    def too_far(self) -> NDArray[np.bool_]:
+        """(N,) beyond what is right, whatever the covariance says."""
+        return (self.position_m > self.limit_m) | (self.rotation_deg > LIMIT_DEG)
+
+    @property
+    def too_sure(self) -> NDArray[np.bool_]:
+        """(N,) beyond 5 σ."""
+        position = (self.position_sigmas > FIVE_SIGMA) & (self.position_m > NOBODY_MINDS_M)
+        rotation = (self.rotation_sigmas > FIVE_SIGMA) & (self.rotation_deg > NOBODY_MINDS_DEG)
+        return position | rotation
+
+
+@dataclass
+class Verdict:
+    """How a run ended.
+
+    Attributes:
+        verdict: "right", "right cause", "flagged" or "silent".
+        reasons: why it is not right: "error", "covariance", "no estimate".
+        flags: what warned the user, a sentence each.
+        false_alarm: of a sound run: "flagged" (or refused), "weak" when nothing but scans were called weak where the LiDAR saw
+            enough, else empty.
+    """
+
+    verdict: str
+    reasons: list[str] = field(default_factory=list)
+    flags: list[str] = field(default_factory=list)
+    false_alarm: str = ""
+
+
+def errors_of(estimate: Trajectory, simulation: Simulation) -> Errors:
+    """Compare every pose with the truth, the first one laid upon it."""
+    assert estimate.time_ns is not None and estimate.covariance is not None
+    time_ns = np.clip(estimate.time_ns, simulation.start_ns, simulation.end_ns)
+    truth = simulation.ground_truth(time_ns)
+    R = quaternion.to_matrix(estimate.q_wxyz)
+    R_world_truth = R[0] @ truth.R_world_imu[0].T
+    R_true = R_world_truth @ truth.R_world_imu
+    p_true = (truth.p_world_imu - truth.p_world_imu[0]) @ R_world_truth.T + estimate.p[0]
+    e_p, e_R = estimate.p - p_true, so3.log(np.swapaxes(R_true, 1, 2) @ R)
+    every = np.arange(time_ns[0], max(time_ns[-1], time_ns[0] + 1), 20_000_000)
+    steps = np.linalg.norm(np.diff(simulation.ground_truth(every).p_world_imu, axis=0), axis=1)
+    way = np.interp(time_ns, every, np.concatenate([[0.0], np.cumsum(steps)]))
+    P = estimate.covariance
+    squared = _mahalanobis(np.concatenate([e_R, e_p], axis=1), P)
+    return Errors(
+        position_m=np.linalg.norm(e_p, axis=1),
+        rotation_deg=np.rad2deg(np.linalg.norm(e_R, axis=1)),
+        position_sigmas=np.sqrt(_mahalanobis(e_p, P[:, 3:, 3:])),
+        rotation_sigmas=np.sqrt(_mahalanobis(e_R, P[:, :3, :3])),
+        limit_m=np.maximum(FLOOR_M, SHARE_OF_WAY * way),
+        way_m=float(way[-1]),
+        nees=float(squared[1:].mean() / 6.0) if len(squared) > 1 else 0.0,
+    )
+
+
+def _mahalanobis(e: NDArray[np.float64], P: NDArray[np.float64]) -> NDArray[np.float64]:
+    """eᵀ P⁻¹ e (N,); a variance below (1 µm)² or (1 µrad)² is lifted to it, the first pose is exact by definition."""
+    lifted = P + 1e-12 * np.eye(P.shape[1])
+    squared: NDArray[np.float64] = np.einsum("ni,ni->n", e, np.linalg.solve(lifted, e[..., None])[..., 0])
+    return np.maximum(squared, 0.0)
+
+
+def flags_of(outcome: Outcome, draw: Draw) -> list[str]:
+    """What tells the user that something is wrong.
+
+    That the mounting is unknown is no news to one who did not give it; that some scans are weak says something about these only.
+    """
+    flags = [outcome.error] if outcome.error else []
+    summary = outcome.summary
+    if summary is not None:
+        if summary.contradiction:
+            flags.append(summary.contradiction)
+        for warning in summary.warnings:
+            expected = draw.extrinsic == "absent" and _UNKNOWN_MOUNTING.search(warning.text) is not None
+            if not expected and not _WEAK.search(warning.text):
+                flags.append(warning.text)
+    if outcome.exit_code != 0 and not flags:
+        flags.append(f"exit code {outcome.exit_code}")
+    return flags
+
+
+def names_cause(flags: list[str], draw: Draw) -> bool:
+    """Whether one of the messages names what is wrong with the recording."""
+    if draw.fault == "option":
+        pattern = _OPTION_CAUSES[next(iter(draw.recording_options))]
+    elif draw.fault == "none":
+        return False
+    else:
+        pattern = CAUSES[draw.fault]
+    return any(re.search(pattern, text, re.IGNORECASE) for text in flags)
+
+
+def judge(outcome: Outcome, errors: Errors | None, draw: Draw, *, falsely_weak: bool = False) -> Verdict:
+    """The verdict on a run.
+
+    Args:
+        outcome: what the user got.
+        errors: of its trajectory; None without one.
+        draw: what the recording was.
+        falsely_weak: scans were called weak although the LiDAR saw enough (see `run.falsely_weak`).
+    """
+    flags = flags_of(outcome, draw)
+    reasons: list[str] = []
+    if errors is None:
+        reasons.append("no estimate")
+    else:
+        reasons += ["error"] * bool(errors.too_far.any()) + ["covariance"] * bool(errors.too_sure.any())
+    sound = draw.fault == "none"
+    false_alarm = "" if not sound else "flagged" if flags else "weak" if falsely_weak else ""
+    if not reasons and outcome.exit_code in (0, 3):
+        return Verdict("right", reasons, flags, false_alarm)
+    weak = errors is not None and _within_weak(outcome, errors)
+    guessed = draw.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
+    if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
+        return Verdict("right cause", reasons, flags, false_alarm)
+    if flags or weak or guessed:
+        return Verdict("flagged", reasons, flags, false_alarm)
+    return Verdict("silent", reasons, flags, false_alarm)
+
+
+def _within_weak(outcome: Outcome, errors: Errors) -> bool:
+    """Whether it went wrong in a weak stretch: of the first scan that is wrong and the ten before it, half were weak or lost."""
+    assert outcome.estimate is not None and outcome.estimate.status is not None
+    wrong = np.flatnonzero(errors.too_far | errors.too_sure)
+    if not len(wrong):
+        return False
+    before = outcome.estimate.status[max(wrong[0] - _WEAK_SCANS_BEFORE, 0) : wrong[0] + 1]
+    return sum(status != "ok" for status in before) >= 0.5 * len(before)

@@ -1,0 +1,96 @@
+"""Tables of a campaign, from its lines of JSON."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+VERDICTS = ("right", "right cause", "flagged", "silent")
+_KINDS = ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag")
+Line = dict[str, Any]
+
+
+def report(lines: Sequence[Line]) -> str:
+    """Everything: even seeds (tuned) and odd seeds (untouched) apart, then every silent case with its command."""
+    parts = []
+    for name, half in (("even seeds (tuned)", 0), ("odd seeds (untouched)", 1)):
+        mine = [line for line in lines if line["seed"] % 2 == half]
+        if mine:
+            parts += [f"== {name}: {len(mine)} runs ==", _summary(mine), *(_table(mine, kind) for kind in _KINDS)]
+    parts += [_cases(lines, "silent"), _alarms(lines)]
+    return "\n".join(part for part in parts if part)
+
+
+def _summary(lines: Sequence[Line]) -> str:
+    sound = [line for line in lines if line["fault"] == "none"]
+    faulty = [line for line in lines if line["fault"] != "none"]
+    texts = [_counts("sound", sound), _counts("faulty", faulty)]
+    alarms = Counter(line["false_alarm"] for line in sound)
+    texts.append(f"false alarms of {len(sound)} sound runs: {alarms['flagged']} flagged, {alarms['weak']} only called weak")
+    judged = [line for line in sound if line["worst_m"] is not None]
+    if judged:
+        for key, unit, name in (("worst_m", "m", "largest position error"), ("worst_deg", "deg", "largest rotation error")):
+            median, high = np.percentile([line[key] for line in judged], [50, 95])
+            texts.append(f"sound, {name}: median {median:.3f} {unit}, 95 % {high:.3f} {unit}")
+        median, high = np.percentile([line["nees"] for line in judged], [50, 95])
+        texts.append(f"sound, NEES a degree of freedom (1 is consistent): median {median:.2f}, 95 % {high:.2f}")
+    cpu = [line["cpu_s"] for line in lines]
+    texts.append(f"processor time a run: median {np.median(cpu):.1f} s, most {max(cpu):.1f} s")
+    return "\n".join(texts)
+
+
+def _counts(name: str, lines: Sequence[Line]) -> str:
+    counts = Counter(line["verdict"] for line in lines)
+    return f"{name}: {len(lines)} runs, " + ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+
+
+def _table(lines: Sequence[Line], kind: str) -> str:
+    rows = [f"{kind:22s} {'runs':>5s} " + " ".join(f"{verdict:>11s}" for verdict in VERDICTS) + f" {'false alarm':>11s}"]
+    for value in sorted({line[kind] for line in lines}):
+        mine = [line for line in lines if line[kind] == value]
+        counts = Counter(line["verdict"] for line in mine)
+        cells = " ".join(f"{counts[verdict]:11d}" for verdict in VERDICTS)
+        rows.append(f"  {value:20s} {len(mine):5d} {cells} {sum(bool(line['false_alarm']) for line in mine):11d}")
+    return "\n".join(rows)
+
+
+def describe(line: Line) -> str:
+    """One run in one line."""
+    error = "no estimate"
+    if line["worst_m"] is not None:
+        error = f"{line['worst_m']:.2f} m of {line['way_m']:.1f} m, {line['worst_deg']:.1f} deg, {line['worst_sigmas']:.0f} sigma"
+    alarm = f" FALSE ALARM ({line['false_alarm']})" if line["false_alarm"] else ""
+    what = f"{line['world']}, {line['motion']}, {line['sensor']}, {line['imu']} IMU, {line['extrinsic']}"
+    fault = "sound" if line["fault"] == "none" else f"{line['fault']} ({line['detail']})"
+    via = "" if line["bag"] == "false" else f", by {'command' if line['bag'] == 'command' else 'bag'}"
+    return f"{line['seed']:5d} {line['verdict']}{alarm}: {what}; {fault}{via}; {error}"
+
+
+def _cases(lines: Sequence[Line], verdict: str) -> str:
+    cases = [line for line in lines if line["verdict"] == verdict]
+    if not cases:
+        return "== no run was silently wrong =="
+    rows = [f"== silently wrong: {len(cases)} =="]
+    for line in sorted(cases, key=lambda line: (line["fault"], line["seed"])):
+        rows += [f"{describe(line)} [{', '.join(line['reasons'])}]", f"      {command(line)}"]
+    return "\n".join(rows)
+
+
+def command(line: Line) -> str:
+    """What repeats a run."""
+    bag = " --bag" if line["bag"] == "command" else ""
+    return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{bag}"
+
+
+def _alarms(lines: Sequence[Line]) -> str:
+    cases = [line for line in lines if line["false_alarm"]]
+    if not cases:
+        return ""
+    rows = [f"== false alarms: {len(cases)} =="]
+    for line in cases:
+        why = line["flags"][:1] or [f"called weak where the LiDAR saw enough: {line['falsely_weak_scans'][:2]}"]
+        rows.append(f"{describe(line)}\n      {why[0][:200]}")
+    return "\n".join(rows)

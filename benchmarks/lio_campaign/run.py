@@ -1,0 +1,192 @@
+"""One recording of the campaign: simulate, run the odometry as `boxplus lio` does, judge."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED
+from boxplus.errors import BoxplusError, InputError
+from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.recordings import open_recording
+from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.recording import Recording
+from boxplus.runs.config import MapConfig, RunConfig
+from boxplus.runs.extrinsic import choose_extrinsic
+from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.run_summary import RunSummary, read_summary
+from boxplus.simulation import Simulation, as_recording, write_recording
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from lio_campaign.draws import Draw, draw
+from lio_campaign.judge import Errors, Outcome, errors_of, judge
+
+EXIT_NOT_TRUSTED = 3
+_ENOUGH_SHARE = 0.01
+"""Least eigenvalue of the true information over that of all points, above which no direction of a scan is weak: 2.5 times the
+filter's own threshold."""
+_POINTS_LOOKED_AT = 500
+
+
+def run_seed(seed: int, *, command_line: bool = False) -> dict[str, Any]:
+    """Everything about one seed, as a line of JSON.
+
+    Args:
+        seed: which.
+        command_line: write a bag and run the real `boxplus lio` in a process of its own.
+    """
+    began, cpu = time.perf_counter(), time.process_time()
+    made = draw(seed)
+    simulation = made.simulation()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        outcome = _by_command(made, simulation, work) if command_line else _in_process(made, simulation, work)
+    errors = None if outcome.estimate is None else errors_of(outcome.estimate, simulation)
+    falsely = made.fault == "none" and not made.featureless and outcome.estimate is not None
+    suspects = falsely_weak(outcome.estimate, simulation) if falsely and outcome.estimate is not None else []
+    verdict = judge(outcome, errors, made, falsely_weak=bool(suspects))
+    return {
+        "seed": seed,
+        **made.kinds(),
+        "bag": "command" if command_line else made.kinds()["bag"],
+        "detail": made.detail,
+        "rate_hz": made.scenario.lidar.rate_hz,
+        "imu_hz": made.scenario.imu.rate_hz,
+        "duration_s": round(made.duration_s, 2),
+        **asdict(verdict),
+        **_figures(errors),
+        **_facts(outcome),
+        "falsely_weak_scans": suspects,
+        "cpu_s": round(time.process_time() - cpu, 2),
+        "wall_s": round(time.perf_counter() - began, 2),
+    }
+
+
+def _in_process(made: Draw, simulation: Simulation, work: Path) -> Outcome:
+    """The steps of `boxplus.cli.lio.run`, without a terminal, on a recording in memory or in a file."""
+    given = None if made.T_imu_lidar is None else tuple(map(tuple, made.T_imu_lidar.tolist()))
+    config = RunConfig(
+        recording=RecordingOptions.model_validate(made.recording_options),
+        odometry=LioConfig(T_imu_lidar=given),
+        map=MapConfig(save=False),
+    )
+    run = work / "run"
+    try:
+        with _opened(made, simulation, work, config.recording) as recording:
+            extrinsic = choose_extrinsic(recording, config.odometry)
+            summary = run_odometry(recording, run, config, extrinsic=extrinsic)
+        return Outcome(exit_code_of(summary), None, summary, _estimate(run))
+    except BoxplusError as problem:
+        code = EXIT_BAD_INPUT if isinstance(problem, InputError) else EXIT_FAILED
+        return Outcome(code, str(problem))
+
+
+def exit_code_of(summary: RunSummary) -> int:
+    """The exit code of `boxplus lio` for a run that came to its end."""
+    return 0 if summary.contradiction is None else EXIT_NOT_TRUSTED
+
+
+def _opened(made: Draw, simulation: Simulation, work: Path, options: RecordingOptions) -> Recording:
+    if not made.bag:
+        return as_recording(simulation, made.spoiled)
+    return open_recording(_written(made, simulation, work), options)
+
+
+def _written(made: Draw, simulation: Simulation, work: Path) -> Path:
+    file_format = "ros1" if made.file_format == "ros1" else "ros2"
+    return write_recording(simulation, work / "recording", file_format, made.spoiled)
+
+
+def _by_command(made: Draw, simulation: Simulation, work: Path) -> Outcome:
+    """The real command line on a real file."""
+    recording, run = _written(made, simulation, work), work / "run"
+    command = [sys.executable, "-m", "boxplus.cli", "lio", str(recording), "-o", str(run)]
+    command += ["--no-map", "--no-report", "--threads", "1"]
+    for key, value in made.recording_options.items():
+        command += [f"--{key.replace('_', '-')}", str(value)]
+    if made.T_imu_lidar is not None:
+        command += ["--T-imu-lidar", " ".join(f"{value:.12g}" for value in made.T_imu_lidar.ravel())]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    summary = read_summary(run / "run.json") if (run / "run.json").exists() else None
+    error = None if done.returncode == 0 else done.stderr.strip() or None
+    return Outcome(done.returncode, error, summary, _estimate(run))
+
+
+def _estimate(run: Path) -> Trajectory | None:
+    """The trajectory of a run with at least two poses."""
+    path = run / "trajectory.csv"
+    if not path.exists() or len(path.read_text(encoding="utf-8").splitlines()) < 3:
+        return None
+    return read_trajectory(path, "csv")
+
+
+def falsely_weak(estimate: Trajectory, simulation: Simulation, most: int = 8) -> list[dict[str, float]]:
+    """Scans called weak or lost although their exact points tell every direction of the pose: up to `most` are looked at."""
+    assert estimate.status is not None and estimate.time_ns is not None
+    weak = np.flatnonzero(np.array(estimate.status) != "ok")
+    found = []
+    period_ns = simulation.scan_start_ns(1) - simulation.scan_start_ns(0)
+    for index in weak[np.unique(np.linspace(0, len(weak) - 1, min(most, len(weak))).astype(int))] if len(weak) else []:
+        scan = int((estimate.time_ns[index] - 1 - simulation.scan_start_ns(0)) // period_ns)
+        share = true_information_share(simulation, min(max(scan, 0), simulation.scan_count - 1))
+        if share > _ENOUGH_SHARE:
+            found.append({"scan": float(scan), "share": round(share, 4)})
+    return found
+
+
+def true_information_share(simulation: Simulation, index: int) -> float:
+    """Least information of scan `index` along any direction of the pose, over that of all its points if each measured it.
+
+    From exact points and exact normals, the gradient of the distance to the surfaces a centimetre before each point.
+    """
+    points, time_ns = simulation.exact_points(index)
+    if len(points) < 20:
+        return 0.0
+    chosen = np.linspace(0, len(points) - 1, min(_POINTS_LOOKED_AT, len(points))).astype(int)
+    points, time_ns = points[chosen], time_ns[chosen]
+    motion, T = simulation.ground_truth(time_ns), simulation.T_imu_lidar
+    ranges = np.linalg.norm(points, axis=1, keepdims=True)
+
+    def to_world(p_lidar: np.ndarray) -> np.ndarray:
+        return np.einsum("nij,nj->ni", motion.R_world_imu, p_lidar @ T[:3, :3].T + T[:3, 3]) + motion.p_world_imu
+
+    before = to_world(points * (1.0 - 0.01 / ranges))
+    step = 1e-4
+    gradient = [
+        (simulation.world.distance(before + step * axis) - simulation.world.distance(before - step * axis)) / (2 * step)
+        for axis in np.eye(3)
+    ]
+    normals = np.stack(gradient, axis=1)
+    lever = to_world(points) - motion.p_world_imu
+    arm = float(np.sqrt(np.mean(np.sum(lever**2, axis=1))))
+    J = np.concatenate([np.cross(lever, normals) / max(arm, 1e-6), normals], axis=1)
+    return float(np.linalg.eigvalsh(J.T @ J / len(J))[0])
+
+
+def _figures(errors: Errors | None) -> dict[str, Any]:
+    if errors is None:
+        return {"way_m": None, "worst_m": None, "worst_deg": None, "nees": None}
+    return {
+        "way_m": round(errors.way_m, 3),
+        "worst_m": round(float(errors.position_m.max()), 4),
+        "worst_deg": round(float(errors.rotation_deg.max()), 3),
+        "last_m": round(float(errors.position_m[-1]), 4),
+        "worst_sigmas": round(float(max(errors.position_sigmas.max(), errors.rotation_sigmas.max())), 2),
+        "nees": round(errors.nees, 3),
+    }
+
+
+def _facts(outcome: Outcome) -> dict[str, Any]:
+    summary = outcome.summary
+    return {
+        "exit_code": outcome.exit_code,
+        "status": {} if summary is None else summary.status,
+        "start": None if summary is None or summary.start is None else summary.start.kind,
+        "extrinsic_source": None if summary is None else summary.extrinsic.source,
+    }

@@ -1,0 +1,171 @@
+"""The judge of the campaign on made-up outcomes, and a few fast seeds from draw to verdict."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
+from boxplus.simulation import Simulation, faults
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+PARTS = ("draws", "judge", "places", "report", "run")
+
+
+@pytest.fixture(scope="module")
+def campaign() -> Iterator[SimpleNamespace]:
+    """The modules of the campaign, which is not a package of the library; they leave no trace."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        yield SimpleNamespace(**{name: importlib.import_module(f"lio_campaign.{name}") for name in PARTS})
+    finally:
+        sys.path.remove(str(FOLDER))
+        for name in [name for name in sys.modules if name.partition(".")[0] == "lio_campaign"]:
+            del sys.modules[name]
+
+
+@pytest.fixture(scope="module")
+def seed(campaign: SimpleNamespace) -> int:
+    """A sound recording in a hall, hand-held, whose mounting is given."""
+    wanted = {"fault": "none", "world": "hall", "motion": "handheld", "extrinsic": "given"}
+    return next(seed for seed in range(2000) if campaign.draws.draw_kinds(seed).matches(wanted))
+
+
+def estimate_of(simulation: Simulation, error_m: float = 0.0, sigma_m: float = 0.01, weak: bool = False) -> Trajectory:
+    """A trajectory that is off by up to `error_m` along y, in a world of its own."""
+    time_ns = simulation.start_ns + np.arange(1, 41) * 200_000_000
+    truth = simulation.ground_truth(time_ns)
+    R_other = so3.exp(np.array([0.1, -0.2, 2.0]))
+    p = truth.p_world_imu @ R_other.T + [4.0, 5.0, 6.0]
+    p[:, 1] += error_m * np.linspace(0.0, 1.0, len(p))
+    covariance = np.broadcast_to(np.diag([1e-5] * 3 + [sigma_m**2] * 3), (len(p), 6, 6))
+    status = ("weak" if weak else "ok",) * len(p)
+    return Trajectory(time_ns, p, quaternion.from_matrix(R_other @ truth.R_world_imu), covariance, status)
+
+
+def summary_of(*warnings: str, contradiction: str | None = None, source: str = "given") -> Any:
+    texts = [SimpleNamespace(text=text) for text in warnings]
+    return SimpleNamespace(contradiction=contradiction, warnings=texts, extrinsic=SimpleNamespace(source=source))
+
+
+def test_errors_do_not_depend_on_the_world_of_the_estimate(campaign: SimpleNamespace, seed: int) -> None:
+    simulation = campaign.draws.draw(seed).simulation()
+    errors = campaign.judge.errors_of(estimate_of(simulation), simulation)
+    assert errors.position_m.max() < 1e-9
+    assert errors.rotation_deg.max() < 1e-6
+    assert not errors.too_far.any()
+    assert not errors.too_sure.any()
+    assert campaign.judge.errors_of(estimate_of(simulation, 0.5), simulation).position_m[-1] == pytest.approx(0.5, abs=1e-9)
+    assert errors.way_m == pytest.approx(campaign.judge.errors_of(estimate_of(simulation, 0.5), simulation).way_m)
+
+
+@pytest.mark.parametrize(
+    ("error_m", "sigma_m", "reasons"),
+    [
+        (0.02, 1e-4, []),
+        (0.04, 0.02, []),
+        (0.04, 0.001, ["covariance"]),
+        (3.0, 1.0, ["error"]),
+        (3.0, 0.01, ["error", "covariance"]),
+    ],
+)
+def test_right_is_near_the_truth_and_within_the_covariance(
+    campaign: SimpleNamespace, seed: int, error_m: float, sigma_m: float, reasons: list[str]
+) -> None:
+    draw = campaign.draws.draw(seed)
+    simulation = draw.simulation()
+    estimate = estimate_of(simulation, error_m, sigma_m)
+    outcome = campaign.judge.Outcome(0, None, summary_of(), estimate)
+    verdict = campaign.judge.judge(outcome, campaign.judge.errors_of(estimate, simulation), draw)
+    assert (verdict.verdict, verdict.reasons) == ("silent" if reasons else "right", reasons)
+
+
+def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
+    judge, sound = campaign.judge, campaign.draws.draw(seed)
+    simulation = sound.simulation()
+    faulty = replace(sound, fault="clock_offset", spoiled=faults.clock_offset())
+    wrong = estimate_of(simulation, 3.0)
+    errors = judge.errors_of(wrong, simulation)
+
+    def verdict(draw: Any, *warnings: str, exit_code: int = 0, estimate: Any = wrong, **facts: Any) -> Any:
+        outcome = judge.Outcome(exit_code, None, summary_of(*warnings, **facts), estimate)
+        return judge.judge(outcome, None if estimate is None else errors, draw)
+
+    assert verdict(faulty).verdict == "silent"
+    assert verdict(faulty, "5 of 40 scans are weak; the longest stretch …").verdict == "silent"
+    assert verdict(faulty, estimate=estimate_of(simulation, 3.0, weak=True)).verdict == "flagged"
+    assert verdict(faulty, "accelerometer x saturated").verdict == "flagged"
+    assert verdict(faulty, contradiction="their clocks differ by 100 ms").verdict == "right cause"
+    absent = replace(faulty, extrinsic="absent")
+    unknown = (
+        "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted: its rotation was estimated"
+    )
+    assert verdict(absent, unknown).verdict == "silent"
+    assert verdict(absent, unknown, source="identity").verdict == "flagged"
+    assert judge.judge(judge.Outcome(2, "IMU stamps 100 ms apart"), None, faulty).verdict == "right cause"
+    refused = judge.judge(judge.Outcome(2, "no start was found"), None, sound)
+    assert (refused.verdict, refused.false_alarm) == ("flagged", "flagged")
+
+
+def test_a_sound_run_that_is_right_can_be_a_false_alarm(campaign: SimpleNamespace, seed: int) -> None:
+    judge, draw = campaign.judge, campaign.draws.draw(seed)
+    simulation = draw.simulation()
+    estimate = estimate_of(simulation)
+    errors = judge.errors_of(estimate, simulation)
+    for code, summary, weak, alarm in (
+        (0, summary_of(), False, ""),
+        (0, summary_of(), True, "weak"),
+        (0, summary_of("gyroscope x saturated"), True, "flagged"),
+        (3, summary_of(contradiction="turn differently"), False, "flagged"),
+    ):
+        verdict = judge.judge(judge.Outcome(code, None, summary, estimate), errors, draw, falsely_weak=weak)
+        assert (verdict.verdict, verdict.false_alarm) == ("right", alarm)
+
+
+def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: SimpleNamespace) -> None:
+    draws = campaign.draws
+    assert set(campaign.judge.CAUSES) == set(draws.FAULT_KINDS) - {"option"}
+    kinds = [draws.draw_kinds(seed) for seed in range(400)]
+    assert {kind.fault for kind in kinds} == {"none", *draws.FAULT_KINDS}
+    assert {kind.world for kind in kinds} == set(campaign.places.PLACES)
+    assert {kind.motion for kind in kinds} == set(campaign.places.MOTIONS)
+    assert 0.4 < np.mean([kind.fault == "none" for kind in kinds]) < 0.6
+    assert np.mean([kind.bag == "true" for kind in kinds]) > 0.1
+    first, second = draws.draw(7), draws.draw(7)
+    assert first.kinds() == second.kinds() == draws.asdict(draws.draw_kinds(7))
+    np.testing.assert_array_equal(first.simulation().scan(3).p_lidar, second.simulation().scan(3).p_lidar)
+    assert len(first.simulation().scan(3)) <= 8000
+
+
+def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespace) -> None:
+    shares = {}
+    for world, motion in (("corridor", "handheld"), ("room", "handheld")):
+        wanted = {"world": world, "motion": motion, "sensor": "spinning128"}
+        chosen = next(seed for seed in range(3000) if campaign.draws.draw_kinds(seed).matches(wanted))
+        shares[world] = campaign.run.true_information_share(campaign.draws.draw(chosen).simulation(), 50)
+    assert shares["corridor"] < 1e-6 < 0.01 < shares["room"]
+
+
+def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = campaign.draws.draw(seed)
+    short = replace(draw, duration_s=4.0)
+    monkeypatch.setattr(campaign.run, "draw", lambda _: short)
+    line = campaign.run.run_seed(seed)
+    assert (line["verdict"], line["exit_code"]) == ("right", 0)
+    assert line["worst_m"] < 0.05
+    spoiled = replace(short, fault="accel_unit", spoiled=faults.imu_in_g(), bag=True)
+    monkeypatch.setattr(campaign.run, "draw", lambda _: spoiled)
+    seen_through = campaign.run.run_seed(seed)
+    assert (seen_through["verdict"], seen_through["bag"]) == ("right", "true")
+    text = campaign.report.report([line, seen_through | {"verdict": "silent", "reasons": ["error"]}])
+    assert "sound: 1 runs, 1 right, 0 right cause, 0 flagged, 0 silent" in text
+    assert f"python benchmarks/campaign.py --seeds {seed}:{seed + 1} -v" in text
