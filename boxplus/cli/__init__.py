@@ -92,6 +92,7 @@ def _common(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the log as well.")] = False,
 ) -> None:
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("boxplus").setLevel(logging.INFO if verbose else logging.WARNING)
 
 
 def main() -> None:

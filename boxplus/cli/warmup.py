@@ -9,7 +9,8 @@ def warmup() -> None:
 
     from rich.console import Console
 
-    from boxplus._jit import cache_root, on_compilation
+    from boxplus._jit import on_compilation
+    from boxplus._kernel_cache import cache_root
 
     console = Console(highlight=False)
     began = time.perf_counter()

@@ -1,0 +1,253 @@
+"""Where compiled kernels are kept on disk, under which key, and what is believed of what lies there.
+
+Numba's own cache looks at the modification time of the file that defines a function and not at the files its callees
+come from, so an edited helper leaves stale machine code behind. Here every kernel is cached under a hash of its own
+file, of every boxplus file that file imports (transitively), of Numba's version and of the processor. A stale kernel is
+impossible, and editing one file recompiles only what depends on it.
+
+What is read back is unpickled, and so can run any code. It is therefore read only from folders and files that nobody but
+this user (or root) can write to, and only if it still has the checksum it was written with. Whatever fails is compiled
+again, and a warning is logged, once.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import pickle
+import re
+import stat
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
+
+_log = logging.getLogger(__name__)
+_PACKAGE_ROOT = Path(__file__).resolve().parent
+_IMPORT = re.compile(
+    r"^\s*(?:from\s+((?:boxplus|\.)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+(boxplus[\w.]+))", re.MULTILINE
+)
+_DIGEST_BYTES = 32
+_WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+
+def cache_root() -> Path:
+    """Folder of compiled kernels: `$BOXPLUS_CACHE_DIR`, else the user's cache folder."""
+    override = os.environ.get("BOXPLUS_CACHE_DIR")
+    if override:
+        return Path(override)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", str(Path.home() / "AppData" / "Local")))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache")))
+    return base / "boxplus"
+
+
+def _module_files(dotted_name: str) -> list[Path]:
+    """The file of a module; of a package also its stub, which says where the names come from that it imports on first use."""
+    path = _PACKAGE_ROOT.joinpath(*dotted_name.split(".")[1:])
+    candidates = (path.with_suffix(".py"), path / "__init__.py", path / "__init__.pyi")
+    return [candidate for candidate in candidates if candidate.is_file()]
+
+
+@functools.cache
+def _imported_files(file: Path) -> frozenset[Path]:
+    """The boxplus files that `file` imports directly."""
+    found: set[Path] = set()
+    for package, names, module in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        if package.startswith("."):  # in the stubs; those of a user's file lead to no file of boxplus
+            if not file.is_relative_to(_PACKAGE_ROOT):
+                continue
+            package = ".".join(["boxplus", *file.parent.relative_to(_PACKAGE_ROOT).parts]) + package.rstrip(".")
+        candidates = [module] if module else [package]
+        candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
+        found.update(path for name in candidates for path in _module_files(name))
+    return frozenset(found)
+
+
+@functools.cache
+def _source_key(file: Path) -> str:
+    """Hash of `file`, of every boxplus file it depends on, of Numba's version and of the processor."""
+    pending, seen = [file], {file}
+    while pending:
+        for dependency in _imported_files(pending.pop()) - seen:
+            seen.add(dependency)
+            pending.append(dependency)
+    digest = hashlib.sha256(f"{numba.__version__} {sys.implementation.cache_tag} {_processor()}".encode())
+    for path in sorted(seen):
+        digest.update(str(path).encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:24]
+
+
+@functools.cache
+def _processor() -> str:
+    from llvmlite import binding
+
+    return f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
+
+
+_told: set[str] = set()
+
+
+def _warn_once(topic: str, message: str, *details: object) -> None:
+    """Log a warning; further ones of the same topic in this process would say the same."""
+    if topic not in _told:
+        _told.add(topic)
+        _log.warning(message, *details)
+
+
+def _distrusted(path: str | Path, status: os.stat_result) -> bool:
+    """Whether others could have written this file or folder; says so once."""
+    if os.name == "nt":  # the mode says nothing there, and the user's cache folder is private
+        return False
+    if status.st_uid not in (0, os.geteuid()):
+        what = f"belongs to user {status.st_uid}, not to user {os.geteuid()}"
+    elif status.st_mode & _WRITABLE_FOR_OTHERS:
+        what = "can be written by other users"
+    else:
+        return False
+    _warn_once(
+        "distrusted",
+        "expected compiled kernels in a place only this user can write to - %s %s, so it is not used and kernels are compiled "
+        "in every process - remove it or take the permission away (chmod -R go-w), or set BOXPLUS_CACHE_DIR to a folder of "
+        "your own",
+        path,
+        what,
+    )
+    return True
+
+
+@functools.cache
+def _is_usable(folder: Path) -> bool:
+    """Whether kernels can be kept in `folder`, which is created, closed to others, where it does not exist."""
+    root = cache_root()
+    chain = [folder, *folder.parents]
+    own = chain[: chain.index(root) + 1][::-1]
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        for path in own:
+            with suppress(FileExistsError):
+                path.mkdir(mode=0o700)
+            if _distrusted(path, path.stat()):
+                return False
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
+class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
+    """Tells Numba to keep a function's machine code under the hash of everything it was compiled from."""
+
+    def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
+        file = Path(py_file).resolve()
+        self._line = py_func.__code__.co_firstlineno
+        self._folder = cache_root() / "kernels" / _source_key(file)
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _KeyedLocator | None:
+        locator = cls(py_func, py_file)
+        return locator if _is_usable(locator._folder) else None
+
+
+class _VerifiedFiles(IndexDataCacheFile):  # type: ignore[misc]
+    """The index and the machine code of one function, each behind a checksum that is looked at before anything is unpickled."""
+
+    def _load_index(self) -> dict[Any, str]:
+        content = self._read(self._index_path)
+        if content is None:
+            return {}
+        stamp, overloads = pickle.loads(content)
+        return overloads if stamp == self._source_stamp else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        self._write(self._index_path, self._dump((self._source_stamp, overloads)))  # type: ignore[no-untyped-call]
+
+    def _load_data(self, name: str) -> Any:
+        content = self._read(self._data_path(name))  # type: ignore[no-untyped-call]
+        return None if content is None else pickle.loads(content)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), self._dump(data))  # type: ignore[no-untyped-call]
+
+    def _read(self, path: str) -> bytes | None:
+        """What was written to `path`, if all of it is there and nobody else can have written it."""
+        try:
+            with open(path, "rb") as file:
+                if _distrusted(path, os.fstat(file.fileno())):
+                    return None
+                content = file.read()
+        except OSError:
+            return None
+        digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        if hashlib.sha256(payload).digest() == digest:
+            return payload
+        _warn_once("damaged", "%s is damaged (cut or changed): it is discarded and its kernel compiled again", path)
+        with suppress(OSError):
+            os.unlink(path)
+        return None
+
+    def _write(self, path: str, payload: bytes) -> None:
+        with _replacing(path) as file:
+            file.write(hashlib.sha256(payload).digest())
+            file.write(payload)
+
+
+@contextmanager
+def _replacing(path: str) -> Iterator[BinaryIO]:
+    """A file of this user alone that takes the place of `path` when it is whole; several processes may do so at once."""
+    temporary = f"{path}.tmp.{uuid.uuid4().hex[:16]}"
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    try:
+        with os.fdopen(os.open(temporary, flags, 0o600), "wb") as file:
+            yield file
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = [_KeyedLocator]  # noqa: RUF012
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """What a dispatcher loads its machine code from, and saves it to.
+
+    Raises:
+        RuntimeError: there is no folder that can be used.
+    """
+
+    _impl_class = _KeyedCacheImpl
+
+    def __init__(self, py_func: Callable[..., Any]) -> None:
+        super().__init__(py_func)  # type: ignore[no-untyped-call]
+        locator = self._impl.locator
+        self._cache_file = _VerifiedFiles(  # type: ignore[no-untyped-call]
+            cache_path=locator.get_cache_path(), filename_base=self._impl.filename_base, source_stamp=locator.get_source_stamp()
+        )
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except OSError as error:  # a full disk, a folder removed meanwhile: the kernel is compiled all the same
+            _warn_once("unwritable", "compiled kernels cannot be kept in %s: %s", self._cache_path, error)

@@ -1,0 +1,240 @@
+"""Compiled kernels on disk: keys that follow the sources, and nothing unpickled that is damaged or could be another's."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from numba.core import config as numba_config
+
+from boxplus import _jit, _kernel_cache
+
+compiles = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="nothing is compiled")
+posix = pytest.mark.skipif(os.name == "nt", reason="the mode of a file says nothing there")
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A small package of kernels in place of boxplus: top imports middle, middle imports bottom; aside is imported by none."""
+    root = tmp_path / "boxplus"
+    (root / "low").mkdir(parents=True)
+    (root / "__init__.py").write_text("")
+    (root / "low" / "__init__.py").write_text("")
+    (root / "low" / "bottom.py").write_text("X = 1\n")
+    (root / "middle.py").write_text("from boxplus.low.bottom import (\n    X,\n)\n")
+    (root / "top.py").write_text("import numpy as np\nfrom boxplus import middle as m\n")
+    (root / "aside.py").write_text("Y = 1\n")
+    monkeypatch.setattr(_kernel_cache, "_PACKAGE_ROOT", root)
+    _forget()
+    yield root
+    _forget()
+
+
+def _forget() -> None:
+    _kernel_cache._imported_files.cache_clear()
+    _kernel_cache._source_key.cache_clear()
+
+
+def _key(file: Path) -> str:
+    _forget()
+    return _kernel_cache._source_key(file)
+
+
+@pytest.mark.parametrize("changed", ["top.py", "middle.py", "low/bottom.py", "low/__init__.py"])
+def test_the_key_follows_every_dependency(package: Path, changed: str) -> None:
+    if changed == "low/__init__.py":  # seen only where the package itself is imported from
+        (package / "middle.py").write_text("from boxplus.low import bottom\n")
+    before = _key(package / "top.py")
+    assert _key(package / "top.py") == before
+    with (package / changed).open("a") as file:
+        file.write("Z = 2\n")
+    assert _key(package / "top.py") != before
+
+
+@pytest.mark.parametrize("changed", ["low/bottom.py", "low/__init__.pyi"])
+def test_the_key_follows_the_stub_of_a_package(package: Path, changed: str) -> None:
+    (package / "low" / "__init__.pyi").write_text("from .bottom import X as X\n")
+    (package / "middle.py").write_text("from boxplus.low import X\n")
+    before = _key(package / "top.py")
+    with (package / changed).open("a") as file:
+        file.write("Z = 2\n")
+    assert _key(package / "top.py") != before
+
+
+@pytest.mark.parametrize("changed", ["aside.py", "top.py"])
+def test_the_key_ignores_what_is_not_imported(package: Path, changed: str) -> None:
+    before = _key(package / "middle.py")
+    (package / changed).write_text("Y = 2\n")
+    assert _key(package / "middle.py") == before
+
+
+def test_files_that_import_one_another_have_a_key(package: Path) -> None:
+    (package / "low" / "bottom.py").write_text("from boxplus.top import m\n")
+    assert len(_key(package / "top.py")) == 24
+
+
+def test_the_key_follows_the_processor(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = _key(package / "top.py")
+    monkeypatch.setattr(_kernel_cache, "_processor", lambda: "another one")
+    assert _key(package / "top.py") != before
+
+
+def test_the_cache_folder_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BOXPLUS_CACHE_DIR", str(tmp_path))
+    assert _kernel_cache.cache_root() == tmp_path
+    monkeypatch.delenv("BOXPLUS_CACHE_DIR")
+    assert _kernel_cache.cache_root().name == "boxplus"
+
+
+_PROGRAM = """
+from boxplus._jit import kernel, on_compilation
+@kernel
+def twice(x):
+    return 2.0 * x
+compiled = []
+with on_compilation(compiled.append):
+    twice(3.0)
+print(twice(4.0), compiled)
+"""
+
+
+@compiles
+def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(_PROGRAM)
+
+    def run(cache: Path) -> str:
+        environment = {"BOXPLUS_CACHE_DIR": str(cache), "PATH": ""}
+        done = subprocess.run(
+            [sys.executable, str(tmp_path / "program.py")], env=environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    assert run(tmp_path / "cache") == "8.0 ['twice']"
+    assert run(tmp_path / "cache") == "8.0 []"
+    # Where the cache cannot be written the kernel works all the same.
+    (tmp_path / "file").write_text("")
+    assert run(tmp_path / "file") == "8.0 ['twice']"
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder of this test's own, about which nothing was said yet."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("BOXPLUS_CACHE_DIR", str(folder))
+    monkeypatch.setattr(_kernel_cache, "_told", set())
+    _kernel_cache._is_usable.cache_clear()
+    return folder
+
+
+def _compiled_names() -> list[str]:
+    """Which kernels a new process would have to compile: the dispatcher is new, the file it comes from is not."""
+
+    def twice(x: float) -> float:
+        return 2.0 * x
+
+    compiled: list[str] = []
+    with _jit.on_compilation(compiled.append):
+        assert _jit.kernel(twice)(3.0) == 6.0
+    return compiled
+
+
+def _files(cache: Path, ending: str) -> list[Path]:
+    return sorted(cache.rglob(f"*{ending}"))
+
+
+@compiles
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damage", ["emptied", "cut", "changed"])
+def test_a_damaged_file_is_discarded_said_once_and_written_again(
+    cache: Path, caplog: pytest.LogCaptureFixture, ending: str, damage: str
+) -> None:
+    assert _compiled_names() == ["twice"] and _compiled_names() == []
+    (file,) = _files(cache, ending)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    file.write_bytes({"emptied": b"", "cut": file.read_bytes()[:-7], "changed": bytes(content)}[damage])
+    with caplog.at_level(logging.WARNING):
+        assert _compiled_names() == ["twice"]
+        assert _compiled_names() == []
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{file} is damaged (cut or changed): it is discarded and its kernel compiled again"
+    ]
+
+
+class _Planted:
+    """Unpickling it leaves a file behind."""
+
+    def __init__(self, trace: Path) -> None:
+        self._trace = trace
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self._trace,)
+
+
+@compiles
+@posix
+@pytest.mark.parametrize("where", ["root", "kernels", "key", "file"])
+@pytest.mark.parametrize("how", ["group", "others", "owner"])
+def test_what_others_can_write_is_never_unpickled(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, where: str, how: str
+) -> None:
+    assert _compiled_names() == ["twice"]
+    (index,) = _files(cache, ".nbi")
+    payload = pickle.dumps(_Planted(tmp_path / "planted"))
+    index.write_bytes(_kernel_cache.hashlib.sha256(payload).digest() + payload)
+    path = {"root": cache, "kernels": cache / "kernels", "key": index.parent, "file": index}[where]
+    if how == "owner":
+        this = path.stat().st_ino
+        distrusted = _kernel_cache._distrusted
+
+        def of_another(path: str | Path, status: os.stat_result) -> bool:
+            fields = list(status)
+            fields[4] = 4321 if status.st_ino == this else status.st_uid  # st_uid
+            return distrusted(path, os.stat_result(fields))
+
+        monkeypatch.setattr(_kernel_cache, "_distrusted", of_another)
+    else:
+        path.chmod(path.stat().st_mode | (0o020 if how == "group" else 0o002))
+    _kernel_cache._is_usable.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        assert _compiled_names() == ["twice"]
+        _compiled_names()
+    assert not (tmp_path / "planted").exists()
+    (record,) = caplog.records
+    said = "belongs to user 4321" if how == "owner" else "can be written by other users"
+    assert f"{path} {said}" in record.getMessage() and "BOXPLUS_CACHE_DIR" in record.getMessage()
+
+
+@compiles
+@posix
+def test_what_is_written_is_closed_to_others_whatever_the_umask(cache: Path) -> None:
+    before = os.umask(0)
+    try:
+        assert _compiled_names() == ["twice"]
+    finally:
+        os.umask(before)
+    for path in [cache, *cache.rglob("*")]:
+        assert path.stat().st_mode & 0o077 == 0, path
+
+
+@compiles
+def test_a_disk_without_room_leaves_the_kernel_working(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(_kernel_cache.os, "replace", full)
+    with caplog.at_level(logging.WARNING):
+        assert _compiled_names() == ["twice"]
+        assert _compiled_names() == ["twice"]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"compiled kernels cannot be kept in {next(cache.glob('kernels/*'))}: [Errno 28] No space left on device"
+    ]
+    assert not _files(cache, "nbi") and not list(cache.rglob("*.tmp.*"))
