@@ -18,7 +18,13 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def kernel(
-    function: _Function | None = None, *, fastmath: bool = False, inline: bool = False, borrow: bool = False, cached: bool = True
+    function: _Function | None = None,
+    *,
+    fastmath: bool = False,
+    inline: bool = False,
+    borrow: bool = False,
+    cached: bool = True,
+    checked: bool = False,
 ) -> Any:
     """Compile a function to native code: releases the GIL, divides like C, and is cached on disk.
 
@@ -26,12 +32,19 @@ def kernel(
     inline the function wherever it is called (small helpers of a hot loop). `borrow` leaves the reference counts of the
     arguments alone, which are otherwise raised and lowered, atomically, in every call of a function with a loop: for
     kernels that are called once a point, or on the same arrays by several threads. Such a kernel cannot allocate. What is
-    not `cached` is compiled in every process: functions of users, whose sources the cache does not know.
+    not `cached` is compiled in every process: functions of users, whose sources the cache does not know. What is `checked`
+    raises IndexError where it would read or write beyond an array: likewise functions of users.
     """
     if function is None:
-        return lambda f: kernel(f, fastmath=fastmath, inline=inline, borrow=borrow, cached=cached)
+        return lambda f: kernel(f, fastmath=fastmath, inline=inline, borrow=borrow, cached=cached, checked=checked)
     flags = {"contract", "reassoc"} if fastmath else False
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": flags, "_nrt": not borrow}
+    options: dict[str, Any] = {
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": flags,
+        "_nrt": not borrow,
+        "boundscheck": checked,
+    }
     if inline:
         options["forceinline"] = True
     dispatcher = numba.njit(**options)(function)

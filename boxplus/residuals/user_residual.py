@@ -111,8 +111,12 @@ class UserResidual(Residual):
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         if self._loops is not None and self._loops.linearize is not None:
-            extra = (*self._tables, *self._steps) if self.jacobian is None and self._tables is not None else ()
-            self._check(self._loops.linearize(begin, end, *x, *index, *self.data, *extra, r, *jacobians, valid))
+            extra: tuple[NDArray[Any], ...] = ()
+            if self.jacobian is None and self._tables is not None:
+                self.evaluate_into(begin, end, x, index, r, valid)  # with bounds checked, which the differences are not
+                extra = (*self._tables, *self._steps)
+            rows = (*x, *index, *self.data, *extra)
+            self._run(self._loops.linearize, begin, end, rows, (r, *jacobians, valid))
             return
         self.evaluate_into(begin, end, x, index, r, valid)
         if self.jacobian is None:
@@ -125,7 +129,7 @@ class UserResidual(Residual):
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         if self._loops is not None:
-            self._check(self._loops.evaluate(begin, end, *x, *index, *self.data, r, valid))
+            self._run(self._loops.evaluate, begin, end, (*x, *index, *self.data), (r, valid))
         else:
             r[begin:end], valid[begin:end] = self._call_batch(begin, end, self._gather(begin, end, x, index))
             r[begin:end][~valid[begin:end]] = 0.0
@@ -142,7 +146,7 @@ class UserResidual(Residual):
         r, valid = np.zeros((end - begin, self.dim)), np.ones(end - begin, dtype=np.bool_)
         rows = (np.arange(end - begin, dtype=np.uint32),) * len(values)
         data = (array[begin:end] for array in self.data)
-        self._check(self._loops.evaluate(0, end - begin, *values, *rows, *data, r, valid))
+        self._run(self._loops.evaluate, 0, end - begin, (*values, *rows, *data), (r, valid), first=begin)
         return r, valid
 
     def _call_batch(
@@ -195,9 +199,43 @@ class UserResidual(Residual):
     def _name(self) -> str:
         return str(getattr(self.function, "__name__", "the function"))
 
-    def _check(self, status: int) -> None:
-        if status:
-            raise InputError(f"{self.dim} numbers from {self._name}", f"{status - 1}", "return as many as dim says")
+    def _run(
+        self,
+        loop: Callable[..., int],
+        begin: int,
+        end: int,
+        rows: tuple[NDArray[Any], ...],
+        out: tuple[NDArray[Any], ...],
+        *,
+        first: int = 0,
+    ) -> None:
+        """Call a compiled loop over rows [begin, end), of which the first one is residual `first + begin` of the group."""
+        try:
+            wrong = loop(begin, end, *rows, *out)
+        except IndexError:
+            raise self._beyond(first + self._first_beyond(loop, begin, end, rows, out)) from None
+        if wrong:
+            raise InputError(f"{self.dim} numbers from {self._name}", f"{wrong - 1}", "return as many as dim says")
+
+    @staticmethod
+    def _first_beyond(
+        loop: Callable[..., int], begin: int, end: int, rows: tuple[NDArray[Any], ...], out: tuple[NDArray[Any], ...]
+    ) -> int:
+        for n in range(begin, end):
+            try:
+                loop(n, n + 1, *rows, *out)
+            except IndexError:
+                return n
+        return begin
+
+    def _beyond(self, residual: int) -> InputError:
+        named = [f"{role} ({manifold.size},)" for role, manifold in zip(self.roles, self.manifolds, strict=True)]
+        named += [f"data[{k}] {'scalar' if array.ndim == 1 else array.shape[1:]}" for k, array in enumerate(self.data)]
+        return InputError(
+            f"indices within the arrays that {self._name} uses",
+            f"one beyond the end, in residual {residual} of {self.count}, whose arguments are {', '.join(named)}",
+            "correct the index, or return None where there is no residual",
+        )
 
 
 def _data(number: int, array: ArrayLike) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from boxplus.manifolds.se3 import SE3, SE3Left, adjoint_into, between_into, betw
 from boxplus.manifolds.se3_jacobians import right_jacobian_inverse_into
 from boxplus.manifolds.so3 import SO3
 from boxplus.optimization.jacobian_check import check_jacobian
+from boxplus.optimization.problem import Problem
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.user_residual import UserResidual
 
@@ -343,3 +344,89 @@ def test_batch_shapes_are_checked() -> None:
     )
     with pytest.raises(InputError, match=r"expected Jacobians of shapes \[\(5, 1, 2\)\] – got \[\(5, 2\)\]"):
         residual.linearize(np.ones((5, 2)))
+
+
+TABLE = np.arange(4.0)
+
+
+@numba.njit
+def _looked_up(table, at):
+    return table[at]
+
+
+@pytest.mark.parametrize("with_jacobian", [False, True])
+def test_an_index_beyond_an_array_is_refused_and_named(with_jacobian: bool) -> None:
+    """Compiled without checks it reads other memory, or ends the process."""
+
+    def entry(x, which):
+        return x[which] - 1.0
+
+    def jacobian(x, which, J):
+        J[0, which] = 1.0
+
+    good = {"manifolds": (Euclidean(3),), "dim": 1, "jacobian": jacobian if with_jacobian else None}
+    within = UserResidual(entry, data=([0, 1, 2, -1, -3],), **good)
+    assert check_jacobian(within, np.ones((5, 3))).passed
+    beyond = UserResidual(entry, data=([0, 1, 3, 2, 99],), **good)
+    text = (
+        r"expected indices within the arrays that entry uses – got one beyond the end, in residual 2 of 5, whose arguments are "
+        r"x \(3,\), data\[0\] scalar – correct the index"
+    )
+    for call in (beyond.evaluate, beyond.linearize):
+        with pytest.raises(InputError, match=text):
+            call(np.ones((5, 3)))
+    problem = Problem()
+    x = problem.add_variables(Euclidean(3), np.ones((5, 3)))
+    problem.add_residuals(beyond, x)
+    with pytest.raises(InputError, match=text):
+        problem.solve()
+
+
+def test_an_index_beyond_an_array_in_the_jacobian_is_refused() -> None:
+    def first(x):
+        return x[0]
+
+    def jacobian(x, J):
+        J[0, 5] = 1.0
+
+    residual = UserResidual(first, dim=1, manifolds=(Euclidean(3),), jacobian=jacobian, count=2)
+    assert (residual.evaluate(np.ones(3)) == 1.0).all()
+    with pytest.raises(InputError, match="in residual 0 of 2, whose arguments are x"):
+        residual.linearize(np.ones(3))
+
+
+@pytest.mark.parametrize("by", ["itself", "a helper", "a helper of a helper"])
+def test_an_index_that_leaves_an_array_while_solving_is_refused(by: str) -> None:
+    """The index depends on the variable: within the table at the start, beyond it after a step."""
+
+    @numba.njit
+    def twice_removed(table, at):
+        return _looked_up(table, at)
+
+    look_up = {"itself": None, "a helper": _looked_up, "a helper of a helper": twice_removed}[by]
+    if look_up is None:
+
+        def residual(x):
+            return TABLE[int(x[0])] + x[0] - 60.0
+
+    else:
+
+        def residual(x):
+            return look_up(TABLE, int(x[0])) + x[0] - 60.0
+
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[1.5]])
+    problem.add_residuals(UserResidual(residual, dim=1, manifolds=(Euclidean(1),), count=1), x)
+    with pytest.raises(
+        InputError, match="indices within the arrays that residual uses – got one beyond the end, in residual 0 of 1"
+    ):
+        problem.solve()
+
+
+def test_a_function_compiled_by_its_user_is_checked_as_well() -> None:
+    @numba.njit
+    def fifth(x):
+        return x[5]
+
+    with pytest.raises(InputError, match="indices within the arrays that fifth uses"):
+        UserResidual(fifth, dim=1, manifolds=(Euclidean(3),), count=1).evaluate(np.ones(3))
