@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
+from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.elimination import choose_system
@@ -29,14 +30,17 @@ from boxplus.sparse.cholesky import NotPositiveDefinite
 class Problem:
     """Minimises ½ Σ ρ(‖W r(x)‖²) over variables on manifolds.
 
-    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed.
+    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. One thread at a
+    time may use a problem, its solving included; a second one is refused (InputError).
     """
 
     def __init__(self) -> None:
+        self._guard = ThreadGuard("Problem")
         self.blocks: list[Variables] = []
         self.groups: list[Group] = []
         self._analysed: tuple[tuple[Any, ...], LeastSquares, tuple[str, ...]] | None = None
 
+    @changes
     def add_variables(self, manifold: Manifold, values: ArrayLike, *, name: str | None = None) -> Variables:
         """A block of n variables.
 
@@ -55,6 +59,7 @@ class Problem:
         self._analysed = None
         return self.blocks[-1]
 
+    @changes
     def add_residuals(
         self, residual: Residual, *connections: VariableRows | Variables, loss: Loss | None = None, name: str | None = None
     ) -> Group:
@@ -86,10 +91,12 @@ class Problem:
         self._analysed = None
         return self.groups[-1]
 
+    @changes
     def fix(self, selected: VariableRows | Variables) -> None:
         """Hold variables at their values: known quantities, or the gauge."""
         self._set_fixed(selected, True)
 
+    @changes
     def free(self, selected: VariableRows | Variables) -> None:
         """Let fixed variables move again."""
         self._set_fixed(selected, False)
@@ -108,6 +115,7 @@ class Problem:
             what = f"{rows.block!r} of another one" if isinstance(rows, VariableRows) else f"{rows!r}"
             raise InputError("variables of this problem", what, "use a block that `add_variables` returned, or rows of it")
 
+    @changes
     def cost(self, values: Solution | Sequence[NDArray[np.float64]] | None = None) -> float:
         """½ Σ ρ(‖W r‖²) at `values`, by default the variables' own."""
         at = self.values_at(values)
@@ -117,6 +125,7 @@ class Problem:
         """What is wrong with the structure, a sentence each: variables without residuals, components without gauge."""
         return structural_defects(self.blocks, self.groups)
 
+    @changes
     def solve(
         self,
         options: SolverOptions | None = None,

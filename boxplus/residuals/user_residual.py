@@ -111,12 +111,11 @@ class UserResidual(Residual):
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         if self._loops is not None and self._loops.linearize is not None:
-            extra: tuple[NDArray[Any], ...] = ()
+            extra: tuple[Any, ...] = ()
             if self.jacobian is None and self._tables is not None:
                 self.evaluate_into(begin, end, x, index, r, valid)  # with bounds checked, which the differences are not
                 extra = (*self._tables, *self._steps)
-            rows = (*x, *index, *self.data, *extra)
-            self._run(self._loops.linearize, begin, end, rows, (r, *jacobians, valid))
+            self._run(self._loops.linearize, begin, end, (*x, *index, *self.data, *extra), (r, *jacobians, valid))
             return
         self.evaluate_into(begin, end, x, index, r, valid)
         if self.jacobian is None:

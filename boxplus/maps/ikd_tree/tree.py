@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import run_chunks
+from boxplus._thread_guard import ThreadGuard, changes, reads
 from boxplus.errors import InputError
 from boxplus.maps.ikd_tree.batch import fill_operations, keep_near, update_batch
 from boxplus.maps.ikd_tree.check import check_tree
@@ -72,7 +73,7 @@ class IkdTree:
     Raises:
         InputError: a parameter is out of range.
 
-    Searches may run on several threads at once, but not together with an update. Source: SPEC section 10.
+    Searches may run on several threads at once; an update together with anything else is refused (InputError).
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class IkdTree:
             raise InputError("cell_size above 0 m", str(cell_size), "give the side of a downsampling cell in metres")
         if threads < 1:
             raise InputError("threads of at least 1", str(threads), "take 1")
+        self._guard = ThreadGuard("IkdTree")
         self.cell_size = cell_size
         self.threads = threads
         self.origin: NDArray[np.float64] = np.zeros(3)
@@ -111,8 +113,7 @@ class IkdTree:
         if points is not None:
             self.build(points)
 
-    # ------------------------------------------------------------------------------------------------------- updates
-
+    @changes
     def build(self, points: ArrayLike) -> InsertReport:
         """Replace all contents by `points`, (N, 3) [m], in a balanced tree; no downsampling.
 
@@ -130,6 +131,7 @@ class IkdTree:
         self._revivable = 0
         return InsertReport(len(relative), 0, not_finite, too_far)
 
+    @changes
     def insert(self, points: ArrayLike, *, downsample: bool = False) -> InsertReport:
         """Add points, (N, 3) [m], one after the other.
 
@@ -148,6 +150,7 @@ class IkdTree:
         inserted = self._update(operations)
         return InsertReport(inserted, len(relative) - inserted, not_finite, too_far)
 
+    @changes
     def delete_points(self, points: ArrayLike) -> int:
         """Delete the live points within 1e-6 m on each axis of any of `points`, (N, 3) [m]; returns how many there were.
 
@@ -159,6 +162,7 @@ class IkdTree:
         low, high = round_up(centers - DELETE_TOLERANCE), round_up(np.nextafter(centers + DELETE_TOLERANCE, np.inf))
         return self._delete(np.concatenate([low, high], axis=1))
 
+    @changes
     def delete_box(self, lo: ArrayLike, hi: ArrayLike) -> int:
         """Delete the points with `lo ≤ p < hi` on every axis, (3,) each [m]; returns how many live ones there were.
 
@@ -167,6 +171,7 @@ class IkdTree:
         """
         return self._delete(self._relative_box(lo, hi))
 
+    @changes
     def reinsert_box(self, lo: ArrayLike, hi: ArrayLike) -> int:
         """Revive the deleted points with `lo ≤ p < hi` on every axis, (3,) each [m]; returns how many there were.
 
@@ -182,8 +187,7 @@ class IkdTree:
         self._revivable -= revived
         return revived
 
-    # ------------------------------------------------------------------------------------------------------- searches
-
+    @reads
     def nearest(self, queries: ArrayLike, k: int, *, max_distance: float = np.inf) -> Neighbors:
         """The k nearest live points of each query within `max_distance` (inclusive).
 
@@ -216,6 +220,7 @@ class IkdTree:
         run_chunks(work, size, _QUERY_CHUNK, self.threads)
         return result
 
+    @reads
     def radius_search(self, center: ArrayLike, radius: float) -> NDArray[np.float64]:
         """The live points within `radius` [m] of `center` (3,) [m], inclusive: (K, 3), ordered by x, y, z.
 
@@ -230,6 +235,7 @@ class IkdTree:
         box = np.concatenate([middle - margin, middle + margin]).astype(np.float32)
         return self._collect(box, x, y, z, round_down(radius**2))
 
+    @reads
     def box_search(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float64]:
         """The live points with `lo ≤ p < hi` on every axis, (3,) each [m]: (K, 3), ordered by x, y, z.
 
@@ -275,8 +281,6 @@ class IkdTree:
         pending = self._rebuilder.running or self._job["queued"] > 0
         balance = 1.0 if pending else float(self._job["balance"])
         return check_tree(self._pool, len(self), balance=balance, smallest=int(self._job["check"])).height
-
-    # ------------------------------------------------------------------------------------------------- life and rebuild
 
     def close(self) -> None:
         """End the background thread; the tree can still be used, and then rebuilds in the calling thread."""
@@ -362,8 +366,6 @@ class IkdTree:
         if self._rebuilder.running:
             self._rebuilder.complete(self._pool)
             self._pool = self._rebuilder.swap(self._pool)
-
-    # ------------------------------------------------------------------------------------------------------ coordinates
 
     def _to_relative(self, world: NDArray[np.float64]) -> tuple[NDArray[np.float32], int, int]:
         """(N, 3) float32 relative to the origin, and how many points were not finite or too far."""
