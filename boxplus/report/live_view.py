@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
+import time
 from collections import deque
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +23,21 @@ _MOST_POINTS = 20_000
 _MAP_SCANS = 600
 """Scans that stay visible; older ones are replaced, so that the viewer's memory stays bounded."""
 _SMALLEST_STEP_M = 0.02
+_LOOPBACK = "127.0.0.1"
+_LONGEST_WAIT_S = 20.0
 
 
 class LiveView:
     """Opens the viewer and shows every estimate it is given.
+
+    The viewer listens on the loopback interface only: nobody on the network can look at the run or send to it.
 
     Args:
         title: name of the recording.
         spawn: open a viewer; False only prepares the recording stream (tests, or a viewer that is connected elsewhere).
 
     Raises:
-        InputError: rerun-sdk is not installed.
+        InputError: rerun-sdk is not installed, or its viewer does not open.
     """
 
     def __init__(self, title: str, *, spawn: bool = True) -> None:
@@ -38,7 +48,9 @@ class LiveView:
                 "rerun-sdk for the live view", "an installation without it", "install it: pip install 'boxplus[view]'"
             ) from error
         self._rerun = rerun
-        rerun.init(f"boxplus {title}", spawn=spawn)
+        rerun.init(f"boxplus {title}")
+        if spawn:
+            rerun.connect_grpc(f"rerun+http://{_LOOPBACK}:{_open_viewer()}/proxy")
         rerun.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._path: deque[NDArray[np.float64]] = deque(maxlen=20_000)
         self._count = 0
@@ -61,3 +73,26 @@ class LiveView:
             rerun.log(f"lidar_share/{axis.replace(' ', '_')}", rerun.Scalars(float(share)))
         rerun.log("points_used", rerun.Scalars(float(estimate.points_used)))
         self._count += 1
+
+
+def _open_viewer() -> int:
+    """Start a viewer, which outlives this process; returns its port. Started by rerun itself it would listen to every network."""
+    with socket.socket() as free:
+        free.bind((_LOOPBACK, 0))
+        port = int(free.getsockname()[1])
+    viewer = subprocess.Popen(
+        [sys.executable, "-m", "rerun", f"--bind={_LOOPBACK}", f"--port={port}", "--expect-data-soon"],
+        env={**os.environ, "RERUN_APP_ONLY": "true"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    until = time.monotonic() + _LONGEST_WAIT_S
+    while viewer.poll() is None and time.monotonic() < until:
+        with suppress(OSError), socket.create_connection((_LOOPBACK, port), timeout=1.0):
+            return port
+        time.sleep(0.05)
+    got = "none in 20 s" if viewer.poll() is None else f"a process that ended with code {viewer.returncode}"
+    viewer.terminate()
+    raise InputError("the viewer of rerun in a window", got, "run without the live view, or try 'python -m rerun' by itself")
