@@ -1,29 +1,43 @@
 """Graduated non-convexity: outliers are told from inliers without a good start (Yang, Antonante, Tzoumas and Carlone, RA-L 2020).
 
-The loss of Geman and McClure is first made so wide that the cost is almost least squares, ρ_μ = μ c² s/(μ c² + s) with μ ≫ 1, and
-then narrowed step by step to μ = 1, each minimum being the start of the next. ρ_μ is the same loss with the scale √μ c.
+The residuals get fixed weights, the weighted least-squares problem is solved, and its residuals give the next weights, for a loss
+that begins almost convex and becomes the one that is meant, width by width. With r in standard deviations and the threshold c,
+
+    truncated:       w = [c √(μ(μ+1))/‖r‖ − μ] clipped to 0 … 1,  μ from c²/(2 r²_max − c²) upwards    (eqs. 13, 14)
+    Geman-McClure:   w = (μ c²/(r² + μ c²))²,                     μ from 2 r²_max/c² downwards to 1    (eqs. 11, 12)
+
+Every width is solved from the start that was given, so that a minimum in which false residuals have folded everything is left
+behind with the weights that made it. Where the last minimum is lower under the new weights, for want of a good start, it is taken
+up again instead.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.optimization.group import Group
-from boxplus.optimization.losses import GemanMcClure, Squared
+from boxplus.optimization.inlier_report import InlierReport, inlier_report
+from boxplus.optimization.losses import GemanMcClure, Squared, Truncated
+from boxplus.optimization.minimize import Callback
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 
+GraduatedLoss = Literal["geman_mcclure", "truncated"]
+
 _PROBABILITY = 0.99  # of an inlier to lie within the threshold, where none is given
-_STEPS = 10  # tried at each width but the last; the minimum of a width is only the start of the next
-_TOLERANCE = 1e-4  # relative decrease of the cost at which the next width begins
+_STEPS = 10  # tried at each width but the last; the minimum of a width only gives the next weights
+_TOLERANCE = 1e-3  # relative decrease of the cost at which the next width begins
+_WIDTHS = 200  # at most; with a narrowing of 1.4, for residuals of 1e14 thresholds
+_DECIDED = 1e-3  # weights this near 0 or 1 are decided
+_LOWER = 1.0 - 1e-3  # of the cost reached: below it the last minimum is taken up again
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +45,16 @@ class Level:
     """One width of the loss.
 
     Attributes:
-        mu: width; the scale of the loss is √μ times the threshold.
-        cost: at its end, under this loss.
+        mu: width; see the formulas above.
+        cost: at its end, with the weights of this width.
         inliers: residuals within the threshold then, all groups together.
+        undecided: residuals whose weight was neither 0 nor 1.
     """
 
     mu: float
     cost: float
     inliers: int
+    undecided: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +67,7 @@ class GraduatedSolution:
         inliers: (N,) bool for each, residuals within the threshold.
         thresholds: for each, the length of a whitened residual that counts as an inlier at most.
         levels: the widths, from the widest on.
+        reports: for each, how clear the decision was.
     """
 
     solution: Solution
@@ -58,32 +75,45 @@ class GraduatedSolution:
     inliers: dict[str, NDArray[np.bool_]]
     thresholds: dict[str, float]
     levels: tuple[Level, ...]
+    reports: dict[str, InlierReport]
 
 
 def graduate(
     problem: Problem,
     groups: Group | Sequence[Group],
     *,
+    loss: GraduatedLoss = "geman_mcclure",
     inlier_threshold: float | None = None,
+    weights: Mapping[str, ArrayLike] | None = None,
     narrowing: float = 1.4,
     options: SolverOptions | None = None,
     start: Solution | Sequence[NDArray[np.float64]] | None = None,
+    callback: Callback | None = None,
     **settings: Any,
 ) -> GraduatedSolution:
     """Minimise with outliers among the residuals of some groups.
 
-    The groups keep the loss of the last width, `GemanMcClure(threshold)`: later costs and covariances are those of the solution.
+    The groups keep the narrowest loss, `GemanMcClure(threshold)` or `Truncated(threshold)`: later costs and covariances are those
+    of the solution.
 
     Args:
-        groups: those that may hold outliers; the others keep their losses.
+        groups: those that may hold outliers; the others keep their losses. What is never an outlier, such as the odometry among
+            the edges of a graph, belongs into a group of its own that is not given here.
+        loss: what the weights come from; `truncated` takes a residual whole or not at all in the end.
         inlier_threshold: largest length of an inlier's whitened residual, in standard deviations; by default such that 99 % of
             inliers lie within, √(χ²(dim) at 0.99), which trusts the sigmas that were given.
+        weights: for groups by name, (N,) from 0 to 1, of the first minimum; ones where left out. What is known to be hopeless at
+            the start may begin with zero; it is taken up again if it turns out to fit.
         narrowing: factor between one width and the next, above 1; 1.4 in the paper. Nearer to 1 is slower and safer.
         options, settings, start: as for `Problem.solve`; the options hold for the last width, those before end early.
+        callback: called with every `Iteration` of every width; returns True to stop.
 
     Raises:
-        InputError: no group, a group of another problem, a threshold that is not positive, a narrowing that does not narrow;
-            and what `Problem.solve` raises.
+        InputError: no group, a group of another problem, a threshold that is not positive, a narrowing that does not narrow,
+            weights of another length or group; and what `Problem.solve` raises.
+
+    Example:
+        `graduate(problem, loops, loss="truncated").inliers["loops"]`
     """
     chosen = [groups] if isinstance(groups, Group) else list(groups)
     if not chosen or not all(any(group is own for own in problem.groups) for group in chosen):
@@ -92,34 +122,108 @@ def graduate(
         raise InputError("a narrowing above 1", f"{narrowing}", "leave it at 1.4")
     if options is not None and settings:
         raise InputError("options or single settings", "both", "put the settings into the options")
-    thresholds = {group.name: _threshold(group, inlier_threshold) for group in chosen}
+    if loss not in ("geman_mcclure", "truncated"):
+        raise InputError("the loss geman_mcclure or truncated", repr(loss), "choose one of them")
     last = options if options is not None else SolverOptions(**settings)
-    early = last.model_copy(
-        update={"max_iterations": min(_STEPS, last.max_iterations), "cost_tolerance": max(_TOLERANCE, last.cost_tolerance)}
-    )
-    for group in chosen:
-        group.set_loss(Squared())
-    solution = problem.solve(early, start=start)
-    squares = _squares(chosen, solution)
-    ratios = np.concatenate([squares[group.name] / thresholds[group.name] ** 2 for group in chosen])
-    mu = max(2.0 * float(ratios[np.isfinite(ratios)].max(initial=0.0)), 1.0)
-    levels = []
-    while True:
+    first = _first_weights(chosen, weights)
+    widths = _Widths(problem, chosen, inlier_threshold, last, problem.values_at(start), callback)
+    try:
+        levels = widths.narrow(loss, first, narrowing)
+    finally:
         for group in chosen:
-            group.set_loss(GemanMcClure(math.sqrt(mu) * thresholds[group.name]))
-        solution = problem.solve(last if mu == 1.0 else early, start=solution)
-        squares = _squares(chosen, solution)
-        within = sum(int((squares[g.name] <= thresholds[g.name] ** 2).sum()) for g in chosen)
-        levels.append(Level(mu, solution.cost, within))
-        if mu == 1.0:
-            break
-        mu = max(mu / narrowing, 1.0)
-    weights, inliers = {}, {}
+            problem.set_weights(group, None)
+    make = Truncated if loss == "truncated" else GemanMcClure
     for group in chosen:
-        s, c2 = squares[group.name], thresholds[group.name] ** 2
-        weights[group.name] = np.where(np.isfinite(s), (c2 / (c2 + s)) ** 2, 0.0)
-        inliers[group.name] = s <= c2
-    return GraduatedSolution(solution, weights, inliers, thresholds, tuple(levels))
+        group.set_loss(make(widths.thresholds[group.name]))
+    final = last.model_copy(update={"max_iterations": 0}) if widths.is_stopped else last
+    solution = problem.solve(final, start=widths.solution, callback=callback)
+    squares = {group.name: group.squares(solution.values) for group in chosen}
+    return GraduatedSolution(
+        solution,
+        {group.name: group.loss_weights(solution.values) for group in chosen},
+        {name: s <= widths.thresholds[name] ** 2 for name, s in squares.items()},
+        widths.thresholds,
+        tuple(levels),
+        {g.name: inlier_report(squares[g.name], g.residual.dim, widths.thresholds[g.name]) for g in chosen},
+    )
+
+
+class _Widths:
+    """Solves the weighted problems of one graduation; residuals of all its groups stand one after the other."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        groups: list[Group],
+        threshold: float | None,
+        options: SolverOptions,
+        start: list[NDArray[np.float64]],
+        callback: Callback | None,
+    ) -> None:
+        self.thresholds = {group.name: _threshold(group, threshold) for group in groups}
+        self.solution: Solution | None = None
+        self.is_stopped = False
+        self._problem, self._groups, self._start, self._callback = problem, groups, start, callback
+        self._ends = np.cumsum([group.residual.count for group in groups])[:-1]
+        limits = {
+            "max_iterations": min(_STEPS, options.max_iterations),
+            "cost_tolerance": max(_TOLERANCE, options.cost_tolerance),
+        }
+        self._early = options.model_copy(update=limits)
+
+    def narrow(self, loss: GraduatedLoss, first: NDArray[np.float64], narrowing: float) -> list[Level]:
+        """Width after width until all weights are decided (truncated), or the loss is that which is meant (Geman-McClure)."""
+        truncated = loss == "truncated"
+        for group in self._groups:
+            group.set_loss(Squared())
+        ratios, cost = self._solve(first)
+        worst = float(ratios[np.isfinite(ratios)].max(initial=0.0))
+        if truncated and worst <= 1.0:
+            return []  # no outlier to look for
+        mu = 1.0 / (2.0 * worst - 1.0) if truncated else max(2.0 * worst, 1.0)
+        levels: list[Level] = []
+        while len(levels) < _WIDTHS and not self.is_stopped:
+            if truncated:
+                with np.errstate(divide="ignore"):
+                    weights = np.clip(math.sqrt(mu * (mu + 1.0)) / np.sqrt(ratios) - mu, 0.0, 1.0)
+            else:
+                weights = (mu / (mu + ratios)) ** 2
+            ratios, cost = self._solve(weights)
+            undecided = int(np.count_nonzero((weights > _DECIDED) & (weights < 1.0 - _DECIDED)))
+            levels.append(Level(mu, cost, int(np.count_nonzero(ratios <= 1.0)), undecided))
+            if undecided == 0 if truncated else mu == 1.0:
+                break
+            mu = mu * narrowing if truncated else max(mu / narrowing, 1.0)
+        return levels
+
+    def _solve(self, weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """‖W r‖²/c² (N,) of all residuals at the minimum with these weights, and its cost."""
+        for group, own in zip(self._groups, np.split(weights, self._ends), strict=True):
+            self._problem.set_weights(group, own)
+        found = self._problem.solve(self._early, start=self._start, callback=self._watch)
+        if self.solution is not None and not self.is_stopped and self._problem.cost(self.solution) < _LOWER * found.cost:
+            again = self._problem.solve(self._early, start=self.solution, callback=self._watch)
+            found = again if again.cost < found.cost else found
+        self.solution = found
+        return np.concatenate([g.squares(found.values) / self.thresholds[g.name] ** 2 for g in self._groups]), found.cost
+
+    def _watch(self, iteration: Iteration) -> bool:
+        self.is_stopped = self.is_stopped or (self._callback is not None and bool(self._callback(iteration)))
+        return self.is_stopped
+
+
+def _first_weights(groups: list[Group], given: Mapping[str, ArrayLike] | None) -> NDArray[np.float64]:
+    given = given if given is not None else {}
+    foreign = set(given) - {group.name for group in groups}
+    if foreign:
+        raise InputError("weights of graduated groups", f"{sorted(foreign)}", "name groups that are graduated")
+    parts = []
+    for group in groups:
+        own = np.asarray(given.get(group.name, np.ones(group.residual.count)), dtype=np.float64)
+        if own.shape != (group.residual.count,) or not ((own >= 0.0) & (own <= 1.0)).all():
+            raise InputError(f"weights ({group.residual.count},) from 0 to 1 of {group.name}", f"shape {own.shape}", "scale them")
+        parts.append(own)
+    return np.concatenate(parts)
 
 
 def _threshold(group: Group, given: float | None) -> float:
@@ -130,15 +234,3 @@ def _threshold(group: Group, given: float | None) -> float:
     if not (math.isfinite(given) and given > 0.0):
         raise InputError("a positive inlier threshold", f"{given}", "give it in standard deviations of the residual, such as 3.0")
     return float(given)
-
-
-def _squares(groups: Sequence[Group], at: Solution) -> dict[str, NDArray[np.float64]]:
-    """‖W r‖² (N,) of every group, infinite where a residual cannot be evaluated."""
-    found = {}
-    for group in groups:
-        loss = group.loss
-        group.set_loss(Squared())
-        group.evaluate(at.values, 1)
-        found[group.name] = np.where(group.valid, (group.r**2).sum(axis=1), np.inf)
-        group.set_loss(loss)
-    return found

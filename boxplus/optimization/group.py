@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
 from boxplus.manifolds.tangent_change import tangent_change
-from boxplus.optimization.losses import SQUARED, Loss
+from boxplus.optimization.losses import SQUARED, Loss, Squared
 from boxplus.optimization.variables import VariableRows
 from boxplus.optimization.weighting import (
     first_not_finite,
@@ -53,6 +53,7 @@ class Group:
         residual, name: as given to `Problem.add_residuals`.
         loss: as given there, or to `set_loss` since.
         connections: one `VariableRows` of length N for each connected variable.
+        left_out: (N,) residuals of weight zero that the structure of the problem leaves out; None for none.
         r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,).
     """
 
@@ -70,6 +71,8 @@ class Group:
         whitening = residual.whitening
         self._is_white = bool(len(whitening.factors) == 1 and np.array_equal(whitening.factors[0], np.eye(residual.dim)))
         self.set_loss(loss)
+        self.left_out: NDArray[np.bool_] | None = None
+        self._root: NDArray[np.float64] | None = None
         self._sums = np.zeros((-(-residual.count // _CHUNK), 4))
 
     def __repr__(self) -> str:
@@ -80,6 +83,33 @@ class Group:
         self.loss = loss
         scaled = self.residual.count if loss.code != SQUARED else 0
         self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
+
+    def set_weights(self, weights: NDArray[np.float64] | None) -> None:
+        """Count ‖W r‖² (N,) times from the next linearisation on, whatever the loss; None for once. See `Problem.set_weights`."""
+        self._root = None if weights is None else np.sqrt(weights)
+
+    def loss_weights(self, values: Sequence[NDArray[np.float64]], threads: int = 1) -> NDArray[np.float64]:
+        """(N,) weights ρ′ of the loss at the point `values`, 1 for least squares; 0 where a residual cannot be evaluated.
+
+        Overwrites `r` and `valid`, as `evaluate` does.
+        """
+        self.evaluate(values, threads)
+        return self._factor**2 if self.loss.code != SQUARED else self.valid.astype(np.float64)
+
+    def squares(self, values: Sequence[NDArray[np.float64]], threads: int = 1) -> NDArray[np.float64]:
+        """(N,) ‖W r‖² at the point `values`, whatever loss and weights; infinite where a residual cannot be evaluated.
+
+        Overwrites `r` and `valid`, as `evaluate` does.
+        """
+        loss, root = self.loss, self._root
+        self.set_loss(Squared())
+        self._root = None
+        try:
+            self.evaluate(values, threads)
+            return np.where(self.valid, (self.r * self.r).sum(axis=1), np.inf)
+        finally:
+            self._root = root
+            self.set_loss(loss)
 
     def linearize(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
         """Fill `r`, `jacobians` and `valid` at the point `values` (one array a block of the problem)."""
@@ -104,6 +134,8 @@ class Group:
                 residual.evaluate_into(begin, end, x, self._index, self.r, self.valid)
             if not self._is_white:
                 whiten_residuals(begin, end, factors, diagonal, self.r)
+            if self._root is not None:
+                self.r[begin:end] *= self._root[begin:end, None]
             weigh_residuals(
                 begin, end, self.loss.code, self.loss.scale, self.r, self.valid, self.counted,
                 self._factor, self._projection, self._sums[chunk],
@@ -116,6 +148,8 @@ class Group:
                     change(begin, end, x[slot], self._index[slot], J)
                 if not self._is_white:
                     whiten_jacobian(begin, end, factors, diagonal, J)
+                if self._root is not None:
+                    J[begin:end] *= self._root[begin:end, None, None]
                 if self.loss.code != SQUARED:
                     weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
 

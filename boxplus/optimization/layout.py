@@ -82,5 +82,8 @@ class Layout:
 
 
 def connected_numbers(layout: Layout, group: Group) -> list[NDArray[np.int64]]:
-    """For every connection of a group, the numbers of its variables, −1 where fixed."""
-    return [layout.numbers(connection) for connection in group.connections]
+    """For every connection of a group, the numbers of its variables, −1 where fixed or where the residual is left out."""
+    numbers = [layout.numbers(connection) for connection in group.connections]
+    if group.left_out is not None:
+        numbers = [np.where(group.left_out, -1, number) for number in numbers]
+    return numbers

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from boxplus._jit import kernel
 from boxplus.errors import InputError
 
-SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH = 0, 1, 2, 3, 4, 5
+SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH, TRUNCATED = 0, 1, 2, 3, 4, 5, 6
 # Share of ρ′ that must be left along the residual for its second-order term to be used. It matters little: over pose graphs and
 # bundle adjustments with 0 to 20 % outliers and all losses below, 0.5 took 0 to 10 % fewer iterations than reweighted least
 # squares alone in most cases. 0.1 saved a quarter in one (Cauchy at half a standard deviation), but its steps were often too
@@ -34,6 +34,11 @@ class Loss:
 
     def __repr__(self) -> str:
         return self.name if self.code == SQUARED else f"{self.name}({self.scale:g})"
+
+    @property
+    def is_redescending(self) -> bool:
+        """Whether a residual pulls the less the larger it is, far out: the cost then has minima that depend on the start."""
+        return self.code not in (SQUARED, HUBER)
 
     def with_scale(self, scale: float) -> Loss:
         """The same loss with another scale."""
@@ -78,6 +83,11 @@ def Welsch(scale: float) -> Loss:
     return _loss(WELSCH, scale, "Welsch")
 
 
+def Truncated(scale: float) -> Loss:
+    """ρ = s up to c², then c²: least squares over the residuals within c, where the others cost as much as the last of these."""
+    return _loss(TRUNCATED, scale, "Truncated")
+
+
 @kernel(inline=True)
 def loss_at(code: int, scale: float, s: float) -> tuple[float, float, float]:
     """ρ(s), ρ′(s), ρ″(s)."""
@@ -101,6 +111,8 @@ def loss_at(code: int, scale: float, s: float) -> tuple[float, float, float]:
     if code == WELSCH:
         w = math.exp(-s / c2)
         return -c2 * math.expm1(-s / c2), w, -w / c2
+    if code == TRUNCATED:
+        return (s, 1.0, 0.0) if s <= c2 else (c2, 0.0, 0.0)
     return s, 1.0, 0.0
 
 

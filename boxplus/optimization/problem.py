@@ -14,6 +14,7 @@ from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.elimination import choose_system
+from boxplus.optimization.faded import faded_notes, faded_shares
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.least_squares import LeastSquares
@@ -25,6 +26,9 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import VariableRows, Variables
 from boxplus.residuals.residual import Residual
 from boxplus.sparse.cholesky import NotPositiveDefinite
+
+# Share of a group that may have lost its weight before the problem is analysed anew without it.
+_STALE = 0.05
 
 
 class Problem:
@@ -101,6 +105,34 @@ class Problem:
         """Let fixed variables move again."""
         self._set_fixed(selected, False)
 
+    def set_weights(self, group: Group, weights: ArrayLike | None) -> None:
+        """Let every residual of a group count `weights` times: ½ Σ ρ(w ‖W r‖²), until other weights are set.
+
+        Args:
+            weights: (N,) not negative; None for one each. Residuals of weight zero leave the structure of the problem when they
+                are many, so that they cost neither memory nor time.
+
+        Raises:
+            InputError: a group of another problem, weights of another shape, negative or not finite.
+        """
+        if not any(group is own for own in self.groups):
+            raise InputError("a group of this problem", f"{group!r}", "give what `add_residuals` returned")
+        if weights is None:
+            group.set_weights(None)
+            none = np.zeros(group.residual.count, dtype=np.bool_)
+        else:
+            checked = np.asarray(weights, dtype=np.float64)
+            if checked.shape != (group.residual.count,) or not (np.isfinite(checked) & (checked >= 0.0)).all():
+                expected = f"weights ({group.residual.count},), finite and not negative"
+                raise InputError(expected, f"shape {checked.shape}, smallest {checked.min(initial=np.inf):g}", "repair them")
+            group.set_weights(checked)
+            none = checked == 0.0
+        before = group.left_out if group.left_out is not None else np.zeros_like(none)
+        fresh, counted = int(np.count_nonzero(none & ~before)), int(np.count_nonzero(~before))
+        if (before & ~none).any() or fresh > _STALE * counted:
+            group.left_out = none if none.any() else None
+            self._analysed = None
+
     def _set_fixed(self, selected: VariableRows | Variables, fixed: bool) -> None:
         rows = selected[:] if isinstance(selected, Variables) else selected
         self._require_own(rows)
@@ -161,6 +193,7 @@ class Problem:
             status, reason, history = minimize(model, strategy, options, callback, begin)
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(model, error)) from error
+        faded = faded_shares(self.groups, model.values)
         return Solution(
             status=status,
             reason=reason,
@@ -171,7 +204,8 @@ class Problem:
             method=strategy.name,
             linear_solver=model.system.description,
             invalid={group.name: int((~group.counted).sum()) for group in self.groups},
-            notes=notes,
+            faded=faded,
+            notes=(*notes, *faded_notes(self.groups, faded)),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )

@@ -51,7 +51,8 @@ class Solution:
         history: every step tried.
         method, linear_solver: what was used, and why.
         invalid: for every group the number of residuals that could not be evaluated at the end, such as points behind a camera.
-        notes: what a user should know (assumptions, fixed gauge).
+        faded: for every group with a robust loss the share of its residuals whose weight ρ′ is below 0.1 at the end.
+        notes: what a user should know (assumptions, fixed gauge, residuals that hardly count).
         timing_s: seconds by stage: analysis, residuals and Jacobians, normal equations, linear solve, total.
     """
 
@@ -64,6 +65,7 @@ class Solution:
     method: str
     linear_solver: str
     invalid: dict[str, int]
+    faded: dict[str, float]
     notes: tuple[str, ...]
     timing_s: dict[str, float]
     _problem: LeastSquares = field(repr=False)

@@ -3,7 +3,8 @@
 The robot goes straight for a block, then turns by a right angle or not, and stays within a box so small that it comes by every
 place several times. Odometry joins successive poses; loop closures join poses that are near each other and not in time. False
 ones are what a front end brings that is deceived: `random` ones alone, each between any two places, or `clustered` ones, which
-claim for a stretch of the walk that it is another and agree with each other (perceptual aliasing: Sünderhauf and Protzel, IROS 2012).
+claim for a stretch of the walk that it is another and agree with each other (perceptual aliasing: Sünderhauf and Protzel, IROS
+2012).
 """
 
 from __future__ import annotations
@@ -118,9 +119,7 @@ def simulate_pose_graph(config: GraphSimulationConfig | None = None, **settings:
 def without_false_loops(simulated: SimulatedPoseGraph) -> PoseGraph:
     """The same graph as a front end that is never deceived would have made it."""
     graph, kept = simulated.graph, ~simulated.is_false
-    return replace(
-        graph, edges=graph.edges[kept], measurements=graph.measurements[kept], information=graph.information[kept]
-    )
+    return replace(graph, edges=graph.edges[kept], measurements=graph.measurements[kept], information=graph.information[kept])
 
 
 def _lattice_walk(config: GraphSimulationConfig, random: np.random.Generator) -> NDArray[np.float64]:
@@ -185,7 +184,9 @@ def _false_loops(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(count, 2) pairs of poses and the relative poses that are claimed of them, without noise."""
     manifold, group = (SE3, se3) if config.dimension == 3 else (SE2, se2)
-    n, pairs, claimed = len(truth), [], []
+    n = len(truth)
+    pairs: list[NDArray[np.int64]] = []
+    claimed: list[NDArray[np.float64]] = []
     alone = {"random": count, "clustered": 0, "mixed": count // 2}[config.false_kind]
     while len(pairs) < count:
         length = 1 if len(pairs) < alone else min(config.cluster, count - len(pairs), n - _LEAST_GAP)

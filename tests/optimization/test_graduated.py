@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus import SE3, SO3, Euclidean, InputError, Problem, SingularProblemError, losses
+from boxplus import SE2, SE3, SO3, Euclidean, InputError, Problem, SingularProblemError, losses
 from boxplus.manifolds import se3
 from boxplus.optimization.graduated import graduate
-from boxplus.residuals import PointToPoint, Prior, RelativePose, UserResidual
+from boxplus.optimization.inlier_report import inlier_report
+from boxplus.residuals import PointToPoint, Prior, RelativePose, RelativePose2D, UserResidual
+from boxplus.simulation.pose_graphs import simulate_pose_graph
 
 SIGMA = {"odometry": np.array([0.03] * 3 + [0.05] * 3), "closures": np.array([0.01] * 3 + [0.03] * 3)}
 
@@ -157,3 +159,53 @@ def test_wrong_use_is_refused():
     ):
         with pytest.raises(InputError, match=message):
             graduate(problem, wrong, **settings)
+
+
+@pytest.mark.parametrize("loss", ["truncated", "geman_mcclure"])
+def test_every_width_begins_at_the_start_and_tells_true_loops_from_false(loss):
+    """From the minimum of the width before, both end in a folded map."""
+    simulated = simulate_pose_graph(poses=400, seed=3, false_share=0.5, false_kind="mixed")
+    problem, graph = Problem(), simulated.graph
+    poses = problem.add_variables(SE2, graph.poses, name="poses")
+    for name, rows in (("odometry", ~simulated.is_loop), ("loops", simulated.is_loop)):
+        i, j = graph.edges[rows].T
+        residual = RelativePose2D(graph.measurements[rows], information=graph.information[rows])
+        problem.add_residuals(residual, poses[i], poses[j], name=name)
+    problem.fix(poses[0])
+    found = graduate(problem, problem.groups[1], loss=loss, inlier_threshold=4.5)
+    right = ~simulated.is_false[simulated.is_loop]
+    np.testing.assert_array_equal(found.inliers["loops"], right)
+    report = found.reports["loops"]
+    assert (report.kept, report.refused) == (right.sum(), (~right).sum()) and report.close == 0
+    assert 0.3 < report.mean_square < 1.0 and report.purity > 0.95
+    assert f"{right.sum()} of 400 loops kept" in report.sentence("loops")
+    np.testing.assert_allclose(report.innovations**2, problem.groups[1].squares(found.solution.values))
+    if loss == "truncated":
+        np.testing.assert_array_equal(found.weights["loops"], right.astype(float))
+        assert found.levels[-1].undecided == 0
+
+
+def test_a_report_tells_bent_outliers_by_the_tail():
+    rng = np.random.default_rng(0)
+    clean = rng.chisquare(3, 5000)
+    assert inlier_report(clean, 3, 4.0).purity > 0.98
+    bent = np.concatenate([clean, rng.uniform(0.0, 4.0, 1000) ** 2])
+    spoiled = inlier_report(bent, 3, 4.0)
+    assert 0.83 < spoiled.purity < 0.95
+    refused = inlier_report(np.array([1.0, 17.0, 1e6, np.inf]), 3, 4.0)
+    assert (refused.kept, refused.refused, refused.close) == (1, 3, 1)
+
+
+def test_a_hopeless_residual_may_begin_with_weight_zero():
+    values = np.array([2.0, 2.1, 1.9, 2.05, 50.0])[:, None]
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[0.0]], name="x")
+    group = problem.add_residuals(Prior(Euclidean(1), values, sigma=0.1), x[0], name="readings")
+    found = graduate(problem, group, loss="truncated", weights={"readings": [1.0, 1.0, 0.0, 1.0, 0.0]})
+    np.testing.assert_array_equal(found.inliers["readings"], [True, True, True, True, False])  # taken up again
+    assert found.solution[x][0, 0] == pytest.approx(values[:4].mean(), rel=1e-9)
+    for wrong in ({"readings": [1.0]}, {"readings": [2.0] * 5}, {"others": [1.0]}):
+        with pytest.raises(InputError, match="weights"):
+            graduate(problem, group, weights=wrong)
+    with pytest.raises(InputError, match="geman_mcclure or truncated"):
+        graduate(problem, group, loss="tukey")

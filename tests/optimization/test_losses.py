@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from boxplus import InputError, losses
 from boxplus.optimization.losses import loss_at, triggs
 
-ROBUST = [losses.Huber, losses.Cauchy, losses.Tukey, losses.GemanMcClure, losses.Welsch]
+ROBUST = [losses.Truncated, losses.Huber, losses.Cauchy, losses.Tukey, losses.GemanMcClure, losses.Welsch]
 
 
 @pytest.mark.parametrize("make", ROBUST)
