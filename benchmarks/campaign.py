@@ -5,6 +5,7 @@
     python benchmarks/campaign.py --seeds 17:18 -v            # one, with all it says
     python benchmarks/campaign.py --only fault=clock_offset --only world=hall --seeds 0:1000
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
+    python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run
 
 A seed draws world, motion, sensors, mounting and, in half of the runs, one fault. Every run ends `right`, flagged with the `right
@@ -14,11 +15,12 @@ cause`, `flagged`, or `silent`ly wrong; lio_campaign/judge.py says what these me
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -26,10 +28,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # a spawned process knows the script, not its folder
 
 from lio_campaign.draws import draw_kinds
+from lio_campaign.real import why_not
 from lio_campaign.report import describe, report
-from lio_campaign.run import run_seed
+from lio_campaign.run import run_real, run_seed
 
 _SMALL, _NIGHTLY = 40, 1000
+_SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -39,10 +43,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]
         print(report(sorted(lines, key=lambda line: line["seed"])))
         return
-    begin, end = options.seeds
-    seeds = [seed for seed in range(begin, end) if draw_kinds(seed).matches(dict(options.only))]
-    lines = []
-    for line in _runs(seeds, options.jobs, command_line=options.bag):
+    work = _work(options)
+    if isinstance(work, str):
+        print(work)
+        return
+    lines: list[dict[str, Any]] = []
+    for line in _runs(*work, options.jobs):
         lines.append(line)
         if options.out is not None:
             with options.out.open("a", encoding="utf-8") as file:
@@ -51,18 +57,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(describe(line))
             print(json.dumps(line, indent=1), flush=True)
         else:
-            print(f"[{len(lines)}/{len(seeds)}] {describe(line)}", flush=True)
+            print(f"[{len(lines)}/{len(work[1])}] {describe(line)}", flush=True)
     print(report(sorted(lines, key=lambda line: line["seed"])))
 
 
-def _runs(seeds: Sequence[int], jobs: int, *, command_line: bool) -> Iterator[dict[str, Any]]:
+Run = Callable[[int], dict[str, Any]]
+
+
+def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
+    """What to do with which seeds, or why nothing can be done."""
+    begin, end = options.seeds
+    if options.real is None:
+        seeds = [seed for seed in range(begin, end) if draw_kinds(seed).matches(dict(options.only))]
+        return functools.partial(run_seed, command_line=options.bag), seeds
+    missing = why_not(options.shared)
+    if missing is not None:
+        return f"no recordings with a real IMU: {missing}"
+    return functools.partial(run_real, shared=options.shared), list(range(begin, begin + options.real))
+
+
+def _runs(run: Run, seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
     """Results as they come, from `jobs` processes."""
     if jobs == 1:
-        for seed in seeds:
-            yield run_seed(seed, command_line=command_line)
+        yield from map(run, seeds)
         return
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(run_seed, seed, command_line=command_line) for seed in seeds]):
+        for future in as_completed([pool.submit(run, seed) for seed in seeds]):
             yield future.result()
 
 
@@ -73,6 +93,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--only", type=_pair, action="append", default=[], metavar="KEY=VALUE", help="world, motion, fault …")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes")
     parser.add_argument("--bag", action="store_true", help="write bags and run the real command line")
+    parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
+    parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")
     parser.add_argument("-v", "--verbose", action="store_true", help="all that is known about every run")

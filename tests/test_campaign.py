@@ -15,10 +15,12 @@ import pytest
 
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
-from boxplus.simulation import Simulation, faults
+from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.sensors.imu import ImuSamples
+from boxplus.simulation import Simulation, faults, write_recording
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-PARTS = ("draws", "judge", "places", "report", "run")
+PARTS = ("draws", "judge", "places", "real", "report", "run", "spoil")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def summary_of(*warnings: str, contradiction: str | None = None, source: str = "
 
 
 def test_errors_do_not_depend_on_the_world_of_the_estimate(campaign: SimpleNamespace, seed: int) -> None:
-    simulation = campaign.draws.draw(seed).simulation()
+    simulation = campaign.draws.draw(seed).truth()
     errors = campaign.judge.errors_of(estimate_of(simulation), simulation)
     assert errors.position_m.max() < 1e-9
     assert errors.rotation_deg.max() < 1e-6
@@ -82,7 +84,7 @@ def test_right_is_near_the_truth_and_within_the_covariance(
     campaign: SimpleNamespace, seed: int, error_m: float, sigma_m: float, reasons: list[str]
 ) -> None:
     draw = campaign.draws.draw(seed)
-    simulation = draw.simulation()
+    simulation = draw.truth()
     estimate = estimate_of(simulation, error_m, sigma_m)
     outcome = campaign.judge.Outcome(0, None, summary_of(), estimate)
     verdict = campaign.judge.judge(outcome, campaign.judge.errors_of(estimate, simulation), draw)
@@ -91,8 +93,8 @@ def test_right_is_near_the_truth_and_within_the_covariance(
 
 def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     judge, sound = campaign.judge, campaign.draws.draw(seed)
-    simulation = sound.simulation()
-    faulty = replace(sound, fault="clock_offset", spoiled=faults.clock_offset())
+    simulation = sound.truth()
+    faulty = replace(sound, kinds=replace(sound.kinds, fault="clock_offset"), spoiled=faults.clock_offset())
     wrong = estimate_of(simulation, 3.0)
     errors = judge.errors_of(wrong, simulation)
 
@@ -105,7 +107,7 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     assert verdict(faulty, estimate=estimate_of(simulation, 3.0, weak=True)).verdict == "flagged"
     assert verdict(faulty, "accelerometer x saturated").verdict == "flagged"
     assert verdict(faulty, contradiction="their clocks differ by 100 ms").verdict == "right cause"
-    absent = replace(faulty, extrinsic="absent")
+    absent = replace(faulty, kinds=replace(faulty.kinds, extrinsic="absent"))
     unknown = (
         "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted: its rotation was estimated"
     )
@@ -118,7 +120,7 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
 
 def test_a_sound_run_that_is_right_can_be_a_false_alarm(campaign: SimpleNamespace, seed: int) -> None:
     judge, draw = campaign.judge, campaign.draws.draw(seed)
-    simulation = draw.simulation()
+    simulation = draw.truth()
     estimate = estimate_of(simulation)
     errors = judge.errors_of(estimate, simulation)
     for code, summary, weak, alarm in (
@@ -133,17 +135,17 @@ def test_a_sound_run_that_is_right_can_be_a_false_alarm(campaign: SimpleNamespac
 
 def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: SimpleNamespace) -> None:
     draws = campaign.draws
-    assert set(campaign.judge.CAUSES) == set(draws.FAULT_KINDS) - {"option"}
+    assert set(campaign.judge.CAUSES) == set(campaign.spoil.FAULT_KINDS) - {"option"}
     kinds = [draws.draw_kinds(seed) for seed in range(400)]
-    assert {kind.fault for kind in kinds} == {"none", *draws.FAULT_KINDS}
+    assert {kind.fault for kind in kinds} == {"none", *campaign.spoil.FAULT_KINDS}
     assert {kind.world for kind in kinds} == set(campaign.places.PLACES)
     assert {kind.motion for kind in kinds} == set(campaign.places.MOTIONS)
     assert 0.4 < np.mean([kind.fault == "none" for kind in kinds]) < 0.6
     assert np.mean([kind.bag == "true" for kind in kinds]) > 0.1
     first, second = draws.draw(7), draws.draw(7)
-    assert first.kinds() == second.kinds() == draws.asdict(draws.draw_kinds(7))
-    np.testing.assert_array_equal(first.simulation().scan(3).p_lidar, second.simulation().scan(3).p_lidar)
-    assert len(first.simulation().scan(3)) <= 8000
+    assert first.kinds == second.kinds == draws.draw_kinds(7)
+    np.testing.assert_array_equal(first.truth().scan(3).p_lidar, second.truth().scan(3).p_lidar)
+    assert len(first.truth().scan(3)) <= 8000
 
 
 def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespace) -> None:
@@ -151,7 +153,7 @@ def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespa
     for world, motion in (("corridor", "handheld"), ("room", "handheld")):
         wanted = {"world": world, "motion": motion, "sensor": "spinning128"}
         chosen = next(seed for seed in range(3000) if campaign.draws.draw_kinds(seed).matches(wanted))
-        shares[world] = campaign.run.true_information_share(campaign.draws.draw(chosen).simulation(), 50)
+        shares[world] = campaign.run.true_information_share(campaign.draws.draw(chosen).truth(), 50)
     assert shares["corridor"] < 1e-6 < 0.01 < shares["room"]
 
 
@@ -162,10 +164,41 @@ def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, m
     line = campaign.run.run_seed(seed)
     assert (line["verdict"], line["exit_code"]) == ("right", 0)
     assert line["worst_m"] < 0.05
-    spoiled = replace(short, fault="accel_unit", spoiled=faults.imu_in_g(), bag=True)
+    spoiled = replace(short, kinds=replace(short.kinds, fault="accel_unit", bag="true"), spoiled=faults.imu_in_g())
     monkeypatch.setattr(campaign.run, "draw", lambda _: spoiled)
     seen_through = campaign.run.run_seed(seed)
     assert (seen_through["verdict"], seen_through["bag"]) == ("right", "true")
     text = campaign.report.report([line, seen_through | {"verdict": "silent", "reasons": ["error"]}])
     assert "sound: 1 runs, 1 right, 0 right cause, 0 flagged, 0 silent" in text
     assert f"python benchmarks/campaign.py --seeds {seed}:{seed + 1} -v" in text
+
+
+def test_the_truth_of_a_real_flight_is_interpolated_smoothly(campaign: SimpleNamespace, seed: int, tmp_path: Path) -> None:
+    simulation = replace(campaign.draws.draw(seed), duration_s=3.0).truth()
+    write_recording(simulation, tmp_path / "flight", "ros1")
+    truth = campaign.real.RecordedTruth(tmp_path / "flight.gt.tum")
+    times = truth.start_ns + np.arange(50, 2900) * 1_000_000 + 333_333
+    exact, found = simulation.ground_truth(times), truth.ground_truth(times)
+    assert np.abs(found.p_world_imu - exact.p_world_imu).max() < 1e-4
+    assert np.rad2deg(np.linalg.norm(so3.boxminus(found.R_world_imu, exact.R_world_imu), axis=1)).max() < 0.01
+
+
+def test_a_real_recording_is_spoilt_after_its_reader(campaign: SimpleNamespace, seed: int, tmp_path: Path) -> None:
+    draw = replace(campaign.draws.draw(seed), duration_s=2.0)
+    path = write_recording(draw.truth(), tmp_path / "flight", "ros1")
+    T_true = np.diag([1.0, -1.0, -1.0, 1.0])
+    fault = faults.inverted_extrinsic().then(faults.flip_gyro())
+    spoiled, option = campaign.spoil.deliver("recorded", fault, T_true)
+    made = campaign.real.RealDraw(seed, draw.kinds, "", False, 2.0, spoiled, path, T_true, {}, option)
+    options = RecordingOptions(gyro_unit="rad/s")
+    with open_recording(path, options) as plain, campaign.real.opened_real(made, options) as recording:
+        assert option is None
+        np.testing.assert_array_equal(recording.info.T_imu_lidar, np.linalg.inv(T_true))
+        for before, after in zip(plain.events(), recording.events(), strict=True):
+            if isinstance(before, ImuSamples):
+                np.testing.assert_array_equal(after.gyro, -before.gyro)
+        assert recording.progress == 1.0
+
+
+def test_real_recordings_are_left_out_with_a_reason(campaign: SimpleNamespace, tmp_path: Path) -> None:
+    assert campaign.real.why_not(tmp_path) == f"{tmp_path / 'tools' / 'make_lio_recording.py'} is not there"

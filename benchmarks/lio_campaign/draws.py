@@ -8,100 +8,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.manifolds import so3
 from boxplus.simulation import Fault, ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting
 from boxplus.simulation.lidar import LidarModel
 from lio_campaign.places import MOTIONS, PLACES, Place, make_motion
+from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Setting, deliver, draw_spoiling
 
-FAULT_KINDS = (
-    "gyro_unit",
-    "accel_unit",
-    "time_unit",
-    "gyro_sign",
-    "accel_sign",
-    "clock_offset",
-    "clock_drift",
-    "other_imu",
-    "other_lidar",
-    "point_scale",
-    "option",
-    "mirrored",
-    "imu_gap",
-    "nan_burst",
-    "inverted_extrinsic",
-    "extrinsic_off",
-)
 SENSORS = ("spinning16", "spinning32", "spinning64", "spinning128", "rosette")
 EXTRINSICS = ("given", "recorded", "absent")
 
 _POINTS = 8000
-_FAULTY_SHARE = 0.5
+FAULTY_SHARE = 0.5
 _BAG_SHARE = 0.25
-_READER_FAULTS = ("gyro_unit", "accel_unit", "time_unit")
-"""Most of these go through a file, where the reader may see through them; in memory nothing stands between."""
-
 # density of gyro [rad/s/√Hz] and accelerometer [m/s²/√Hz], walks of both biases, largest biases [rad/s], [m/s²]
 _IMU_GRADES: dict[str, tuple[float, ...]] = {
     "tactical": (3e-5, 3e-4, 2e-6, 3e-5, 1e-3, 0.01),
     "industrial": (1.7e-4, 2e-3, 1.9e-5, 1e-3, 0.01, 0.06),
     "cheap": (4e-4, 4e-3, 5e-5, 2e-3, 0.03, 0.25),
 }
-_WRONG_OPTIONS = (
-    ("gyro_unit", "deg/s"),
-    ("accel_unit", "g"),
-    ("point_time_unit", "ms"),
-    ("point_time_unit", "us"),
-    ("point_time_reference", "scan_end"),
-)
-
-
-@dataclass(frozen=True)
-class Draw:
-    """One random recording.
-
-    Attributes:
-        seed: everything below follows from it.
-        world, motion, sensor, imu, extrinsic, fault: kinds, for tables and filters; fault "none" is a sound recording.
-        detail: the parameters of the fault, in words.
-        featureless: the world gives the LiDAR little to see.
-        bag: the recording goes through a file.
-        file_format: of that file.
-        scenario: world, motion, sensors and true mounting.
-        duration_s: length [s].
-        spoiled: what happens to the stream of events and to the declared mounting.
-        recording_options, T_imu_lidar: what the user says on the command line.
-    """
-
-    seed: int
-    world: str
-    motion: str
-    sensor: str
-    imu: str
-    extrinsic: str
-    fault: str
-    detail: str
-    featureless: bool
-    bag: bool
-    file_format: str
-    scenario: Scenario
-    duration_s: float
-    spoiled: Fault | None
-    recording_options: dict[str, Any] = field(default_factory=dict)
-    T_imu_lidar: NDArray[np.float64] | None = None
-
-    def kinds(self) -> dict[str, Any]:
-        """What filters and tables go by."""
-        names = ("world", "motion", "sensor", "imu", "extrinsic", "fault")
-        return {name: getattr(self, name) for name in names} | {"bag": str(self.bag).lower()}
-
-    def simulation(self) -> Simulation:
-        """The recording before anything is spoilt, and the truth."""
-        return Simulation(self.scenario, self.seed, self.duration_s)
 
 
 @dataclass(frozen=True)
 class Kinds:
-    """What a seed is about, without its worlds and motions: cheap, for filters."""
+    """What a seed is about, without its worlds and motions: cheap.
+
+    Attributes:
+        world, motion, sensor, imu: kinds.
+        extrinsic: "given" as an option, "recorded" in the recording, or "absent".
+        fault: "none" is a sound recording.
+        bag: "true" when it goes through a file.
+    """
 
     world: str
     motion: str
@@ -117,6 +52,38 @@ class Kinds:
         return all(mine[key] == value for key, value in only.items())
 
 
+@dataclass(frozen=True)
+class Draw:
+    """One random recording.
+
+    Attributes:
+        seed: everything below follows from it.
+        kinds: for tables and filters.
+        detail: the parameters of the fault, in words.
+        featureless: the world gives the LiDAR little to see.
+        file_format: of the bag, where there is one.
+        scenario: world, motion, sensors and true mounting.
+        duration_s: length [s].
+        spoiled: what happens to the stream of events and to the declared mounting.
+        recording_options, T_imu_lidar: what the user says on the command line.
+    """
+
+    seed: int
+    kinds: Kinds
+    detail: str
+    featureless: bool
+    file_format: str
+    scenario: Scenario
+    duration_s: float
+    spoiled: Fault
+    recording_options: dict[str, Any] = field(default_factory=dict)
+    T_imu_lidar: NDArray[np.float64] | None = None
+
+    def truth(self) -> Simulation:
+        """The recording before anything is spoilt, and its exact motion."""
+        return Simulation(self.scenario, self.seed, self.duration_s)
+
+
 def draw_kinds(seed: int) -> Kinds:
     """The kinds of a seed."""
     random = np.random.Generator(np.random.PCG64([seed, 1]))
@@ -125,10 +92,10 @@ def draw_kinds(seed: int) -> Kinds:
     sensor = str(random.choice(SENSORS))
     imu = str(random.choice(list(_IMU_GRADES)))
     extrinsic = str(random.choice(EXTRINSICS, p=(0.4, 0.4, 0.2)))
-    fault = str(random.choice(FAULT_KINDS)) if random.uniform() < _FAULTY_SHARE else "none"
+    fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
     chance = random.uniform()
-    bag = chance < _BAG_SHARE or fault == "option" or (fault in _READER_FAULTS and chance < 0.7)
-    if fault in ("inverted_extrinsic", "extrinsic_off", "other_lidar") and extrinsic == "absent":
+    bag = chance < _BAG_SHARE or fault == "option" or (fault in READER_FAULTS and chance < 0.7)
+    if fault in MOUNTING_FAULTS and extrinsic == "absent":
         extrinsic = "recorded"
     return Kinds(world, motion, sensor, imu, extrinsic, fault, str(bag).lower())
 
@@ -147,23 +114,35 @@ def draw(seed: int) -> Draw:
         imu = imu.model_copy(update={"accel_vibration": strength, "gyro_vibration": 0.02 * strength, "vibration_hz": hz})
     T_imu_lidar = _mounting(kinds.extrinsic == "absent", random)
     scenario = Scenario(f"campaign {seed}", place.world, trajectory, lidar, imu, T_imu_lidar)
-    made = Draw(
+    bag, file_format = kinds.bag == "true", str(random.choice(("ros2", "ros1")))
+    begin_s = float(random.uniform(4.0, 0.6 * duration_s))
+    other = _other_body(scenario, place, seed, duration_s)
+    spoiling = draw_spoiling(kinds.fault, Setting(begin_s, bag, T_imu_lidar, other.imu_samples), random)
+    fault = spoiling.fault
+    if kinds.fault == "other_lidar" and fault is not None:
+        # The declared mounting is that of the first LiDAR, the points come from the second one.
+        second = fault.declared_extrinsic(T_imu_lidar)
+        assert second is not None
+        scenario, fault = replace(scenario, T_imu_lidar=second), faults.declare(T_imu_lidar)
+    spoiled, option = deliver(kinds.extrinsic, fault, scenario.T_imu_lidar)
+    return Draw(
         seed=seed,
-        world=kinds.world,
-        motion=kinds.motion,
-        sensor=kinds.sensor,
-        imu=kinds.imu,
-        extrinsic=kinds.extrinsic,
-        fault=kinds.fault,
-        detail="",
+        kinds=kinds,
+        detail=spoiling.detail,
         featureless=place.featureless,
-        bag=kinds.bag == "true",
-        file_format=str(random.choice(("ros2", "ros1"))),
+        file_format=file_format,
         scenario=scenario,
         duration_s=duration_s,
-        spoiled=None,
+        spoiled=spoiled,
+        recording_options=spoiling.recording_options,
+        T_imu_lidar=option,
     )
-    return _declared(_spoil(made, place, random))
+
+
+def _other_body(scenario: Scenario, place: Place, seed: int, duration_s: float) -> Simulation:
+    """Somebody else in the same place, with the same kind of IMU."""
+    other = manoeuvres.handheld(duration_s + 1.0, place.low, place.high, 1.0, 1.2, 2.0, seed=seed + 1)
+    return Simulation(replace(scenario, trajectory=other), seed + 1, duration_s)
 
 
 def _lidar(sensor: str, random: np.random.Generator) -> tuple[LidarModel, float]:
@@ -204,79 +183,3 @@ def _mounting(near: bool, random: np.random.Generator) -> NDArray[np.float64]:
     yaw = random.uniform(-180.0, 180.0) if random.uniform() < 0.7 else random.uniform(-10.0, 10.0)
     roll, pitch = random.uniform(-8.0, 8.0, 2)
     return mounting(roll, pitch, yaw, tuple(random.uniform(-reach, reach, 3)))
-
-
-def _spoil(made: Draw, place: Place, random: np.random.Generator) -> Draw:
-    """The draw with its fault."""
-    fault = made.fault
-    begin = float(random.uniform(4.0, 0.6 * made.duration_s))
-    if fault == "none":
-        return made
-    if fault == "option":
-        key, value = _WRONG_OPTIONS[int(random.integers(len(_WRONG_OPTIONS)))]
-        return replace(made, recording_options={key: value}, detail=f"--{key.replace('_', '-')} {value}")
-    if fault == "other_lidar":
-        return _second_lidar(made, random)
-    spoiled: Fault
-    if fault == "gyro_unit":
-        spoiled = faults.gyro_in_deg() if made.bag or random.uniform() < 0.5 else faults.gyro_in_rad_as_deg()
-    elif fault == "accel_unit":
-        spoiled = faults.imu_in_g()
-    elif fault == "time_unit":
-        spoiled = faults.wrong_time_unit(float(random.choice((1e-3, 1e3))))
-    elif fault == "gyro_sign":
-        spoiled = faults.flip_gyro()
-    elif fault == "accel_sign":
-        spoiled = faults.flip_accel()
-    elif fault == "clock_offset":
-        spoiled = faults.clock_offset(float(random.choice((-1.0, 1.0)) * np.exp(random.uniform(np.log(0.02), np.log(0.5)))))
-    elif fault == "clock_drift":
-        spoiled = faults.clock_drift(float(random.choice((-1.0, 1.0)) * np.exp(random.uniform(np.log(0.001), np.log(0.02)))))
-    elif fault == "other_imu":
-        low, high = np.array(place.low), np.array(place.high)
-        other = manoeuvres.handheld(made.duration_s + 1.0, low, high, 1.0, 1.2, 2.0, seed=made.seed + 1)
-        body = Simulation(replace(made.scenario, trajectory=other), made.seed + 1, made.duration_s)
-        spoiled = faults.other_imu(body.imu_samples)
-    elif fault == "point_scale":
-        spoiled = faults.scale_points(float(random.choice((1.1, 0.9, 3.28084))))
-    elif fault == "mirrored":
-        spoiled = faults.mirror_points(int(random.integers(3)))
-    elif fault == "imu_gap":
-        spoiled = faults.drop_imu(begin, float(random.uniform(0.2, 2.0)))
-    elif fault == "nan_burst":
-        spoiled = faults.nan_burst(begin, float(random.uniform(0.2, 1.0)))
-    elif fault == "inverted_extrinsic":
-        spoiled = faults.inverted_extrinsic()
-    elif fault == "extrinsic_off":
-        axis = random.standard_normal(3)
-        angle = float(random.uniform(5.0, 20.0))
-        off = made.scenario.T_imu_lidar.copy()
-        off[:3, :3] = off[:3, :3] @ so3.exp(np.deg2rad(angle) * axis / np.linalg.norm(axis))
-        spoiled = faults.declare(off, f"T_imu_lidar {angle:.1f} deg off")
-    else:
-        raise ValueError(fault)
-    return replace(made, spoiled=spoiled, detail=spoiled.description)
-
-
-def _second_lidar(made: Draw, random: np.random.Generator) -> Draw:
-    """The points come from a second LiDAR, mounted otherwise; what is declared is the mounting of the first."""
-    first, second = made.scenario.T_imu_lidar, np.eye(4)
-    turned = random.uniform() < 0.8
-    if turned:
-        yaw = random.choice((90.0, 180.0, -90.0)) + random.uniform(-15.0, 15.0)
-        second = mounting(random.uniform(-15.0, 15.0), random.uniform(-15.0, 15.0), yaw, (0.0, 0.0, 0.0))
-    second = first @ second
-    second[:3, 3] = first[:3, 3] + random.choice((-1.0, 1.0), 3) * random.uniform(0.1, 0.4, 3)
-    spoiled = faults.declare(first, "a second LiDAR, turned and set off" if turned else "a second LiDAR, set off, not turned")
-    return replace(made, scenario=replace(made.scenario, T_imu_lidar=second), spoiled=spoiled, detail=spoiled.description)
-
-
-def _declared(made: Draw) -> Draw:
-    """Bring the mounting to the odometry: as an option, by the recording, or not at all."""
-    if made.extrinsic == "recorded":
-        return made
-    T_imu_lidar = made.scenario.T_imu_lidar
-    declared = T_imu_lidar if made.spoiled is None else made.spoiled.declared_extrinsic(T_imu_lidar)
-    silent = faults.declare(None, "no T_imu_lidar")
-    spoiled = silent if made.spoiled is None else made.spoiled.then(silent)
-    return replace(made, spoiled=spoiled, T_imu_lidar=declared if made.extrinsic == "given" else None)

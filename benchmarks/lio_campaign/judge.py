@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,7 @@ from numpy.typing import NDArray
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
 from boxplus.runs.run_summary import RunSummary
-from boxplus.simulation import Simulation
-from lio_campaign.draws import Draw
+from boxplus.simulation import Motion
 
 FLOOR_M, SHARE_OF_WAY, LIMIT_DEG = 0.05, 0.02, 2.0
 NOBODY_MINDS_M, NOBODY_MINDS_DEG = 0.03, 0.3
@@ -60,6 +60,24 @@ _OPTION_CAUSES = {
 }
 _UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
 _WEAK = re.compile(r"scans are weak")
+
+
+class Truth(Protocol):
+    """The exact motion of the IMU over `[start_ns, end_ns]`."""
+
+    start_ns: int
+    end_ns: int
+
+    def ground_truth(self, time_ns: NDArray[np.int64]) -> Motion:
+        """At `time_ns` (N,)."""
+
+
+class Drawn(Protocol):
+    """What the verdict needs to know about a recording; `kinds` has its `extrinsic` and its `fault`, see draws.py."""
+
+    kinds: Any
+    featureless: bool
+    recording_options: dict[str, Any]
 
 
 @dataclass
@@ -130,18 +148,18 @@ class Verdict:
     false_alarm: str = ""
 
 
-def errors_of(estimate: Trajectory, simulation: Simulation) -> Errors:
+def errors_of(estimate: Trajectory, truth: Truth) -> Errors:
     """Compare every pose with the truth, the first one laid upon it."""
     assert estimate.time_ns is not None and estimate.covariance is not None
-    time_ns = np.clip(estimate.time_ns, simulation.start_ns, simulation.end_ns)
-    truth = simulation.ground_truth(time_ns)
+    time_ns = np.clip(estimate.time_ns, truth.start_ns, truth.end_ns)
+    true = truth.ground_truth(time_ns)
     R = quaternion.to_matrix(estimate.q_wxyz)
-    R_world_truth = R[0] @ truth.R_world_imu[0].T
-    R_true = R_world_truth @ truth.R_world_imu
-    p_true = (truth.p_world_imu - truth.p_world_imu[0]) @ R_world_truth.T + estimate.p[0]
+    R_world_truth = R[0] @ true.R_world_imu[0].T
+    R_true = R_world_truth @ true.R_world_imu
+    p_true = (true.p_world_imu - true.p_world_imu[0]) @ R_world_truth.T + estimate.p[0]
     e_p, e_R = estimate.p - p_true, so3.log(np.swapaxes(R_true, 1, 2) @ R)
     every = np.arange(time_ns[0], max(time_ns[-1], time_ns[0] + 1), 20_000_000)
-    steps = np.linalg.norm(np.diff(simulation.ground_truth(every).p_world_imu, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(truth.ground_truth(every).p_world_imu, axis=0), axis=1)
     way = np.interp(time_ns, every, np.concatenate([[0.0], np.cumsum(steps)]))
     P = estimate.covariance
     squared = _mahalanobis(np.concatenate([e_R, e_p], axis=1), P)
@@ -163,7 +181,7 @@ def _mahalanobis(e: NDArray[np.float64], P: NDArray[np.float64]) -> NDArray[np.f
     return np.maximum(squared, 0.0)
 
 
-def flags_of(outcome: Outcome, draw: Draw) -> list[str]:
+def flags_of(outcome: Outcome, draw: Drawn) -> list[str]:
     """What tells the user that something is wrong.
 
     That the mounting is unknown is no news to one who did not give it; that some scans are weak says something about these only.
@@ -174,7 +192,7 @@ def flags_of(outcome: Outcome, draw: Draw) -> list[str]:
         if summary.contradiction:
             flags.append(summary.contradiction)
         for warning in summary.warnings:
-            expected = draw.extrinsic == "absent" and _UNKNOWN_MOUNTING.search(warning.text) is not None
+            expected = draw.kinds.extrinsic == "absent" and _UNKNOWN_MOUNTING.search(warning.text) is not None
             if not expected and not _WEAK.search(warning.text):
                 flags.append(warning.text)
     if outcome.exit_code != 0 and not flags:
@@ -182,18 +200,18 @@ def flags_of(outcome: Outcome, draw: Draw) -> list[str]:
     return flags
 
 
-def names_cause(flags: list[str], draw: Draw) -> bool:
+def names_cause(flags: list[str], draw: Drawn) -> bool:
     """Whether one of the messages names what is wrong with the recording."""
-    if draw.fault == "option":
+    if draw.kinds.fault == "option":
         pattern = _OPTION_CAUSES[next(iter(draw.recording_options))]
-    elif draw.fault == "none":
+    elif draw.kinds.fault == "none":
         return False
     else:
-        pattern = CAUSES[draw.fault]
+        pattern = CAUSES[draw.kinds.fault]
     return any(re.search(pattern, text, re.IGNORECASE) for text in flags)
 
 
-def judge(outcome: Outcome, errors: Errors | None, draw: Draw, *, falsely_weak: bool = False) -> Verdict:
+def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak: bool = False) -> Verdict:
     """The verdict on a run.
 
     Args:
@@ -208,12 +226,12 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Draw, *, falsely_weak: 
         reasons.append("no estimate")
     else:
         reasons += ["error"] * bool(errors.too_far.any()) + ["covariance"] * bool(errors.too_sure.any())
-    sound = draw.fault == "none"
+    sound = draw.kinds.fault == "none"
     false_alarm = "" if not sound else "flagged" if flags else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
     weak = errors is not None and _within_weak(outcome, errors)
-    guessed = draw.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
+    guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)
     if flags or weak or guessed:

@@ -81,8 +81,8 @@ def _cases(lines: Sequence[Line], verdict: str) -> str:
 
 def command(line: Line) -> str:
     """What repeats a run."""
-    bag = " --bag" if line["bag"] == "command" else ""
-    return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{bag}"
+    how = " --real 1" if line["real"] else " --bag" if line["bag"] == "command" else ""
+    return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{how}"
 
 
 def _alarms(lines: Sequence[Line]) -> str:

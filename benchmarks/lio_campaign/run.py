@@ -1,16 +1,20 @@
-"""One recording of the campaign: simulate, run the odometry as `boxplus lio` does, judge."""
+"""One recording of the campaign: make it, run the odometry as `boxplus lio` does, judge."""
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED
 from boxplus.errors import BoxplusError, InputError
@@ -25,13 +29,15 @@ from boxplus.runs.run_summary import RunSummary, read_summary
 from boxplus.simulation import Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
-from lio_campaign.judge import Errors, Outcome, errors_of, judge
+from lio_campaign.judge import Drawn, Errors, Outcome, Truth, errors_of, judge
+from lio_campaign.real import RealDraw, draw_real, opened_real
 
 EXIT_NOT_TRUSTED = 3
 _ENOUGH_SHARE = 0.01
 """Least eigenvalue of the true information over that of all points, above which no direction of a scan is weak: 2.5 times the
 filter's own threshold."""
 _POINTS_LOOKED_AT = 500
+_COMMAND = (sys.executable, "-c", "from boxplus.cli import main; main()", "lio")
 
 
 def run_seed(seed: int, *, command_line: bool = False) -> dict[str, Any]:
@@ -41,34 +47,50 @@ def run_seed(seed: int, *, command_line: bool = False) -> dict[str, Any]:
         seed: which.
         command_line: write a bag and run the real `boxplus lio` in a process of its own.
     """
-    began, cpu = time.perf_counter(), time.process_time()
+    clock = _Clock()
     made = draw(seed)
-    simulation = made.simulation()
+    simulation = made.truth()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        outcome = _by_command(made, simulation, work) if command_line else _in_process(made, simulation, work)
-    errors = None if outcome.estimate is None else errors_of(outcome.estimate, simulation)
-    falsely = made.fault == "none" and not made.featureless and outcome.estimate is not None
-    suspects = falsely_weak(outcome.estimate, simulation) if falsely and outcome.estimate is not None else []
+        if command_line:
+            outcome = _by_command(made, simulation, work)
+        else:
+            outcome = _in_process(lambda options: _opened(made, simulation, work, options), made, work)
+    suspects: list[dict[str, float]] = []
+    if made.kinds.fault == "none" and not made.featureless and outcome.estimate is not None:
+        suspects = falsely_weak(outcome.estimate, simulation)
+    facts = {"seed": seed, "real": False, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
+    if command_line:
+        facts["bag"] = "command"
+    return facts | _judged(made, outcome, simulation, suspects) | clock.read()
+
+
+def run_real(seed: int, shared: Path) -> dict[str, Any]:
+    """The same of a recording with a real IMU and a real motion.
+
+    Args:
+        seed: which.
+        shared: folder with `tools/make_lio_recording.py` and `data/imu`.
+    """
+    clock = _Clock()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        made = draw_real(seed, shared, work)
+        outcome = _in_process(lambda options: opened_real(made, options), made, work)
+        truth = made.truth()
+    facts = {"seed": seed, "real": True, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
+    return facts | _judged(made, outcome, truth, []) | clock.read()
+
+
+def _judged(made: Drawn, outcome: Outcome, truth: Truth, suspects: list[dict[str, float]]) -> dict[str, Any]:
+    errors = None if outcome.estimate is None else errors_of(outcome.estimate, truth)
     verdict = judge(outcome, errors, made, falsely_weak=bool(suspects))
-    return {
-        "seed": seed,
-        **made.kinds(),
-        "bag": "command" if command_line else made.kinds()["bag"],
-        "detail": made.detail,
-        "rate_hz": made.scenario.lidar.rate_hz,
-        "imu_hz": made.scenario.imu.rate_hz,
-        "duration_s": round(made.duration_s, 2),
-        **asdict(verdict),
-        **_figures(errors),
-        **_facts(outcome),
-        "falsely_weak_scans": suspects,
-        "cpu_s": round(time.process_time() - cpu, 2),
-        "wall_s": round(time.perf_counter() - began, 2),
-    }
+    return asdict(verdict) | _figures(errors) | _facts(outcome) | {"falsely_weak_scans": suspects}
 
 
-def _in_process(made: Draw, simulation: Simulation, work: Path) -> Outcome:
+def _in_process(
+    opened: Callable[[RecordingOptions], AbstractContextManager[Recording]], made: Draw | RealDraw, work: Path
+) -> Outcome:
     """The steps of `boxplus.cli.lio.run`, without a terminal, on a recording in memory or in a file."""
     given = None if made.T_imu_lidar is None else tuple(map(tuple, made.T_imu_lidar.tolist()))
     config = RunConfig(
@@ -78,7 +100,7 @@ def _in_process(made: Draw, simulation: Simulation, work: Path) -> Outcome:
     )
     run = work / "run"
     try:
-        with _opened(made, simulation, work, config.recording) as recording:
+        with opened(config.recording) as recording:
             extrinsic = choose_extrinsic(recording, config.odometry)
             summary = run_odometry(recording, run, config, extrinsic=extrinsic)
         return Outcome(exit_code_of(summary), None, summary, _estimate(run))
@@ -93,7 +115,7 @@ def exit_code_of(summary: RunSummary) -> int:
 
 
 def _opened(made: Draw, simulation: Simulation, work: Path, options: RecordingOptions) -> Recording:
-    if not made.bag:
+    if made.kinds.bag != "true":
         return as_recording(simulation, made.spoiled)
     return open_recording(_written(made, simulation, work), options)
 
@@ -106,8 +128,7 @@ def _written(made: Draw, simulation: Simulation, work: Path) -> Path:
 def _by_command(made: Draw, simulation: Simulation, work: Path) -> Outcome:
     """The real command line on a real file."""
     recording, run = _written(made, simulation, work), work / "run"
-    command = [sys.executable, "-m", "boxplus.cli", "lio", str(recording), "-o", str(run)]
-    command += ["--no-map", "--no-report", "--threads", "1"]
+    command = [*_COMMAND, str(recording), "-o", str(run), "--no-map", "--no-report", "--threads", "1"]
     for key, value in made.recording_options.items():
         command += [f"--{key.replace('_', '-')}", str(value)]
     if made.T_imu_lidar is not None:
@@ -153,8 +174,10 @@ def true_information_share(simulation: Simulation, index: int) -> float:
     motion, T = simulation.ground_truth(time_ns), simulation.T_imu_lidar
     ranges = np.linalg.norm(points, axis=1, keepdims=True)
 
-    def to_world(p_lidar: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", motion.R_world_imu, p_lidar @ T[:3, :3].T + T[:3, 3]) + motion.p_world_imu
+    def to_world(p_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+        p_imu = p_lidar @ T[:3, :3].T + T[:3, 3]
+        p_world: NDArray[np.float64] = np.einsum("nij,nj->ni", motion.R_world_imu, p_imu) + motion.p_world_imu
+        return p_world
 
     before = to_world(points * (1.0 - 0.01 / ranges))
     step = 1e-4
@@ -167,6 +190,22 @@ def true_information_share(simulation: Simulation, index: int) -> float:
     arm = float(np.sqrt(np.mean(np.sum(lever**2, axis=1))))
     J = np.concatenate([np.cross(lever, normals) / max(arm, 1e-6), normals], axis=1)
     return float(np.linalg.eigvalsh(J.T @ J / len(J))[0])
+
+
+class _Clock:
+    """Processor time of this process and of those it started, and wall time."""
+
+    def __init__(self) -> None:
+        self._began = self._now()
+
+    def _now(self) -> tuple[float, float]:
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return sum(usage.ru_utime + usage.ru_stime for usage in used), time.perf_counter()
+
+    def read(self) -> dict[str, float]:
+        """Since it was made [s]."""
+        cpu, wall = (now - began for now, began in zip(self._now(), self._began, strict=True))
+        return {"cpu_s": round(cpu, 2), "wall_s": round(wall, 2)}
 
 
 def _figures(errors: Errors | None) -> dict[str, Any]:
