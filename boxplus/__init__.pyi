@@ -48,8 +48,8 @@ from .sensors.scan import Scan as Scan
 from .simulation.simulation import Simulation as Simulation
 from .simulation.simulation import simulate as simulate
 from .sparse.cholesky import SparseCholesky as SparseCholesky
-from .systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig as BundleAdjustmentConfig
 from .systems.bundle_adjustment.bundle_adjustment import adjust_bundle as adjust_bundle
+from .systems.bundle_adjustment.config import BundleAdjustmentConfig as BundleAdjustmentConfig
 from .systems.direct_alignment.direct_alignment import Alignment as Alignment
 from .systems.direct_alignment.direct_alignment import align_rgbd as align_rgbd
 from .systems.lidar_inertial_odometry.config import LioConfig as LioConfig

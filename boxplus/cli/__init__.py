@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from boxplus.errors import BoxplusError, InputError
 
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_UNTRUSTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
 from boxplus.cli.optimization_terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from boxplus.formats.reconstruction import Reconstruction
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
-    from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig, BundleAdjustmentResult
+    from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentResult
+    from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 
 
 class FormatChoice(StrEnum):
@@ -62,14 +64,15 @@ def ba(
     """Adjust cameras and points so that they explain best where the points were seen.
 
     The result is written in the format of the input, and as scene.ply (points and camera centres). Exit codes: 0 done, 1 the
-    problem does not determine its variables or the results could not be written, 2 bad input, 130 interrupted (results up to
-    there are complete).
+    problem does not determine its variables or the results could not be written, 2 bad input, 3 finished but not to be trusted
+    (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
     """
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
     from boxplus.runs.output_folder import prepare_output_folder
-    from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
+    from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+    from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
@@ -101,7 +104,9 @@ def ba(
     summary.write(folder / "run.json")
     terminal.results(summary, "px", folder, ["report.html", name, "scene.ply", "run.json"])
     if summary.state == "interrupted":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if summary.doubt is not None:
+        raise typer.Exit(EXIT_UNTRUSTED)
 
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -166,16 +171,25 @@ def _summary(
         method=solution.method,
         linear_solver=solution.linear_solver,
         convention=f"cost ½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over the observations, σ = {config.sigma_px:g} px{rho}",
-        start="the file's cameras and points",
+        start=_start(result),
         cost_initial=solution.cost_initial,
         cost=solution.cost,
         errors_initial=ErrorFacts.of(result.errors_start),
         errors=ErrorFacts.of(result.errors),
         invalid=solution.invalid,
         notes=list(result.notes),
+        doubt=result.doubt,
         timing_s=solution.timing_s,
         history=iteration_facts(solution),
     )
+
+
+def _start(result: BundleAdjustmentResult) -> str:
+    found = result.cheirality
+    anew = [f"{len(found.triangulated)} points triangulated anew"] if len(found.triangulated) else []
+    anew += [f"{len(found.turned_back)} cameras set anew"] if len(found.turned_back) else []
+    anew += [f"{found.left_out} observations left out"] if found.left_out else []
+    return ", ".join(["the file's cameras and points", *anew])
 
 
 def _write_scene(path: Path, reconstruction: Reconstruction) -> None:

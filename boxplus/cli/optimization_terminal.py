@@ -182,7 +182,7 @@ class OptimizationTerminal:
 
     def results(self, summary: OptimizationSummary, unit: str, folder: Path, files: list[str]) -> None:
         """Why it stopped, errors before and after, notes and files."""
-        good = summary.status == "converged" and summary.state == "finished"
+        good = summary.status == "converged" and summary.state == "finished" and summary.doubt is None
         self.console.print(Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow"), soft_wrap=True)
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in (f"error [{unit}]", "rms", "median", "99th perc.", "largest", "not valid"):
@@ -208,6 +208,8 @@ class OptimizationTerminal:
         self.console.print(table)
         for note in summary.notes:
             self.warn(note)
+        if summary.doubt is not None:
+            self.console.print(Text.assemble(("not to be trusted: ", "bold red"), summary.doubt), soft_wrap=True)
         for name in files:
             if (folder / name).exists():
                 self.console.print(f"  {folder / name}", soft_wrap=True, markup=False)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.formats.bal import BalProblem
 from boxplus.formats.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
-from boxplus.systems.bundle_adjustment.bundle_adjustment import mean_error_of_points
+from boxplus.systems.bundle_adjustment.reconstruction_problem import mean_error_of_points
 
 _MOST_POINTS = 40_000
 

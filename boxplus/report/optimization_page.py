@@ -41,8 +41,9 @@ def write_optimization_page(
 
 
 def _head(summary: OptimizationSummary, numbers: list[tuple[str, str]]) -> str:
-    good = summary.state == "finished" and summary.status == "converged"
-    state = "interrupted" if summary.state == "interrupted" else summary.status
+    good = summary.state == "finished" and summary.status == "converged" and summary.doubt is None
+    doubt = "" if summary.doubt is None else ", not to be trusted"
+    state = ("interrupted" if summary.state == "interrupted" else summary.status) + doubt
     return (
         f"<h1>{escape(Path(summary.input).name)}</h1>"
         f'<p class="lead"><span class="state{"" if good else " interrupted"}">{state}</span> {escape(summary.reason)} · '
@@ -55,6 +56,8 @@ def _warnings(summary: OptimizationSummary) -> list[str]:
     lines = [escape(note) for note in summary.notes]
     if summary.state == "finished" and summary.status != "converged":
         lines.insert(0, f"not converged: {escape(summary.reason)}")
+    if summary.doubt is not None:
+        lines.insert(0, f"not to be trusted: {escape(summary.doubt)}")
     lines += [
         f"{count} residuals of {escape(group)} could not be evaluated at the end and do not count"
         for group, count in summary.invalid.items()

@@ -84,6 +84,7 @@ class OptimizationSummary(_Part):
     errors: ErrorFacts
     invalid: dict[str, int] = Field(description="residuals that could not be evaluated at the end, by group")
     notes: list[str]
+    doubt: str | None = Field(None, description="why the result is not to be trusted; the exit code is then 3")
     timing_s: dict[str, float]
     history: list[IterationFacts]
 

@@ -3,62 +3,25 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
-from boxplus.cameras.distortion import Radial, RadialTangential
-from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.gbp import GbpProblem
 from boxplus.formats.reconstruction import Reconstruction
-from boxplus.manifolds import quaternion, so3
-from boxplus.manifolds.euclidean import Euclidean
-from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import Variables
-from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
-from boxplus.residuals.reprojection import Reprojection
-from boxplus.residuals.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
+from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
+from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
 
-# Points far away creep on for many steps that change nothing but their distance.
-_COST_TOLERANCE = 1e-8
-# The scale of a COLMAP model is arbitrary: only what lies behind a camera is behind it.
-_Z_MIN = 1e-9
-# Which of COLMAP's parameters stands where in `Pinhole.parameters`; −1: a coefficient that is zero.
-_COLMAP_LAYOUT = {
-    "SIMPLE_PINHOLE": (0, 0, 1, 2),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1),
-    "RADIAL": (0, 0, 1, 2, 3, 4),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
-}
-
-
-class BundleAdjustmentConfig(BaseModel):
-    """Options of `adjust_bundle`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    sigma_px: float = Field(1.0, gt=0, description="[px] standard deviation of a pixel measurement")
-    intrinsics: Literal["held", "refined"] = Field(
-        "held", description="of COLMAP's cameras; those of a BAL file are always refined, as its cameras carry them"
-    )
-    principal_point: Literal["held", "refined"] = Field(
-        "held", description="of COLMAP's cameras where the intrinsics are refined; few scenes determine it well"
-    )
-    solver: SolverOptions = Field(
-        SolverOptions(cost_tolerance=_COST_TOLERANCE), description="see SolverOptions; stops once the cost settles to 8 digits"
-    )
+_HEAVY, _LOAD = 0.01, 0.9  # a share of the observations, and of the cost, that only wrong matches carry
+_BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +33,11 @@ class BundleAdjustmentResult:
         errors_start, errors: (k,) distance of every observation from its projection [px], NaN where it cannot be projected.
             k leaves out those of COLMAP's observations that belong to no point.
         camera_of, point_of: (k,) the camera (of COLMAP the image) and the point of each.
+        cheirality: points behind cameras, before and after, and what was done about them. What was left out is in none of the
+            arrays above, and its points stay where they were.
+        depth: how well the distance of each point is determined.
         notes: what a user should know of the structure, one sentence each.
+        doubt: why the result is not to be trusted; None where nothing speaks against it.
         solution: with history, covariance, and why it stopped.
         cameras, points: the variables of `solution`.
         time_s: seconds, set-up included.
@@ -81,7 +48,10 @@ class BundleAdjustmentResult:
     errors: NDArray[np.float64]
     camera_of: NDArray[np.int64]
     point_of: NDArray[np.int64]
+    cheirality: Cheirality
+    depth: DepthUncertainty
     notes: tuple[str, ...]
+    doubt: str | None
     solution: Solution
     cameras: Variables
     points: Variables
@@ -100,7 +70,8 @@ def adjust_bundle(
     Nothing is held: Levenberg-Marquardt stays near the start along the seven directions that move the whole scene.
 
     Raises:
-        InputError: a camera model without a counterpart here; no observation; a method without damping.
+        InputError: a camera model without a counterpart here; a focal length that is not positive; no observation; more than
+            half of the observations of points behind their cameras, beyond repair; a method without damping.
     """
     config = config if config is not None else BundleAdjustmentConfig()
     if config.solver.method == "gauss_newton":
@@ -111,27 +82,31 @@ def adjust_bundle(
         )
     begin = time.perf_counter()
     problem = Problem()
-    if isinstance(reconstruction, BalProblem):
-        blocks = _add_bal(problem, reconstruction, config, loss)
-    elif isinstance(reconstruction, GbpProblem):
-        blocks = _add_gbp(problem, reconstruction, config, loss)
-    else:
-        blocks = _add_colmap(problem, reconstruction, config, loss)
-    cameras, points = blocks
+    sound = make_sound(reconstruction)
+    cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
+    problem.fix(points[sound.cheirality.dropped])
     start = [block.values for block in problem.blocks]
     errors_start = _errors(problem, start)
-    solution = problem.solve(config.solver, callback=callback)
+    start[cameras.number], start[points.number] = start_values(sound.reconstruction)
+    solution = problem.solve(config.solver, start=start, callback=callback)
     errors = _errors(problem, list(solution.values))
     camera_of, point_of = (
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
     )
+    adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
+    cheirality = count_behind(sound, adjusted)
+    depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
+    notes = [*cheirality.notes(reconstruction), *depth.notes(reconstruction)]
     return BundleAdjustmentResult(
-        reconstruction=_with_values(reconstruction, config, problem, solution, cameras, points, errors, point_of),
+        reconstruction=adjusted,
         errors_start=errors_start,
         errors=errors,
         camera_of=camera_of,
         point_of=point_of,
-        notes=_notes(len(points), camera_of, point_of, solution),
+        cheirality=cheirality,
+        depth=depth,
+        notes=(*notes, *_outliers(errors, loss), *_notes(len(points), camera_of, point_of, solution)),
+        doubt=_doubt(cheirality, depth),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -139,87 +114,32 @@ def adjust_bundle(
     )
 
 
-def _add_bal(problem: Problem, bal: BalProblem, config: BundleAdjustmentConfig, loss: Loss | None) -> tuple[Variables, Variables]:
-    rotation = quaternion.from_matrix(so3.exp(bal.cameras[:, :3]))
-    cameras = problem.add_variables(BalCamera, np.hstack([rotation, bal.cameras[:, 3:]]), name="cameras")
-    points = problem.add_variables(Euclidean(3), bal.points, name="points")
-    residual = BalReprojection(bal.pixels, sigma=config.sigma_px)
-    problem.add_residuals(residual, cameras[bal.camera_of], points[bal.point_of], loss=loss, name="pixels")
-    return cameras, points
+def _outliers(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
+    """A sentence where a few observations carry nearly all of a cost without robust loss."""
+    squared = np.sort(errors[np.isfinite(errors)] ** 2)[::-1]
+    few = max(1, int(_HEAVY * len(squared)))
+    if loss is not None or len(squared) < 1.0 / _HEAVY or not squared[:few].sum() > _LOAD * squared.sum():
+        return []
+    if np.sqrt(squared[0]) < 1e-6:  # all exact but for rounding
+        return []
+    return [
+        f"{few} of {len(squared)} observations carry {squared[:few].sum() / squared.sum():.0%} of the cost, the largest error is "
+        f"{np.sqrt(squared[0]):.4g} px: wrong matches or a wrong start; use a robust loss (--loss huber)"
+    ]
 
 
-def _add_gbp(problem: Problem, gbp: GbpProblem, config: BundleAdjustmentConfig, loss: Loss | None) -> tuple[Variables, Variables]:
-    cameras = problem.add_variables(SE3Left, gbp.T_camera_world, name="cameras")
-    points = problem.add_variables(Euclidean(3), gbp.points, name="points")
-    fx, fy, cx, cy = (float(v) for v in gbp.intrinsics)
-    residual = Reprojection(Pinhole(fx, fy, cx, cy), gbp.pixels, sigma=config.sigma_px)
-    problem.add_residuals(residual, cameras[gbp.camera_of], points[gbp.point_of], loss=loss, name="pixels")
-    return cameras, points
-
-
-def _add_colmap(
-    problem: Problem, model: ColmapModel, config: BundleAdjustmentConfig, loss: Loss | None
-) -> tuple[Variables, Variables]:
-    images = problem.add_variables(SE3Left, model.T_camera_world, name="cameras")
-    points = problem.add_variables(Euclidean(3), model.points, name="points")
-    seen = model.point_of >= 0
-    for number, name in enumerate(model.camera_ids):
-        chosen = np.flatnonzero(seen & (model.camera_of[model.image_of] == number))
-        if not len(chosen):
-            continue
-        camera = _pinhole(model, number)
-        connections = [images[model.image_of[chosen]], points[model.point_of[chosen]]]
-        label = f"pixels of camera {name}"
-        if config.intrinsics == "held":
-            held = Reprojection(camera, model.pixels[chosen], sigma=config.sigma_px)
-            problem.add_residuals(held, *connections, loss=loss, name=label)
-            continue
-        free, offset, basis = _free_parameters(model, number, config)
-        refined = ReprojectionTiedIntrinsics(camera, model.pixels[chosen], offset, basis, sigma=config.sigma_px)
-        start = model.camera_params[number][free]
-        intrinsics = problem.add_variables(refined.manifolds[2], start, name=_intrinsics_name(name))
-        problem.add_residuals(refined, *connections, intrinsics, loss=loss, name=label)
-    if not problem.groups:
-        raise InputError("images that see points", f"not a single observation of a point ({model.source})", "triangulate first")
-    return images, points
-
-
-def _intrinsics_name(camera_id: int) -> str:
-    return f"intrinsics of camera {camera_id}"
-
-
-def _layout(model: ColmapModel, number: int) -> NDArray[np.float64]:
-    """(n, m) matrix that turns COLMAP's parameters of a camera into those of `Pinhole`."""
-    name = model.camera_models[number]
-    if name not in _COLMAP_LAYOUT:
-        raise InputError(
-            f"a camera of model {', '.join(_COLMAP_LAYOUT)}",
-            f"{name}, camera {model.camera_ids[number]} ({model.source})",
-            "undistort the images, or convert the camera",
+def _doubt(cheirality: Cheirality, depth: DepthUncertainty) -> str | None:
+    """Why the result is not to be trusted."""
+    reasons = []
+    if not depth.cameras_move_apart:
+        reasons.append("the cameras do not move apart: their rotations are measured, depths and positions are not")
+    if cheirality.bad_share > _BAD_SHARE:
+        count = cheirality.behind + cheirality.left_out
+        reasons.append(
+            f"{count} of {cheirality.count} observations ({cheirality.bad_share:.1%}) are of points behind their cameras at the "
+            "end, or were left out for it"
         )
-    layout = np.zeros((len(_COLMAP_LAYOUT[name]), len(model.camera_params[number])))
-    for row, column in enumerate(_COLMAP_LAYOUT[name]):
-        if column >= 0:
-            layout[row, column] = 1.0
-    return layout
-
-
-def _pinhole(model: ColmapModel, number: int) -> Pinhole:
-    """The camera, in pixels of COLMAP: its centres at half pixels only shift cx and cy."""
-    c = [float(value) for value in _layout(model, number) @ model.camera_params[number]]
-    distortion = None if len(c) == 4 else Radial(c[4], c[5]) if len(c) == 6 else RadialTangential(c[4], c[5], c[6], c[7])
-    return Pinhole(c[0], c[1], c[2], c[3], distortion, _Z_MIN)
-
-
-def _free_parameters(
-    model: ColmapModel, number: int, config: BundleAdjustmentConfig
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Which of COLMAP's parameters are refined, and offset and basis of `ReprojectionTiedIntrinsics` for them."""
-    layout = _layout(model, number)
-    free = np.ones(layout.shape[1], dtype=np.bool_)
-    if config.principal_point == "held":
-        free[list(_COLMAP_LAYOUT[model.camera_models[number]][2:4])] = False
-    return free, layout[:, ~free] @ model.camera_params[number][~free], layout[:, free]
+    return "; ".join(reasons) or None
 
 
 def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -251,38 +171,3 @@ def _notes(point_count: int, camera_of: NDArray[np.int64], point_of: NDArray[np.
     if few_cameras:
         notes.append(f"{few_cameras} cameras see fewer than 4 points: their pose is not determined and stays near the start")
     return tuple(notes)
-
-
-def mean_error_of_points(count: int, errors: NDArray[np.float64], point_of: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(count,) mean distance of every point's observations from its projections [px]; NaN where none can be projected."""
-    seen = np.isfinite(errors)
-    total = np.bincount(point_of[seen], errors[seen], count)
-    times = np.bincount(point_of[seen], minlength=count)
-    return np.where(times > 0, total / np.maximum(times, 1), np.nan)
-
-
-def _with_values(
-    reconstruction: Reconstruction,
-    config: BundleAdjustmentConfig,
-    problem: Problem,
-    solution: Solution,
-    cameras: Variables,
-    points: Variables,
-    errors: NDArray[np.float64],
-    point_of: NDArray[np.int64],
-) -> Reconstruction:
-    T, p_world = solution[cameras], solution[points]
-    if isinstance(reconstruction, BalProblem):
-        vectors = so3.log(quaternion.to_matrix(T[:, :4]))
-        return replace(reconstruction, cameras=np.hstack([vectors, T[:, 4:]]), points=p_world)
-    if isinstance(reconstruction, GbpProblem):
-        return replace(reconstruction, T_camera_world=T, points=p_world)
-    params = [array.copy() for array in reconstruction.camera_params]
-    names = {_intrinsics_name(name): number for number, name in enumerate(reconstruction.camera_ids)}
-    for block in problem.blocks:
-        if block.name in names:
-            number = names[block.name]
-            params[number][_free_parameters(reconstruction, number, config)[0]] = solution[block][0]
-    mean = mean_error_of_points(len(p_world), errors, point_of)
-    known = np.where(np.isfinite(mean), mean, -1.0)
-    return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params), errors=known)

@@ -14,7 +14,8 @@ from boxplus.formats.bal import read_bal
 from boxplus.formats.gbp import read_gbp
 from boxplus.optimization import losses
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentConfig, adjust_bundle
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 
 REFINED = BundleAdjustmentConfig(intrinsics="refined")
 

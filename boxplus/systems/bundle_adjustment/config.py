@@ -1,0 +1,29 @@
+"""Options of bundle adjustment."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus.optimization.solver_options import SolverOptions
+
+# Points far away creep on for many steps that change nothing but their distance.
+_COST_TOLERANCE = 1e-8
+
+
+class BundleAdjustmentConfig(BaseModel):
+    """Options of `adjust_bundle`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sigma_px: float = Field(1.0, gt=0, description="[px] standard deviation of a pixel measurement")
+    intrinsics: Literal["held", "refined"] = Field(
+        "held", description="of COLMAP's cameras; those of a BAL file are always refined, as its cameras carry them"
+    )
+    principal_point: Literal["held", "refined"] = Field(
+        "held", description="of COLMAP's cameras where the intrinsics are refined; few scenes determine it well"
+    )
+    solver: SolverOptions = Field(
+        SolverOptions(cost_tolerance=_COST_TOLERANCE), description="see SolverOptions; stops once the cost settles to 8 digits"
+    )

@@ -1,0 +1,80 @@
+"""Whether the cameras move apart at all, or images that only turn explain everything as well.
+
+Where cameras stand in one place, depths and positions fit nothing but noise, and fit it so well that the curvature at the minimum
+looks as if they were measured. So the images are explained once more with all cameras in one place, everything else free as it
+was. What depths and positions explain beyond that is compared with the noise, as in an F-test of nested models.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.bal import BalProblem
+from boxplus.formats.reconstruction import Reconstruction
+from boxplus.optimization.losses import Loss
+from boxplus.optimization.problem import Problem
+from boxplus.residuals.prior import Prior
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
+from boxplus.systems.bundle_adjustment.sightings import Sightings
+
+_LEAST_NOISE = 0.01  # [px] no pixel is measured better
+_IN_PLACE = 1e8  # information that holds the cameras, where points are at distance 1
+_STEPS, _SETTLED = 30, 1e-4
+
+
+def parallax_ratio(
+    adjusted: Reconstruction, used: NDArray[np.bool_], config: BundleAdjustmentConfig, loss: Loss | None, cost: float
+) -> float:
+    """Cost that depths and positions explain, for each of their numbers, over that of a number that explains noise.
+
+    1 to 2 where the cameras only turn (the best of many depths and positions was chosen), and large where they move apart;
+    infinite where there are too few observations to tell.
+
+    Args:
+        adjusted: where bundle adjustment ended, at `cost`.
+        used: (k,) observations that were adjusted.
+    """
+    problem = Problem()
+    cameras, points = add_reconstruction(problem, _in_one_place(adjusted, used), used, config, loss)
+    seen = np.zeros(len(points), dtype=np.bool_)
+    for group in problem.groups:
+        seen[group.connections[1].rows] = True
+    problem.fix(points[~seen])
+    m, n = len(cameras), int(np.count_nonzero(seen))
+    left = sum(2 * group.residual.count for group in problem.groups) + 7 - 3 * n
+    left -= sum(block.values.shape[0] * block.manifold.dof for block in problem.blocks if block is not points)
+    if left <= 0 or m < 2:
+        return float("inf")
+    information = np.zeros((cameras.manifold.dof, cameras.manifold.dof))
+    information[3:6, 3:6] = _IN_PLACE * np.eye(3)
+    problem.add_residuals(Prior(cameras.manifold, cameras.values, information=information), cameras[:])
+    options = config.solver.model_copy(update={"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": None})
+    without = problem.solve(options)
+    if any(without.invalid.values()):
+        return float("inf")  # no directions before all cameras explain the images
+    noise = max(cost / left, 0.5 * (_LEAST_NOISE / config.sigma_px) ** 2)
+    return float((without.cost - cost) / (n + 3 * (m - 1) - 1) / noise)
+
+
+def _in_one_place(adjusted: Reconstruction, used: NDArray[np.bool_]) -> Reconstruction:
+    """All cameras at the origin, and every point at distance 1 in the mean direction it is seen in."""
+    sightings = Sightings.of(adjusted)
+    rows = np.flatnonzero(used)
+    rays, found = sightings.bearings(rows)
+    own = sightings.R_camera_world[sightings.camera_of[rows[found]]]
+    in_world = np.einsum("nji,nj->ni", own, rays[found] / np.linalg.norm(rays[found], axis=1, keepdims=True))
+    n = len(sightings.points)
+    total = np.stack([np.bincount(sightings.point_of[rows[found]], x, n) for x in in_world.T], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    directions = np.where(length > 0.0, total / np.where(length > 0.0, length, 1.0), sightings.points)
+    if isinstance(adjusted, BalProblem):
+        cameras = adjusted.cameras.copy()
+        cameras[:, 3:6] = 0.0
+        return replace(adjusted, cameras=cameras, points=directions)
+    T = adjusted.T_camera_world.copy()
+    T[:, 4:] = 0.0
+    return replace(adjusted, T_camera_world=T, points=directions)
