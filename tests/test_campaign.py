@@ -118,6 +118,19 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     assert (refused.verdict, refused.false_alarm) == ("flagged", "flagged")
 
 
+def test_an_error_lies_where_it_arose(campaign: SimpleNamespace, seed: int) -> None:
+    judge, simulation = campaign.judge, campaign.draws.draw(seed).truth()
+    wrong = estimate_of(simulation, 3.0)
+    half = len(wrong.p) // 2
+    p = wrong.p.copy()
+    p[:, 1] = estimate_of(simulation).p[:, 1] + np.clip(np.arange(len(p)) - half, 0, 10) * 0.1  # one metre, within ten scans
+    for weak, share in ((slice(half, half + 11), 1.0), (slice(0, half), 0.0), (slice(half + 11, None), 0.0)):
+        status = np.full(len(p), "ok", dtype="<U4")
+        status[weak] = "weak"
+        estimate = replace(wrong, p=p, status=tuple(status.tolist()))
+        assert judge.weak_share_of_error(estimate, judge.errors_of(estimate, simulation)) == pytest.approx(share, abs=1e-6)
+
+
 def test_a_sound_run_that_is_right_can_be_a_false_alarm(campaign: SimpleNamespace, seed: int) -> None:
     judge, draw = campaign.judge, campaign.draws.draw(seed)
     simulation = draw.truth()

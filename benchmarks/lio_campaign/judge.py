@@ -10,6 +10,8 @@ right when at every scan
 - ‖e_p‖ ≤ max(5 cm, 2 % of the true way so far), and ‖e_R‖ ≤ 2 deg;
 - both lie within 5 σ of the covariance the run states for the pose (Mahalanobis distance of three components, with the
   probability of 5 σ of one), or are below 3 cm and 0.3 deg, which nobody minds.
+
+That scans are `weak` or `lost` counts as a flag when at least half of the error arose in such scans, and not otherwise.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ FLOOR_M, SHARE_OF_WAY, LIMIT_DEG = 0.05, 0.02, 2.0
 NOBODY_MINDS_M, NOBODY_MINDS_DEG = 0.03, 0.3
 FIVE_SIGMA = 5.64
 """√χ²₃ whose probability is that of 5 σ in one dimension, 5.7e-7."""
-_WEAK_SCANS_BEFORE = 10
+_STRETCH_SCANS = 10
 
 _CLOCKS = r"clock|time offset|synchron|stamps?\b.*(early|late|apart|shift)|(early|late|apart|offset).* ms\b"
 _MOUNTING = r"T_imu_lidar|extrinsic|mount"
@@ -104,11 +106,14 @@ class Errors:
     """Errors of every scan; see the top of the file.
 
     Attributes:
+        e_p, R_error: (N, 3) position error [m] and (N, 3, 3) rotation error, in the world of the estimate.
         position_m, rotation_deg, position_sigmas, rotation_sigmas, limit_m: (N,) each.
         way_m: true length of the way.
         nees: normalised estimation error squared of the pose, mean over scans after the first, per degree of freedom.
     """
 
+    e_p: NDArray[np.float64]
+    R_error: NDArray[np.float64]
     position_m: NDArray[np.float64]
     rotation_deg: NDArray[np.float64]
     position_sigmas: NDArray[np.float64]
@@ -164,6 +169,8 @@ def errors_of(estimate: Trajectory, truth: Truth) -> Errors:
     P = estimate.covariance
     squared = _mahalanobis(np.concatenate([e_R, e_p], axis=1), P)
     return Errors(
+        e_p=e_p,
+        R_error=R @ np.swapaxes(R_true, 1, 2),
         position_m=np.linalg.norm(e_p, axis=1),
         rotation_deg=np.rad2deg(np.linalg.norm(e_R, axis=1)),
         position_sigmas=np.sqrt(_mahalanobis(e_p, P[:, 3:, 3:])),
@@ -230,7 +237,7 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
     false_alarm = "" if not sound else "flagged" if flags else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
-    weak = errors is not None and _within_weak(outcome, errors)
+    weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
     guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)
@@ -239,11 +246,18 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
     return Verdict("silent", reasons, flags, false_alarm)
 
 
-def _within_weak(outcome: Outcome, errors: Errors) -> bool:
-    """Whether it went wrong in a weak stretch: of the first scan that is wrong and the ten before it, half were weak or lost."""
-    assert outcome.estimate is not None and outcome.estimate.status is not None
-    wrong = np.flatnonzero(errors.too_far | errors.too_sure)
-    if not len(wrong):
-        return False
-    before = outcome.estimate.status[max(wrong[0] - _WEAK_SCANS_BEFORE, 0) : wrong[0] + 1]
-    return sum(status != "ok" for status in before) >= 0.5 * len(before)
+def weak_share_of_error(estimate: Trajectory, errors: Errors) -> float:
+    """How much of the error arose while most scans were weak or lost, 0 to 1.
+
+    Over stretches of ten scans: how far the error moved in each, in units of the limits. An error that arose in a weak stretch
+    and is carried on through good scans lies in the weak stretch; one that grows through good scans does not.
+    """
+    assert estimate.status is not None
+    begins = np.arange(0, len(errors.position_m) - 1, _STRETCH_SCANS)
+    ends = np.minimum(begins + _STRETCH_SCANS, len(errors.position_m) - 1)
+    moved = np.linalg.norm(errors.e_p[ends] - errors.e_p[begins], axis=1) / FLOOR_M
+    turned = np.linalg.norm(so3.log(np.swapaxes(errors.R_error[begins], 1, 2) @ errors.R_error[ends]), axis=1)
+    moved += np.rad2deg(turned) / LIMIT_DEG
+    bad = np.concatenate([[0], np.cumsum([status != "ok" for status in estimate.status])])
+    weak = bad[ends + 1] - bad[begins + 1] >= 0.5 * (ends - begins)
+    return float(moved[weak].sum() / max(moved.sum(), 1e-12))
