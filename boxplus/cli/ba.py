@@ -171,7 +171,7 @@ def _summary(
         method=solution.method,
         linear_solver=solution.linear_solver,
         convention=f"cost ½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over the observations, σ = {config.sigma_px:g} px{rho}",
-        start=_start(result),
+        start=_start(result, loss),
         cost_initial=solution.cost_initial,
         cost=solution.cost,
         errors_initial=ErrorFacts.of(result.errors_start),
@@ -184,11 +184,13 @@ def _summary(
     )
 
 
-def _start(result: BundleAdjustmentResult) -> str:
+def _start(result: BundleAdjustmentResult, loss: Loss | None) -> str:
     found = result.cheirality
     anew = [f"{len(found.triangulated)} points triangulated anew"] if len(found.triangulated) else []
     anew += [f"{len(found.turned_back)} cameras set anew"] if len(found.turned_back) else []
     anew += [f"{found.left_out} observations left out"] if found.left_out else []
+    if loss is not None and loss.is_redescending:
+        anew.append("then the minimum under Huber's loss")
     return ", ".join(["the file's cameras and points", *anew])
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.reconstruction import Reconstruction
+from boxplus.optimization.convex_start import solve_from_convex
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback
 from boxplus.optimization.problem import Problem
@@ -21,6 +22,7 @@ from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_unce
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
 
 _HEAVY, _LOAD = 0.01, 0.9  # a share of the observations, and of the cost, that only wrong matches carry
+_MOST = 0.5  # share of the observations that a robust loss may silence
 _BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
 
@@ -67,6 +69,8 @@ def adjust_bundle(
 ) -> BundleAdjustmentResult:
     """Minimise ½ Σ ρ(‖e/σ‖²) over cameras and points, with the reprojection errors e.
 
+    A redescending loss starts from the minimum under Huber's (`solve_from_convex`): it does not see what is far off.
+
     Nothing is held: Levenberg-Marquardt stays near the start along the seven directions that move the whole scene.
 
     Raises:
@@ -88,7 +92,7 @@ def adjust_bundle(
     start = [block.values for block in problem.blocks]
     errors_start = _errors(problem, start)
     start[cameras.number], start[points.number] = start_values(sound.reconstruction)
-    solution = problem.solve(config.solver, start=start, callback=callback)
+    solution = solve_from_convex(problem, config.solver, start=start, callback=callback)
     errors = _errors(problem, list(solution.values))
     camera_of, point_of = (
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
@@ -106,7 +110,7 @@ def adjust_bundle(
         cheirality=cheirality,
         depth=depth,
         notes=(*notes, *_outliers(errors, loss), *_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth),
+        doubt=_doubt(cheirality, depth, solution),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -128,7 +132,7 @@ def _outliers(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
     ]
 
 
-def _doubt(cheirality: Cheirality, depth: DepthUncertainty) -> str | None:
+def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution) -> str | None:
     """Why the result is not to be trusted."""
     reasons = []
     if not depth.cameras_move_apart:
@@ -139,6 +143,9 @@ def _doubt(cheirality: Cheirality, depth: DepthUncertainty) -> str | None:
             f"{count} of {cheirality.count} observations ({cheirality.bad_share:.1%}) are of points behind their cameras at the "
             "end, or were left out for it"
         )
+    faded = max(solution.faded.values(), default=0.0)
+    if faded > _MOST:
+        reasons.append(f"{faded:.0%} of the observations hardly count under the robust loss: a wrong start, or a sigma too small")
     return "; ".join(reasons) or None
 
 
