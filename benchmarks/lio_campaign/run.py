@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED
+from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_UNTRUSTED
 from boxplus.errors import BoxplusError, InputError
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings import open_recording
@@ -32,7 +32,6 @@ from lio_campaign.draws import Draw, draw
 from lio_campaign.judge import Drawn, Errors, Outcome, Truth, errors_of, judge
 from lio_campaign.real import RealDraw, draw_real, opened_real
 
-EXIT_NOT_TRUSTED = 3
 _ENOUGH_SHARE = 0.01
 """Least eigenvalue of the true information over that of all points, above which no direction of a scan is weak: 2.5 times the
 filter's own threshold."""
@@ -111,7 +110,7 @@ def _in_process(
 
 def exit_code_of(summary: RunSummary) -> int:
     """The exit code of `boxplus lio` for a run that came to its end."""
-    return 0 if summary.contradiction is None else EXIT_NOT_TRUSTED
+    return 0 if summary.contradiction is None else EXIT_UNTRUSTED
 
 
 def _opened(made: Draw, simulation: Simulation, work: Path, options: RecordingOptions) -> Recording:
