@@ -44,7 +44,9 @@ def _summary(lines: Sequence[Line]) -> str:
 
 def _counts(name: str, lines: Sequence[Line]) -> str:
     counts = Counter(line["verdict"] for line in lines)
-    return f"{name}: {len(lines)} runs, " + ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+    sure = sum(line["verdict"] == "silent" and line["reasons"] == ["covariance"] for line in lines)
+    text = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+    return f"{name}: {len(lines)} runs, {text}" + (f" ({sure} of them only too sure of themselves)" if sure else "")
 
 
 def _table(lines: Sequence[Line], kind: str) -> str:
