@@ -20,8 +20,10 @@ import json
 import multiprocessing
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +84,18 @@ def _runs(run: Run, seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]
         yield from map(run, seeds)
         return
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(run, seed) for seed in seeds]):
-            yield future.result()
+        futures = {pool.submit(run, seed): seed for seed in seeds}
+        for future in as_completed(futures):
+            problem = future.exception()
+            yield future.result() if problem is None else _crashed(futures[future], problem)
+
+
+def _crashed(seed: int, problem: BaseException) -> dict[str, Any]:
+    """The line of a run that ended in an exception nobody raised on purpose: a user would see a traceback."""
+    seen = "".join(traceback.format_exception(problem))
+    facts = {"seed": seed, "real": False, **asdict(draw_kinds(seed)), "detail": type(problem).__name__, "verdict": "crashed"}
+    empty = {"reasons": ["no estimate"], "flags": [seen], "false_alarm": "", "worst_m": None, "falsely_weak_scans": []}
+    return facts | empty | {"exit_code": 1, "cpu_s": 0.0}
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -182,7 +182,7 @@ def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, m
     seen_through = campaign.run.run_seed(seed)
     assert (seen_through["verdict"], seen_through["bag"]) == ("right", "true")
     text = campaign.report.report([line, seen_through | {"verdict": "silent", "reasons": ["error"]}])
-    assert "sound: 1 runs, 1 right, 0 right cause, 0 flagged, 0 silent" in text
+    assert "sound: 1 runs, 1 right, 0 right cause, 0 flagged, 0 silent, 0 crashed" in text
     assert f"python benchmarks/campaign.py --seeds {seed}:{seed + 1} -v" in text
 
 
@@ -215,3 +215,18 @@ def test_a_real_recording_is_spoilt_after_its_reader(campaign: SimpleNamespace, 
 
 def test_real_recordings_are_left_out_with_a_reason(campaign: SimpleNamespace, tmp_path: Path) -> None:
     assert campaign.real.why_not(tmp_path) == f"{tmp_path / 'tools' / 'make_lio_recording.py'} is not there"
+
+
+def test_a_crash_is_counted_and_does_not_end_the_campaign(campaign: SimpleNamespace) -> None:
+    script = importlib.import_module("campaign")
+    try:
+        line = script._crashed(3, ZeroDivisionError("by nothing"))
+        assert "ZeroDivisionError: by nothing" in line["flags"][0]
+        text = campaign.report.report([line])
+        assert "== crashed: 1 ==" in text
+        assert "python benchmarks/campaign.py --seeds 3:4 -v" in text
+        assert script._work(script._parse(["--seeds", "0:50", "--only", "fault=none"]))[1] == [
+            seed for seed in range(50) if campaign.draws.draw_kinds(seed).fault == "none"
+        ]
+    finally:
+        del sys.modules["campaign"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-VERDICTS = ("right", "right cause", "flagged", "silent")
+VERDICTS = ("right", "right cause", "flagged", "silent", "crashed")
 _KINDS = ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag")
 Line = dict[str, Any]
 
@@ -20,7 +20,7 @@ def report(lines: Sequence[Line]) -> str:
         mine = [line for line in lines if line["seed"] % 2 == half]
         if mine:
             parts += [f"== {name}: {len(mine)} runs ==", _summary(mine), *(_table(mine, kind) for kind in _KINDS)]
-    parts += [_cases(lines, "silent"), _alarms(lines)]
+    parts += [_cases(lines, "silent", "silently wrong"), _cases(lines, "crashed", "crashed"), _alarms(lines)]
     return "\n".join(part for part in parts if part)
 
 
@@ -71,11 +71,9 @@ def describe(line: Line) -> str:
     return f"{line['seed']:5d} {line['verdict']}{alarm}: {what}; {fault}{via}; {error}"
 
 
-def _cases(lines: Sequence[Line], verdict: str) -> str:
+def _cases(lines: Sequence[Line], verdict: str, name: str) -> str:
     cases = [line for line in lines if line["verdict"] == verdict]
-    if not cases:
-        return "== no run was silently wrong =="
-    rows = [f"== silently wrong: {len(cases)} =="]
+    rows = [f"== {name}: {len(cases)} =="]
     for line in sorted(cases, key=lambda line: (line["fault"], line["seed"])):
         rows += [f"{describe(line)} [{', '.join(line['reasons'])}]", f"      {command(line)}"]
     return "\n".join(rows)
