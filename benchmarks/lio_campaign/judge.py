@@ -37,7 +37,7 @@ _STRETCH_SCANS = 10
 _CLOCKS = r"clock|time offset|synchron|stamps?\b.*(early|late|apart|shift)|(early|late|apart|offset).* ms\b"
 _MOUNTING = r"T_imu_lidar|extrinsic|mount"
 CAUSES: dict[str, str] = {
-    "gyro_unit": r"deg/s|rad/s|gyro.unit|unit of the gyro",
+    "gyro_unit": r"deg/s|gyro.unit|unit of the gyro",
     "accel_unit": r"accel.unit|in g\b|\(g\)|m/s2 or g|unit of the accel",
     "time_unit": r"unit of the point times|point.time|points of a scan span|times in the field",
     "gyro_sign": r"gyro\w*\b.*(sign|negat|invert|opposite|mirror|handed)|(sign|negat|invert|opposite|mirror|handed).*gyro",
@@ -55,7 +55,7 @@ CAUSES: dict[str, str] = {
 }
 """Fault → what a message must say to name its cause (searched in every message, upper or lower case)."""
 _OPTION_CAUSES = {
-    "gyro_unit": r"gyro.unit|deg/s|rad/s",
+    "gyro_unit": r"gyro.unit|deg/s",
     "accel_unit": r"accel.unit",
     "point_time_unit": r"point.time|unit of the point times|points of a scan span",
     "point_time_reference": r"point.time|scan_end|scan_start|reference|" + _CLOCKS,

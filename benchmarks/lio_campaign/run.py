@@ -222,9 +222,11 @@ def _figures(errors: Errors | None) -> dict[str, Any]:
 
 def _facts(outcome: Outcome) -> dict[str, Any]:
     summary = outcome.summary
+    evidence = [] if summary is None else summary.recording.evidence
     return {
         "exit_code": outcome.exit_code,
         "status": {} if summary is None else summary.status,
         "start": None if summary is None or summary.start is None else summary.start.kind,
         "extrinsic_source": None if summary is None else summary.extrinsic.source,
+        "read_as": {entry["key"]: entry["value"] for entry in evidence if entry["key"].endswith("_unit")},
     }
