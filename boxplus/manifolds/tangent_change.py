@@ -26,8 +26,9 @@ from boxplus.manifolds.se3 import SE3, SE3Left
 
 TangentChange = Callable[[int, int, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]], None]
 
-_POSES: tuple[Manifold, ...] = (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)))
-_RIGHT, _LEFT = 0, 1  # positions in _POSES
+POSES: tuple[Manifold, ...] = (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)))
+"""The updates of a pose (7,) that change into each other."""
+_RIGHT, _LEFT = 0, 1  # positions in POSES
 
 
 @kernel
@@ -85,7 +86,7 @@ def tangent_change(native: Manifold, actual: Manifold) -> TangentChange | None:
         raise InputError(
             f"a variable on {native.name}",
             f"one on {actual.name}",
-            f"only the updates of a pose change into each other ({', '.join(pose.name for pose in _POSES)}); "
+            f"only the updates of a pose change into each other ({', '.join(pose.name for pose in POSES)}); "
             "add the variables on the manifold of the residual",
         )
 
@@ -100,8 +101,8 @@ def _parts(native: Manifold, actual: Manifold, stored: int, tangent: int) -> lis
     """(stored, tangent, native code, actual code) of every pose to change; None where another component differs."""
     if native == actual:
         return []
-    if native in _POSES and actual in _POSES:
-        return [(stored, tangent, _POSES.index(native), _POSES.index(actual))]
+    if native in POSES and actual in POSES:
+        return [(stored, tangent, POSES.index(native), POSES.index(actual))]
     if not (isinstance(native, Product) and isinstance(actual, Product) and len(native.components) == len(actual.components)):
         return None
     found = []

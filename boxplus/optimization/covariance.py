@@ -16,6 +16,7 @@ from boxplus.optimization.least_squares import LeastSquares, Values
 from boxplus.optimization.observability.null_space import NullSpace, find_null_space
 from boxplus.optimization.observability.singularity import explain_singularity
 from boxplus.optimization.observability.variable_names import variable_names
+from boxplus.optimization.tangents import to_own_tangent
 from boxplus.optimization.variables import VariableRows
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
@@ -48,7 +49,16 @@ class Covariances:
         blocks = np.zeros((len(first), first.block.manifold.dof, second.block.manifold.dof))
         for k, block in zip(free, self._problem.system.inverse_blocks(i[free], j[free]), strict=True):
             blocks[k] = block
+        to_first, to_second = self._to_own(first), self._to_own(second)
+        if to_first is not None:
+            blocks = to_first @ blocks
+        if to_second is not None:
+            blocks = blocks @ np.swapaxes(to_second, 1, 2)
         return blocks
+
+    def _to_own(self, rows: VariableRows) -> NDArray[np.float64] | None:
+        number = rows.block.number
+        return to_own_tangent(self._problem.layout, number, self._values[number][rows.rows])
 
     def joint(self, selected: Sequence[VariableRows]) -> NDArray[np.float64]:
         """The covariance (D, D) of all selected variables together, tangent after tangent in the order given.
@@ -69,6 +79,14 @@ class Covariances:
         for p, q, block in zip(a, b, self._problem.system.inverse_blocks(number[a], number[b]), strict=True):
             matrix[start[p] : start[p + 1], start[q] : start[q + 1]] = block
             matrix[start[q] : start[q + 1], start[p] : start[p + 1]] = block.T
+        first = 0
+        for rows in selected:
+            to_own = self._to_own(rows)
+            for k, change in enumerate(to_own if to_own is not None else ()):
+                here = slice(int(start[first + k]), int(start[first + k + 1]))
+                matrix[here] = change @ matrix[here]
+                matrix[:, here] = matrix[:, here] @ change.T
+            first += len(rows)
         return 0.5 * (matrix + matrix.T)
 
     def _prepare(self, wanted: NDArray[np.int64]) -> None:

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.least_squares import LeastSquares, inner
-from boxplus.optimization.strategy import Step, Strategy
+from boxplus.optimization.strategy import Step, Strategy, step_scale
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
-_LEAST_DIAGONAL = 1e-14  # as a share of the largest
 _LEAST_RADIUS = 1e-12
 # Where H is singular the Gauss-Newton step is taken with this share of the diagonal added, then ten times more, and so on.
 _FIRST_REGULARIZATION, _LARGEST_REGULARIZATION = 1e-14, 1.0
@@ -92,8 +91,7 @@ def _length(vector: NDArray[np.float64]) -> float:
 
 def _legs(problem: LeastSquares) -> _Legs | None:
     gradient = problem.system.gradient
-    diagonal = problem.system.diagonal
-    squared = np.maximum(diagonal, _LEAST_DIAGONAL * (float(diagonal.max(initial=0.0)) or 1.0))
+    squared = step_scale(problem)
     descent = -gradient / squared
     along = problem.curvature(descent)
     share = 0.0

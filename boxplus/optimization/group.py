@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
-from boxplus.manifolds.tangent_change import tangent_change
+from boxplus.manifolds.manifold import Manifold
+from boxplus.manifolds.tangent_change import TangentChange, tangent_change
 from boxplus.optimization.losses import SQUARED, Loss, Squared
 from boxplus.optimization.variables import VariableRows
 from boxplus.optimization.weighting import (
@@ -111,24 +112,37 @@ class Group:
             self._root = root
             self.set_loss(loss)
 
-    def linearize(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
-        """Fill `r`, `jacobians` and `valid` at the point `values` (one array a block of the problem)."""
-        return self._visit(values, threads, with_jacobians=True)
+    def linearize(
+        self, values: Sequence[NDArray[np.float64]], threads: int, tangents: Sequence[Manifold] | None = None
+    ) -> GroupCost:
+        """Fill `r`, `jacobians` and `valid` at the point `values` (one array a block of the problem).
+
+        Args:
+            tangents: for every block the manifold whose tangents the Jacobians are for; its own where left out.
+        """
+        changes = self._change
+        if tangents is not None:
+            parts = zip(self.residual.manifolds, self.connections, strict=True)
+            changes = [tangent_change(native, tangents[c.block.number]) for native, c in parts]
+        return self._visit(values, threads, changes)
 
     def evaluate(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
         """Cost at the point `values`; overwrites `r` and `valid`, not the Jacobians."""
-        return self._visit(values, threads, with_jacobians=False)
+        return self._visit(values, threads, None)
 
     def accept(self) -> None:
         """The next costs are compared over the residuals that are valid now."""
         self.counted[:] = self.valid
 
-    def _visit(self, values: Sequence[NDArray[np.float64]], threads: int, *, with_jacobians: bool) -> GroupCost:
+    def _visit(
+        self, values: Sequence[NDArray[np.float64]], threads: int, changes: list[TangentChange | None] | None
+    ) -> GroupCost:
+        """Residuals, and unless `changes` is None Jacobians with the change of tangent of every connected variable."""
         x = tuple(values[c.block.number] for c in self.connections)
         residual, factors, diagonal = self.residual, self.residual.whitening.factors, self.residual.whitening.is_diagonal
 
         def work(chunk: int, begin: int, end: int) -> None:
-            if with_jacobians:
+            if changes is not None:
                 residual.linearize_into(begin, end, x, self._index, self.r, self.jacobians, self.valid)
             else:
                 residual.evaluate_into(begin, end, x, self._index, self.r, self.valid)
@@ -140,10 +154,10 @@ class Group:
                 begin, end, self.loss.code, self.loss.scale, self.r, self.valid, self.counted,
                 self._factor, self._projection, self._sums[chunk],
             )  # fmt: skip
-            if not with_jacobians:
+            if changes is None:
                 return
             for slot, J in enumerate(self.jacobians):
-                change = self._change[slot]
+                change = changes[slot]
                 if change is not None:
                     change(begin, end, x[slot], self._index[slot], J)
                 if not self._is_white:

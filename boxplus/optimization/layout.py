@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.group import Group
 from boxplus.optimization.variables import VariableRows, Variables
 
@@ -19,10 +20,13 @@ class Layout:
         number: for every block (n,) int64, the number of each of its variables, −1 where it is fixed.
         sizes: (free variables,) int64 degrees of freedom of each.
         start: (free variables + 1,) int64, where each begins in the tangent vector; the last is its length.
+        tangents: for every block the manifold by whose ⊞ the solver moves it; its own, or another one that stores the same
+            points (`tangents.best_tangents`).
     """
 
     def __init__(self, blocks: Sequence[Variables], without: Variables | None = None) -> None:
         self.blocks = tuple(blocks)
+        self.tangents: tuple[Manifold, ...] = tuple(block.manifold for block in self.blocks)
         self.number: list[NDArray[np.int64]] = []
         count = 0
         sizes = []
@@ -57,20 +61,37 @@ class Layout:
     def boxplus(self, values: Sequence[NDArray[np.float64]], delta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """values ⊞ δ, block by block; fixed variables stay."""
         moved = []
-        for block, number, x in zip(self.blocks, self.number, values, strict=True):
+        for tangent, number, x in zip(self.tangents, self.number, values, strict=True):
             free = np.flatnonzero(number >= 0)
             if not len(free):
                 moved.append(x)
                 continue
             begin = int(self.start[number[free[0]]])
-            step = delta[begin : begin + len(free) * block.manifold.dof].reshape(len(free), block.manifold.dof)
+            step = delta[begin : begin + len(free) * tangent.dof].reshape(len(free), tangent.dof)
             if len(free) == len(x):
-                moved.append(block.manifold.boxplus(x, step))
+                moved.append(tangent.boxplus(x, step))
             else:
                 y = x.copy()
-                y[free] = block.manifold.boxplus(x[free], step)
+                y[free] = tangent.boxplus(x[free], step)
                 moved.append(y)
         return moved
+
+    def largest_of_kind(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """For every tangent the largest entry among those of its kind, the same axis of all variables of the block.
+
+        Entries of one kind have one unit and compare, whatever the units of the problem.
+
+        Args:
+            diagonal: (dof,) not negative.
+        """
+        largest = np.empty_like(diagonal)
+        for tangent, number in zip(self.tangents, self.number, strict=True):
+            free = number[number >= 0]
+            if len(free):
+                own = slice(int(self.start[free[0]]), int(self.start[free[-1] + 1]))
+                kinds = diagonal[own].reshape(len(free), tangent.dof)
+                largest[own].reshape(kinds.shape)[:] = kinds.max(axis=0)
+        return largest
 
     def describe(self, number: int) -> str:
         """Name of a free variable, such as `poses[12]`."""

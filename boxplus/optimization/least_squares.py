@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, NotFiniteError
+from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.group import Group, GroupCost
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.linear_system import LinearSystem
+from boxplus.optimization.tangents import best_tangents
 from boxplus.optimization.weighting import add_product_with_jacobian
 
 Values = Sequence[NDArray[np.float64]]
@@ -38,6 +40,8 @@ class LeastSquares:
         self.timing_s = {"residuals and Jacobians": 0.0, "normal equations": 0.0, "linear solve": 0.0}
         self._threads = threads
         self._linearized: Values = ()
+        self._tangents: tuple[Manifold, ...] | None = None  # where they are not the blocks' own
+        self._has_tangents = False
 
     def start(self, values: Values) -> None:
         """Linearise at `values` and accept them.
@@ -56,6 +60,12 @@ class LeastSquares:
                 "none that can",
                 "start from values where points lie before their cameras",
             )
+        if not self._has_tangents:
+            self._has_tangents = True
+            best = best_tangents(self.layout, self.groups, values)
+            if best != self.layout.tangents:
+                self.layout.tangents = self._tangents = best
+                cost = self.linearize(values)
         self.accept(values, cost)
 
     def linearize(self, values: Values) -> GroupCost:
@@ -64,7 +74,7 @@ class LeastSquares:
         self._linearized = values
         total = GroupCost(0.0, 0.0, 0, 0)
         for group in self.groups:
-            total = total + group.linearize(values, self._threads)
+            total = total + group.linearize(values, self._threads, self._tangents)
         self.timing_s["residuals and Jacobians"] += time.perf_counter() - begin
         return total
 

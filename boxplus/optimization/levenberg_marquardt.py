@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus.optimization.least_squares import LeastSquares, inner
-from boxplus.optimization.strategy import Step, Strategy
+from boxplus.optimization.strategy import Step, Strategy, step_scale
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
-# Smaller entries of diag(H), as a share of the largest, do not scale the damping: a direction without information is damped too.
-_LEAST_DIAGONAL = 1e-14
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-16, 1e16
 
 
@@ -32,8 +29,9 @@ class LevenbergMarquardt(Strategy):
         if self.parameter == 0.0:
             largest = float(diagonal.max(initial=0.0))
             self.parameter = self._initial * (1.0 if self._damping == "diagonal" else (largest or 1.0))
+        scale = step_scale(problem) if self._damping == "diagonal" else np.ones_like(diagonal)
         while self.parameter <= _LARGEST_DAMPING * max(1.0, float(diagonal.max(initial=0.0))):
-            D = self.parameter * self._scale(diagonal)
+            D = self.parameter * scale
             try:
                 delta = problem.solve(D)
             except NotPositiveDefinite:
@@ -41,11 +39,6 @@ class LevenbergMarquardt(Strategy):
                 continue
             return Step(delta, 0.5 * inner(delta, D * delta - problem.system.gradient))
         return None
-
-    def _scale(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        if self._damping == "diagonal":
-            return np.maximum(diagonal, _LEAST_DIAGONAL * (float(diagonal.max(initial=0.0)) or 1.0))
-        return np.ones_like(diagonal)
 
     def _grow(self) -> None:
         self.parameter *= self._growth

@@ -19,6 +19,18 @@ class Step:
     predicted: float
 
 
+# Smaller entries of diag(H), as a share of the largest of their kind, do not scale steps: what has no information is damped too.
+_LEAST_DIAGONAL = 1e-14
+
+
+def step_scale(problem: LeastSquares) -> NDArray[np.float64]:
+    """diag(H) (dof,), positive also where nothing is measured."""
+    diagonal = problem.system.diagonal
+    largest = problem.layout.largest_of_kind(diagonal)
+    overall = float(largest.max(initial=0.0)) or 1.0
+    return np.maximum(diagonal, _LEAST_DIAGONAL * np.where(largest > 0.0, largest, overall))
+
+
 class Strategy(ABC):
     """Proposes steps from the accepted point and learns from their fate.
 

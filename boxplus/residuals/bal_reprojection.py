@@ -11,8 +11,9 @@ Jacobians, with Π = ∂(f s p)/∂P, which is the P of SPEC.md 3.1 for this cam
     ∂e/∂[f, k1, k2] = −[s p, f |p|² p, f |p|⁴ p]
     ∂e/∂p_world     = −Π R
 
-Singular: |P_z| ≤ z_min is invalid. The scale of these problems is arbitrary and their files hold points behind cameras,
-which the model projects all the same; that is why z_min is small here and the sign of P_z is not asked for.
+Singular: |P_z| ≤ z_min (|P_x| + |P_y|), a point in the plane of the camera, is invalid. The scale of these problems is arbitrary,
+so that z_min is a share. Their files hold points behind cameras, which the model projects all the same, mirrored; the sign of P_z
+is not asked for here. `adjust_bundle` does ask, counts them and repairs them.
 
 Source: SPEC.md 3.1 to 3.4; https://grail.cs.washington.edu/projects/bal.
 """
@@ -72,8 +73,9 @@ def _bal_reprojection(
         y = r10 * px + r11 * py + r12 * pz + cameras[i, 5]
         z = r20 * px + r21 * py + r22 * pz + cameras[i, 6]
         # Written so that a NaN passes on into the residual, where it is seen and named.
-        valid[n] = not abs(z) <= z_min
-        if abs(z) <= z_min:
+        in_plane = abs(z) <= z_min * (abs(x) + abs(y))
+        valid[n] = not in_plane
+        if in_plane:
             r[n, 0] = 0.0
             r[n, 1] = 0.0
             if with_jacobians:
@@ -128,7 +130,7 @@ class BalReprojection(Residual):
     Args:
         pixels: (N, 2) measured, relative to the principal point, u to the right and v upwards [px].
         sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
-        z_min: |depth| up to which a residual is invalid [unit of the points].
+        z_min: |depth| up to which a residual is invalid, as a share of |P_x| + |P_y|.
 
     Raises:
         InputError: `pixels` of another shape or not finite, `z_min` negative or not finite, or noise that `Whitening.of`
@@ -142,10 +144,10 @@ class BalReprojection(Residual):
         sigma: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
-        z_min: float = 1e-6,
+        z_min: float = 1e-9,
     ) -> None:
         if not (math.isfinite(z_min) and z_min >= 0.0):
-            raise InputError("z_min finite and not negative", f"{z_min}", "leave it out for 1e-6")
+            raise InputError("z_min finite and not negative", f"{z_min}", "leave it out for 1e-9")
         self.pixels, self.z_min = check_pixels("pixels", pixels), float(z_min)
         count = len(self.pixels)
         super().__init__(

@@ -142,7 +142,7 @@ def _test(
     planar = True
     for part, kind in zip(parts, reading, strict=True):
         x = problem.values[part.block.number][part.rows]
-        B[part.places] = motions_of(part.block.manifold, kind, x).reshape(-1, DOF)
+        B[part.places] = motions_of(problem.layout.tangents[part.block.number], kind, x).reshape(-1, DOF)
         position = positions_of(part.block.manifold, kind, x)
         if position is not None:
             places.append(position)
@@ -269,7 +269,7 @@ def _tangents_text(problem: LeastSquares, shared: SharedDirections, direction: N
     named = []
     for part in _parts(problem, shared):
         tangents = direction[part.places].reshape(len(part.rows), -1)
-        for axis, name in enumerate(part.block.manifold.tangent_names):
+        for axis, name in enumerate(problem.layout.tangents[part.block.number].tangent_names):
             peak = tangents[np.argmax(np.abs(tangents[:, axis])), axis] / largest
             if abs(peak) > 0.1:
                 named.append((abs(peak), f"{peak:+.2f} {name} of {part.block.name}"))

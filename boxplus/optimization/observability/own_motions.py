@@ -57,10 +57,20 @@ def _seen_from_one_place(problem: LeastSquares, number: NDArray[np.int64]) -> st
     names, seen = variable_names(problem.layout, number), touching_groups(problem, number)
     if len(number) == 1:
         return f"{names} can move along its viewing ray: it is seen from one place only; residuals touching it: {seen}"
+    touching = [problem.layout.numbers(c) for group in problem.groups for c in group.connections]
+    times = sum(int(np.isin(of, number).sum()) for of in touching)
+    # Seen more than once each, and still from one place.
+    turning = times >= 2 * len(number) and len(number) == _free_like(problem, number)
+    apart = ", the cameras do not move apart and no depth is determined" if turning else ""
     return (
-        f"{names} can move along their viewing rays: each of the {len(number)} is seen from one place only; "
+        f"{names} can move along their viewing rays: each of the {len(number)} is seen from one place only{apart}; "
         f"residuals touching them: {seen}"
     )
+
+
+def _free_like(problem: LeastSquares, number: NDArray[np.int64]) -> int:
+    """How many free variables the block of these has."""
+    return next(int(np.count_nonzero(own >= 0)) for own in problem.layout.number if np.isin(number[0], own))
 
 
 def _plain(problem: LeastSquares, block: Variables, alone: OwnDirections) -> list[str]:
@@ -75,7 +85,7 @@ def _plain(problem: LeastSquares, block: Variables, alone: OwnDirections) -> lis
     if block.manifold in (Euclidean(2), Euclidean(3)):
         how = f"along {vector_text(first)}"
     else:
-        parts = zip(first, block.manifold.tangent_names, strict=True)
+        parts = zip(first, problem.layout.tangents[block.number].tangent_names, strict=True)
         named = [(abs(w), f"{w:+.2f} {name}") for w, name in parts if abs(w) > 0.05]
         how = f"along ({', '.join(text for _, text in sorted(named, reverse=True)[:4])})"
     return [f"{names} can move freely {how}; residuals touching {_them(alone)}: {seen}"]

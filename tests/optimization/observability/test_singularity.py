@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus import SE2, SE3, Euclidean, InputError, Line3D, Pinhole, Problem, SE3Left, SingularProblemError
-from boxplus.manifolds import lines, se2, se3
+from boxplus.manifolds import lines, quaternion, se2, se3
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.observability.variable_names import variable_names
 from boxplus.residuals import LineReprojection, Prior, RelativePose, RelativePose2D, Reprojection, UserResidual
@@ -278,3 +278,24 @@ def test_levenberg_marquardt_solves_gauge_free_problems_and_says_so():
 def test_errors_of_other_kinds_keep_theirs():
     with pytest.raises(InputError, match="at least one group"):
         Problem().solve(method="gauss_newton")
+
+
+def test_cameras_that_only_turn_determine_no_depth():
+    """Exact pixels from three cameras in one place, and held poses."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (9, 2)), rng.uniform(4.0, 8.0, 9)])
+    poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1))
+    poses = SE3Left.boxplus(poses, np.hstack([rng.uniform(-0.1, 0.1, (3, 3)), np.zeros((3, 3))]))
+    camera_of, point_of = (grid.ravel() for grid in np.mgrid[:3, :9])
+    camera = Pinhole(500.0, 500.0, 320.0, 240.0)
+    in_camera = np.einsum("nij,nj->ni", quaternion.to_matrix(poses[camera_of, :4]), points[point_of])
+    problem = Problem()
+    T = problem.add_variables(SE3Left, poses, name="cameras")
+    p = problem.add_variables(Euclidean(3), points, name="points")
+    residual = Reprojection(camera, camera.project(in_camera)[0])
+    problem.add_residuals(residual, T[camera_of], p[point_of], name="pixels")
+    problem.fix(T)
+    with pytest.raises(SingularProblemError) as error:
+        problem.solve().covariance(p[0])
+    told = "each of the 9 is seen from one place only, the cameras do not move apart and no depth is determined"
+    assert told in str(error.value)

@@ -12,6 +12,7 @@ from small_problems import PARAMS, SIGMA_PX, bal_problem, colmap_model, gbp_prob
 from boxplus.errors import InputError
 from boxplus.formats.bal import read_bal
 from boxplus.formats.gbp import read_gbp
+from boxplus.manifolds import quaternion, so3
 from boxplus.optimization import losses
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
@@ -133,3 +134,37 @@ def test_a_bad_start_by_design(shared_data):
     assert result.solution.status == "converged" and result.solution.invalid == {"pixels": 0}
     assert np.isfinite(result.errors).all()
     assert result.solution.cost == pytest.approx(19297.626, rel=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6])
+@pytest.mark.parametrize("format", ["bal", "gbp", "colmap"])
+def test_the_unit_of_length_does_not_matter(format, scale):
+    start = {"bal": bal_problem, "gbp": gbp_problem, "colmap": lambda: colmap_model("SIMPLE_PINHOLE")}[format]()
+    scaled = replace(start, points=start.points * scale)
+    if format == "bal":
+        scaled = replace(scaled, cameras=start.cameras * np.repeat([1.0, scale, 1.0], 3))
+    else:
+        scaled = replace(scaled, T_camera_world=start.T_camera_world * np.repeat([1.0, scale], [4, 3]))
+    one, other = adjust_bundle(start), adjust_bundle(scaled)
+    assert other.solution.status == "converged" and other.doubt is None
+    assert other.solution.cost == pytest.approx(one.solution.cost, rel=1e-6)
+    assert_allclose(other.errors, one.errors, atol=1e-2)
+    assert_allclose(other.depth.ratio, one.depth.ratio, rtol=1e-3)
+
+
+@pytest.mark.parametrize("format", ["bal", "gbp"])
+def test_the_origin_of_the_world_does_not_matter(format):
+    start = bal_problem() if format == "bal" else gbp_problem()
+    shift = np.array([1e6, -3e5, 2e5])
+    if format == "bal":
+        moved = start.cameras.copy()
+        moved[:, 3:6] -= so3.exp(moved[:, :3]) @ shift
+        far = replace(start, cameras=moved, points=start.points + shift)
+    else:
+        moved = start.T_camera_world.copy()
+        moved[:, 4:] -= quaternion.to_matrix(np.ascontiguousarray(moved[:, :4])) @ shift
+        far = replace(start, T_camera_world=moved, points=start.points + shift)
+    one, other = adjust_bundle(start), adjust_bundle(far)
+    assert other.solution.cost == pytest.approx(one.solution.cost, rel=1e-6)
+    assert_allclose(other.reconstruction.points - shift, one.reconstruction.points, atol=1e-5)
+    assert_allclose(other.depth.ratio, one.depth.ratio, rtol=1e-5)
