@@ -50,7 +50,8 @@ def lio(
     """Turn a recording into a trajectory, a map and a report.
 
     No configuration is needed: topics, times and units are found from the data, with the evidence printed. Exit codes: 0 done,
-    1 the results could not be written, 2 bad input, 130 interrupted (results up to there are complete).
+    1 the results could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other), 130
+    interrupted (results up to there are complete).
     """
     from boxplus.runs.config import load_run_config
     from boxplus.runs.transform import parse_transform
@@ -73,6 +74,8 @@ def lio(
     summary = run(recording, folder, run_config, overwrite=overwrite, view=view, report=not no_report)
     if summary.state == "interrupted":
         raise typer.Exit(130)
+    if summary.contradiction is not None:
+        raise typer.Exit(3)
 
 
 def run(

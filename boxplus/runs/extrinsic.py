@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,17 +12,22 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.recordings.recording import Event, Recording
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.lidar_rotation import RotationAlignment, estimate_rotation_extrinsic
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import thinned
+from boxplus.systems.lidar_inertial_agreement.translation import ARM
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-
-_LOG = logging.getLogger(__name__)
 
 Source = Literal["given", "recording", "estimated", "identity"]
 
 _TURNING_RAD_S = 0.15
-_STRETCH_S = 12.0
-_SEARCH_S = 120.0
+_ESTIMATE = 12.0, 120.0  # length of the stretch, and how far it is looked for [s]
+_CHECK = 6.0, 20.0
+_WIDE_DEG, _WIDE_M = 10.0, 0.3
+_LEVER_EXPLAINED = 0.8
+_LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
+_UNIT_ADVICE = "give --gyro-unit"
 _MOST_POINTS = 20_000
 """Of a scan that is kept for the estimate; 12 s of scans stay below 50 MB."""
 
@@ -37,7 +41,8 @@ class Extrinsic:
         source: "given" (option or configuration), "recording" (its static transforms), "estimated" or "identity".
         text: one sentence.
         refine: it is a guess, to be refined while running wherever the motion allows.
-        warning: what the user should do about it; empty when it is given.
+        warning: what the user should do about it; empty when it is given and nothing contradicts it.
+        sigma: standard deviations of rotation [deg] and translation [m]; None leaves those of the configuration.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -45,61 +50,89 @@ class Extrinsic:
     text: str
     refine: bool
     warning: str
+    sigma: tuple[float, float] | None = None
 
     def applied_to(self, config: LioConfig) -> LioConfig:
         """The configuration with this extrinsic; a guess is refined online unless the configuration decides."""
         changes: dict[str, object] = {"T_imu_lidar": tuple(map(tuple, self.T_imu_lidar.tolist()))}
         if self.refine and "extrinsic_estimation" not in config.model_fields_set:
             changes["extrinsic_estimation"] = "gated"
+        if self.sigma is not None:
+            changes["extrinsic_rotation_sigma_deg"], changes["extrinsic_translation_sigma"] = self.sigma
         return LioConfig.model_validate(config.model_dump() | changes)
 
 
 def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
     """The extrinsic from the configuration, else from the recording's static transforms, else estimated.
 
-    The estimate aligns the rotation rates of gyroscope and LiDAR over the first seconds of rotation
-    (`estimate_rotation_extrinsic`); when they do not determine the rotation, it stays the identity. The translation
-    cannot be seen that way and starts at zero.
+    Either way gyroscope, accelerometer and LiDAR are compared over the first seconds of rotation (`compare_sensors`): without a
+    given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations; with one,
+    what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
+    deviation.
 
     Raises:
         RecordingError: nothing at all could be read.
+        InputError: the LiDAR shows that the gyroscope is in another unit than it is read in.
     """
+    known = _known_extrinsic(recording, config)
+    stretch = _turning_stretch(recording, *(_CHECK if known is not None else _ESTIMATE))
+    agreement = None
+    if stretch is not None:
+        declared = None if known is None else known.T_imu_lidar
+        agreement = compare_sensors(*stretch, config, T_declared=declared, refine=known is None)
+        for finding in contradictions(agreement, declared):
+            if finding.cause == "gyro_unit":
+                raise InputError(
+                    f"angular velocities in {recording.info.gyro_unit}, as they are read", finding.text, _UNIT_ADVICE
+                )
+            if known is not None:
+                known = replace(known, warning=finding.text)
+    return known if known is not None else _estimated(agreement)
+
+
+def _known_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic | None:
     if config.T_imu_lidar is not None:
         return Extrinsic(np.array(config.T_imu_lidar), "given", "T_imu_lidar as given", False, "")
     if recording.info.T_imu_lidar is not None:
         text = f"T_imu_lidar from {recording.info.T_imu_lidar_source or 'the recording'}"
         return Extrinsic(recording.info.T_imu_lidar, "recording", text, False, "")
+    return None
+
+
+def _estimated(agreement: Agreement | None) -> Extrinsic:
+    """As far as the comparison determined it."""
     unknown = "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted"
     remedy = "give --T-imu-lidar for the best result"
-    try:
-        alignment = _align(recording)
-    except InputError as error:
-        _LOG.info("no estimate of the extrinsic: %s", error)
-        why = f"the rotation could not be estimated either ({error})"
+    T, wide = np.eye(4), (_WIDE_DEG, _WIDE_M)
+    rotation = None if agreement is None else agreement.rotation
+    if agreement is None or rotation is None or not judges_rotation(agreement):
+        why = "the platform does not turn enough at the beginning to estimate it, or the LiDAR sees too little"
         return Extrinsic(
-            np.eye(4), "identity", f"identity assumed: {unknown}; {why}", True, f"{unknown}: identity assumed; {why}; {remedy}"
+            T, "identity", f"identity assumed: {unknown}; {why}", True, f"{unknown}: identity assumed; {why}; {remedy}", wide
         )
-    if alignment.observable_axes < 3:
-        why = f"the first rotations do not determine it: {alignment.text}"
-        return Extrinsic(np.eye(4), "identity", f"identity assumed: {why}", True, f"{unknown}: identity assumed; {why}; {remedy}")
-    T = np.eye(4)
-    T[:3, :3] = alignment.R_imu_lidar
-    angle = np.degrees(np.arccos(np.clip((np.trace(alignment.R_imu_lidar) - 1.0) / 2.0, -1.0, 1.0)))
-    text = f"rotation estimated from the data ({angle:.1f} deg from identity), translation begins at zero: {alignment.text}"
-    warning = (
-        f"{unknown}: its rotation was estimated from the data ({angle:.1f} deg from identity, "
-        f"std {alignment.std_deg.max():.2f} deg), its translation begins at zero, both are refined while running; {remedy}"
+    T[:3, :3] = rotation.R_imu_lidar
+    std_deg = np.degrees(rotation.rotation_std[0])
+    angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    translation = agreement.translation
+    std_m = np.full(3, _WIDE_M)
+    if translation is not None and translation.explained > _LEVER_EXPLAINED:
+        T[:3, 3] = translation.p_imu_lidar
+        # Neighbouring poses of the path share their errors, which the covariance does not know.
+        std_m = np.minimum(_LEVER_CAUTION * np.sqrt(np.diag(translation.covariance)[ARM]) + _LEVER_FLOOR_M, _WIDE_M)
+    numbers = ", ".join(f"{value:.3f}" for value in T[:3, 3])
+    text = (
+        f"estimated over {rotation.intervals} scan pairs: {angle:.1f} deg from identity (std "
+        f"{', '.join(f'{value:.1f}' for value in std_deg)} deg about its principal axes), translation ({numbers}) m (std "
+        f"{', '.join(f'{value:.2f}' for value in std_m)} m)"
     )
-    return Extrinsic(T, "estimated", text, True, warning)
+    if std_deg[-1] > _WIDE_DEG:
+        text += "; the motion turns about too few axes to determine the rest"
+    sigma = (float(np.clip(std_deg[-1], 0.3, _WIDE_DEG)), float(std_m.max()))
+    return Extrinsic(T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma)
 
 
-def _align(recording: Recording) -> RotationAlignment:
-    scans, imu = _turning_stretch(recording)
-    return estimate_rotation_extrinsic(scans, imu)
-
-
-def _turning_stretch(events: Iterable[Event]) -> tuple[list[Scan], ImuSamples]:
-    """Scans and samples of the first seconds in which the IMU turns, in bounded memory."""
+def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) -> tuple[list[Scan], ImuSamples] | None:
+    """Scans and samples of the first seconds in which the IMU turns, in bounded memory; None where there are not both."""
     scans: list[Scan] = []
     blocks: list[ImuSamples] = []
     first_ns = begin_ns = None
@@ -113,24 +146,14 @@ def _turning_stretch(events: Iterable[Event]) -> tuple[list[Scan], ImuSamples]:
             if begin_ns is None and np.nanmax(np.linalg.norm(event.gyro, axis=1), initial=0.0) > _TURNING_RAD_S:
                 begin_ns = now_ns
         elif len(event):
-            scans.append(_thinned(event))
+            scans.append(thinned(event, _MOST_POINTS))
         since_s = (now_ns - (first_ns if begin_ns is None else begin_ns)) * 1e-9
-        if since_s > (_SEARCH_S if begin_ns is None else _STRETCH_S):
+        if since_s > (search_s if begin_ns is None else length_s):
             break
-        if begin_ns is None:  # keep one second before the motion
-            scans = [scan for scan in scans if scan.end_ns > now_ns - 1_000_000_000]
-            blocks = [block for block in blocks if block.time_ns[-1] > now_ns - 1_000_000_000]
-    if not blocks:
-        raise InputError("IMU samples", "none at the beginning of the recording", "give --T-imu-lidar")
-    return scans, ImuSamples(
-        np.concatenate([block.time_ns for block in blocks]),
-        np.concatenate([block.gyro for block in blocks]),
-        np.concatenate([block.accel for block in blocks]),
-    )
-
-
-def _thinned(scan: Scan) -> Scan:
-    stride = -(-len(scan) // _MOST_POINTS)
-    if stride == 1:
-        return scan
-    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns)
+        if begin_ns is None:  # keep what would be compared if it never turned
+            scans = [scan for scan in scans if scan.end_ns > now_ns - length_s * 0.5e9]
+            blocks = [block for block in blocks if block.time_ns[-1] > now_ns - length_s * 0.5e9]
+    if not blocks or not scans:
+        return None
+    joined = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time_ns", "gyro", "accel"))
+    return scans, ImuSamples(*joined)

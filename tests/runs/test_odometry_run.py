@@ -308,7 +308,8 @@ def test_extrinsic_is_estimated_when_nobody_gives_it() -> None:
     assert extrinsic.applied_to(config).extrinsic_estimation == "gated"
     decided = load_run_config(settings=["extrinsic_estimation=off"]).odometry
     assert extrinsic.applied_to(decided).extrinsic_estimation == "off"
-    if extrinsic.source == "estimated":
+    assert extrinsic.sigma is not None
+    if extrinsic.sigma[0] < 5.0:  # the turn about one axis leaves the rotation about it open
         turn = extrinsic.T_imu_lidar[:3, :3].T @ simulation.T_imu_lidar[:3, :3]
         assert np.degrees(np.arccos((np.trace(turn) - 1.0) / 2.0)) < 5.0
 

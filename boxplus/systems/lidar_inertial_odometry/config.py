@@ -19,6 +19,12 @@ class LioConfig(BaseModel):
     T_imu_lidar: tuple[tuple[float, ...], ...] | None = Field(
         None, description="pose of the LiDAR in the IMU frame, 4×4 row-major: p_imu = T_imu_lidar p_lidar; None is the identity"
     )
+    extrinsic_rotation_sigma_deg: float = Field(
+        0.2, gt=0, description="standard deviation of the rotation in T_imu_lidar, about each axis [deg]"
+    )
+    extrinsic_translation_sigma: float = Field(
+        0.005, gt=0, description="standard deviation of the translation in T_imu_lidar, along each axis [m]"
+    )
     extrinsic_estimation: Literal["off", "on", "gated"] = Field(
         "off", description="refine T_imu_lidar while running: never, always, or only while the motion makes it observable"
     )

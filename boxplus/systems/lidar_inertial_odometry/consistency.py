@@ -1,59 +1,61 @@
-"""Whether gyroscope, LiDAR, mounting and point times agree; what does not is said in a sentence.
+"""Whether the LiDAR bears out what the IMU predicts, scan by scan.
 
-The filter corrects what it predicted wrongly, scan after scan, and hides a wrong unit or mounting that way. Two cheap sums show
-it: corrections of the rotation that grow with the rotation itself, and points that no longer fit the map. Either one only raises
-a suspicion; it is settled by registering the last scans without the IMU and comparing both rotations
-(`sensors.lidar_rotation`), which no error of the filter can distort.
+The filter corrects what it predicted wrongly, scan after scan, and hides a wrong unit, mounting or clock that way. Cheap sums
+over the scans raise a suspicion: corrections of the rotation that grow with the rotation itself, corrections far beyond what
+the prediction's covariance allows, points that no longer fit the map. What is behind it is found by comparing the sensors
+without the filter (`lidar_inertial_agreement.watch`); a contradiction that lasts is named even where that cannot tell its cause.
 """
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import InputError
-from boxplus.filtering.nav_state import RL, R
+from boxplus.filtering.degeneracy import PoseDirections
+from boxplus.filtering.nav_state import PL, RL, TANGENT, P, R, V, boxminus_into
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.lidar_rotation import RotationAlignment, estimate_rotation_extrinsic
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_odometry.start import joined_imu
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.watch import Watch
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
-_KEPT_SCANS = 40
-_FEWEST_SCANS = 25
-_SCANS_BETWEEN_CHECKS = 50
-_KEEP = 0.96  # of both sums, from scan to scan
+_KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything
-_SUSPICIOUS_SHARE = 0.02  # of the squared rotation, corrected: a mounting 8 degrees off, or a scale 14 % off
-_DEGREES = (30.0, 110.0)  # gyroscope over LiDAR: 57.3 is deg/s taken for rad/s
-_WRONG_ANGLE_DEG = 8.0
-_KNOWN_DEG = 5.0
+_SUSPICIOUS_SHARE = 0.01  # of the squared rotation, corrected
+_INNOVATION_KEEP = 0.8
+_SUSPICIOUS_INNOVATION, _CONTRADICTED_INNOVATION = 2.0, 25.0  # mean square of the innovation, in variances a direction
+_CONTRADICTED_STREAK_S = 1.0
 _LOST_STREAK = 3
 _SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
+_FASTEST_M_S = 120.0
+_MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
 
 
 class Consistency:
     """Follows the scans of one run.
 
     Args:
-        min_matched_share: with less than this share of the points on the map, three scans in a row, the estimate is lost.
-
-    Attributes:
-        contradiction: what the last comparison of gyroscope and LiDAR found wrong, a sentence; None while they agree.
+        config: of the odometry.
+        T_declared: T_imu_lidar (4, 4) as given; None where it is estimated while running.
     """
 
-    def __init__(self, min_matched_share: float) -> None:
-        self._min_matched_share = min_matched_share
-        self._frames: deque[Frame] = deque(maxlen=_KEPT_SCANS)
+    def __init__(self, config: LioConfig, T_declared: NDArray[np.float64] | None) -> None:
+        self._min_matched_share = config.min_matched_share
+        self._watch = Watch(config, T_declared)
         self._turned = 0.0
         self._corrected = 0.0
+        self._innovation = 0.0
+        self._contradicted_since_ns: int | None = None
+        self._innovation_text: str | None = None
         self._unmatched = 0
-        self._until_check = 0
         self._previous_start_ns: int | None = None
         self._told: set[str] = set()
-        self.contradiction: str | None = None
+
+    @property
+    def contradiction(self) -> str | None:
+        """What makes the estimate not to be trusted; a sentence."""
+        found = self._watch.contradiction
+        return found.text if found is not None else self._innovation_text
 
     @property
     def lost(self) -> bool:
@@ -65,29 +67,40 @@ class Consistency:
         frame: Frame,
         x_before: NDArray[np.float64],
         x_prior: NDArray[np.float64],
+        cov_prior: NDArray[np.float64],
         x: NDArray[np.float64],
         matched_share: float,
+        directions: PoseDirections | None,
     ) -> list[str]:
         """Take one scan in; returns what is wrong, one sentence each.
 
         Args:
             frame: the scan and its IMU samples.
             x_before, x_prior, x: (36,) state at the end of the scan before, predicted, and after the update.
+            cov_prior: (24, 24) of the prediction.
             matched_share: points that lie on the map over points filtered.
+            directions: of the pose that the scan determined; None if there was no update.
         """
-        self._frames.append(frame)
         self._unmatched = self._unmatched + 1 if matched_share < self._min_matched_share else 0
         before = x_before[R : R + 9].reshape(3, 3)
         predicted = _turn(before.T @ x_prior[R : R + 9].reshape(3, 3))
-        corrected = _turn(before.T @ x[R : R + 9].reshape(3, 3)) - predicted
-        self._turned = _KEEP * self._turned + float(predicted @ predicted)
+        measured = _turn(before.T @ x[R : R + 9].reshape(3, 3))
+        corrected = measured - predicted
+        # Of whichever sensor turned more: a gyroscope that claims not to turn is wrong as well.
+        self._turned = _KEEP * self._turned + max(float(predicted @ predicted), float(measured @ measured))
         self._corrected = _KEEP * self._corrected + float(corrected @ corrected)
-        self._until_check = max(self._until_check - 1, 0)
         warnings = self._span(frame)
-        suspicious = self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned
-        if (suspicious or self._unmatched) and not self._until_check and len(self._frames) >= _FEWEST_SCANS:
-            self._until_check = _SCANS_BETWEEN_CHECKS
-            warnings += self._compare(x[RL : RL + 9].reshape(3, 3), mounting_too=suspicious)
+        warnings += self._innovate(frame, x_prior, cov_prior, x, directions)
+        suspicious = (
+            (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
+            or self._innovation > _SUSPICIOUS_INNOVATION
+            or self._unmatched > 1
+        )
+        news = self._watch.add(
+            frame.scan, frame.imu, _extrinsic(x), _lidar_twist(x_before, x, frame.duration_s), suspicious=suspicious
+        )
+        if news is not None:
+            warnings.append(news)
         if self._unmatched == _LOST_STREAK:
             warnings.append(
                 f"only {matched_share:.0%} of the points fit the map, and too few in {_LOST_STREAK} scans in a row: the "
@@ -95,92 +108,83 @@ class Consistency:
             )
         return warnings
 
-    def _compare(self, R_imu_lidar: NDArray[np.float64], *, mounting_too: bool) -> list[str]:
-        """Gyroscope against LiDAR over the last scans, without the filter."""
-        try:
-            found = estimate_rotation_extrinsic([frame.scan for frame in self._frames], joined_imu(self._frames))
-        except InputError:
+    def finish(self) -> str | None:
+        """No more scans will come; returns a contradiction that is new."""
+        return self._watch.finish()
+
+    def _innovate(
+        self,
+        frame: Frame,
+        x_prior: NDArray[np.float64],
+        cov_prior: NDArray[np.float64],
+        x: NDArray[np.float64],
+        directions: PoseDirections | None,
+    ) -> list[str]:
+        """The correction of the pose against what the prediction's covariance allows, along the directions that were measured."""
+        speed = float(np.linalg.norm(x[V : V + 3]))
+        if speed > _FASTEST_M_S:
+            self._innovation_text = f"the estimate moves at {speed:.0f} m/s, which no platform with a LiDAR does"
+            return [self._innovation_text] if self._once("speed") else []
+        if directions is None or directions.weak.all():
             return []
-        text = judge_unit(found) or (judge_mounting(found, R_imu_lidar) if mounting_too else None)
-        if text is not None or mounting_too:
-            self.contradiction = text
-        return [] if text is None else [text]
+        delta = np.zeros(TANGENT)
+        boxminus_into(x, x_prior, delta)
+        scale = np.array([directions.lever_arm] * 3 + [1.0] * 3)
+        strong = directions.vectors[:, ~directions.weak].T * scale
+        off = strong @ delta[:6]
+        variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
+        now = float(np.max(off**2 / variance))
+        self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, 1e4)
+        if self._innovation < _CONTRADICTED_INNOVATION:
+            self._contradicted_since_ns = None
+            return []
+        if self._contradicted_since_ns is None:
+            self._contradicted_since_ns = frame.scan.end_ns
+        lasted = (frame.scan.end_ns - self._contradicted_since_ns) * 1e-9
+        if lasted < _CONTRADICTED_STREAK_S or self._innovation_text is not None:
+            return []
+        self._innovation_text = (
+            f"for {lasted:.1f} s the LiDAR has contradicted what the IMU predicts, scan after scan, by "
+            f"{np.sqrt(self._innovation):.0f} standard deviations: units, mounting, clocks or topics of the two do not "
+            "fit together (see 'boxplus inspect')"
+        )
+        return [self._innovation_text]
+
+    def _once(self, key: str) -> bool:
+        new = key not in self._told
+        self._told.add(key)
+        return new
 
     def _span(self, frame: Frame) -> list[str]:
         """The time a scan takes against the time between scans."""
         scan, previous = frame.scan, self._previous_start_ns
         self._previous_start_ns = scan.start_ns
         span, period = (scan.end_ns - scan.start_ns) * 1e-9, 0.0 if previous is None else (scan.start_ns - previous) * 1e-9
-        if not 0.0 < period < 1.0 or span == 0.0 or _SHORT_SPAN * period < span < _LONG_SPAN * period or "span" in self._told:
+        if not 0.0 < period < 1.0 or span == 0.0 or _SHORT_SPAN * period < span < _LONG_SPAN * period or not self._once("span"):
             return []
-        self._told.add("span")
         return [
             f"the points of a scan span {span * 1e3:.3g} ms, but scans come every {period * 1e3:.3g} ms: "
             "check the unit of the point times (s, ms, µs or ns)"
         ]
 
 
-def judge_unit(found: RotationAlignment) -> str | None:
-    """What a comparison of both rotations says against the gyroscope's unit: a sentence, or None."""
-    low, high = _DEGREES
-    if low < found.gyro_scale < high:
-        return (
-            f"over {found.intervals} scans the gyroscope turned {found.gyro_scale:.0f} times as far as the LiDAR: it reports "
-            "deg/s; convert it to rad/s (reading a recording: --gyro-unit deg/s)"
-        )
-    if 1.0 / high < found.gyro_scale < 1.0 / low:
-        return (
-            f"over {found.intervals} scans the LiDAR turned {1.0 / found.gyro_scale:.0f} times as far as the gyroscope: its "
-            "rates were taken for deg/s and are rad/s (reading a recording: --gyro-unit rad/s)"
-        )
-    return None
+def _extrinsic(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    T = np.eye(4)
+    T[:3, :3] = x[RL : RL + 9].reshape(3, 3)
+    T[:3, 3] = x[PL : PL + 3]
+    return T
 
 
-def judge_mounting(found: RotationAlignment, R_imu_lidar: NDArray[np.float64]) -> str | None:
-    """What it says against the given R_imu_lidar (3, 3): a sentence, or None. Axes known to 5 degrees count."""
-    seen = found.std_deg < _KNOWN_DEG
-    apart = found.axes.T @ so3.log(found.R_imu_lidar @ R_imu_lidar.T)
-    angle = float(np.degrees(np.linalg.norm(apart[seen])))
-    if angle < _WRONG_ANGLE_DEG:
-        return None
-    inverse = found.axes.T @ so3.log(found.R_imu_lidar @ R_imu_lidar)
-    inverse_angle = float(np.degrees(np.linalg.norm(inverse[seen])))
-    advice = "check T_imu_lidar"
-    if inverse_angle < 0.3 * angle:
-        advice = f"its inverse fits to {inverse_angle:.1f} deg: T_imu_lidar maps LiDAR coordinates to IMU coordinates"
-    return f"gyroscope and LiDAR turn about axes {angle:.0f} deg apart under the given T_imu_lidar; {advice}"
+def _lidar_twist(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> Twist:
+    """Mean turn rate and velocity of the LiDAR between two states (36,), in its frame."""
+    R_before, R_now, R_imu_lidar = (state[k : k + 9].reshape(3, 3) for state, k in ((x_before, R), (x, R), (x, RL)))
+    rate = R_imu_lidar.T @ so3.log(R_before.T @ R_now) / seconds
+    arm = x[PL : PL + 3]
+    moved = x[P : P + 3] + R_now @ arm - x_before[P : P + 3] - R_before @ arm
+    return rate, R_imu_lidar.T @ R_now.T @ moved / seconds
 
 
 def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3,) sine of the angle times the axis of a rotation (3, 3): the rotation vector, for the turns within one scan."""
     M = rotation
     return np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]) * 0.5
-
-
-class Saturation:
-    """Finds IMU samples that sit at the limit of the sensor: the largest value of an axis, again and again, amid motion."""
-
-    _MEMORY = 20  # scans
-    _LEAST_SPREAD = np.array([0.5, 0.5, 0.5, 1.5, 1.5, 1.5])  # rad/s, m/s²: at rest quantised values repeat as well
-    _NAMES = ("gyroscope x", "gyroscope y", "gyroscope z", "accelerometer x", "accelerometer y", "accelerometer z")
-
-    def __init__(self) -> None:
-        self._peak = np.zeros(6)
-        self._low: deque[NDArray[np.float64]] = deque(maxlen=self._MEMORY)
-
-    def update(self, imu: ImuSamples) -> list[str]:
-        """Take the samples of one scan in; returns the axes that are saturated, one sentence each."""
-        values = np.abs(np.hstack([imu.gyro, imu.accel]))
-        self._low.append(values.min(axis=0))
-        highest = values.max(axis=0)
-        np.maximum(self._peak, highest, out=self._peak)
-        if not (highest >= self._peak).any():
-            return []
-        at_peak = values >= self._peak * (1.0 - 1e-6)
-        runs = at_peak[2:] & at_peak[1:-1] & at_peak[:-2]
-        clipped = runs.any(axis=0) & (self._peak - np.min(self._low, axis=0) > self._LEAST_SPREAD)
-        return [
-            f"{self._NAMES[axis]} saturated at {self._peak[axis]:.2f} {'rad/s' if axis < 3 else 'm/s²'}: motion beyond it is not "
-            "measured, covariance widened"
-            for axis in np.flatnonzero(clipped)
-        ]

@@ -21,14 +21,16 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.consistency import Consistency, Saturation
+from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
+from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
-from boxplus.systems.lidar_inertial_odometry.start import Start, align, deskew_first, find_start, joined_imu
+from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
 
 _LONGEST_START_SCANS = 30
 _BLIND_PASSES = 3
@@ -58,7 +60,7 @@ class LidarInertialOdometry:
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
-        self._consistency = Consistency(self.config.min_matched_share)
+        self._consistency = Consistency(self.config, self._declared())
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
@@ -100,6 +102,7 @@ class LidarInertialOdometry:
         estimates = self._advance(self._sequencer.frames(flush=True))
         if self.start is None and self._waiting:
             estimates += self._try_start(final=True)
+        self._consistency.finish()
         return estimates
 
     def predict(self) -> Prediction | None:
@@ -116,6 +119,12 @@ class LidarInertialOdometry:
         if newest > self._time_ns:
             self._carry(x, cov, imu, newest, self._density)
         return Prediction(newest, NavState.unpack(x), cov)
+
+    def _declared(self) -> NDArray[np.float64] | None:
+        """T_imu_lidar (4, 4) that the sensors can contradict; None where the configuration calls it a guess."""
+        if self.config.extrinsic_estimation != "off" or self.config.T_imu_lidar is None:
+            return None
+        return np.array(self.config.T_imu_lidar)
 
     def _advance(self, frames: list[Frame]) -> list[Estimate]:
         estimates: list[Estimate] = []
@@ -150,6 +159,7 @@ class LidarInertialOdometry:
         self._waiting = []
         p_lidar = deskew_first(first, found.state, self.config)
         self._insert(self._voxel_filter(p_lidar)[1])
+        self._warnings = [found.warning] if found.warning else []
         estimates = [self._estimate(first, p_lidar)]
         return estimates + [self._process(frame) for frame in rest]
 
@@ -173,7 +183,8 @@ class LidarInertialOdometry:
             x_prior, cov_prior, measurement, max_iterations=self.config.max_iterations, min_used=self.config.min_points
         )
         on_map = measurement.on_map_share if posterior.valid else 0.0
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, posterior.x, on_map)
+        directions = posterior.last.directions if posterior.valid else None
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior.x, on_map, directions)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
@@ -194,7 +205,10 @@ class LidarInertialOdometry:
         seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
         for _ in range(_BLIND_PASSES):
             points = self._voxel_filter(self._deskew(frame, self._density)[0])[0]
-            fits = align(points, self.map, self._x, self.config)
+            measurement = PlaneMeasurement(
+                points, self.map, self.config, voxel=self._voxel_filter.voxel_size, with_extrinsic=False
+            )
+            fits = align(self._x, measurement, self.config) is not None
             # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
             motion = 0.5 * (self._motion + mean_motion(x, self._x, seconds))
             self._x[:], self._cov[:] = x, cov

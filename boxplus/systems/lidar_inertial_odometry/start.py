@@ -1,16 +1,15 @@
-"""The first state: from standstill, or from a short batch over scans and IMU when the platform moves (SPEC.md 9.4)."""
+"""The first state: at rest, or moving, from the LiDAR's own motion compared with the IMU (docs/agreement.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.filtering.degeneracy import pose_directions, strong_step
 from boxplus.filtering.nav_state import (
     STANDARD_GRAVITY,
     T_BA,
@@ -21,27 +20,37 @@ from boxplus.filtering.nav_state import (
     T_V,
     TANGENT,
     NavState,
-    boxplus_into,
 )
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.manifolds import so3
-from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.deskew import deskew_into
-from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
+from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+from boxplus.systems.lidar_inertial_agreement.translation import (
+    ARM,
+    BIAS,
+    GRAVITY,
+    SLOPE,
+    BodyAttitude,
+    TranslationFit,
+    compare_accelerations,
+    wide_prior,
+)
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 
-_REST_GYRO_STD = 0.1  # rad/s, SPEC.md 9.4
-_REST_ACCEL_STD = 0.5  # m/s²
-_REST_ACCEL_NORM = (9.0, 10.6)
+_REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
-_REST_MISFIT = (1.25, 0.005)  # at rest, aligning the last scan gains no more than this factor and this much [m] ...
-_REST_MISFIT_MAX = 0.08  # ... and it fits to this [m]
-_REST_SCANS = 3
+_QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
 _MIN_MOVING_SCANS = 8
+_LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
+_SLOPE_STD = 0.01  # of the scale of an accelerometer in order
+_ACCEL_BIAS_STD = 0.15  # m/s²
+_GYRO_BIAS_STD = 5e-3  # rad/s, of the difference to the LiDAR over a second
+_TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +60,10 @@ class Start:
     Attributes:
         kind: "static" or "moving".
         time_ns: the instant of `state`: the end of the first scan.
-        state, covariance: first state and its (24, 24) covariance, tangent as in SPEC.md 9.1.
+        state, covariance: first state and its (24, 24) covariance, tangent as in `NavState`.
         duration_s: how long the start was observed.
         text: one sentence with the evidence.
+        warning: what could not be decided, a sentence; empty when all was.
     """
 
     kind: Literal["static", "moving"]
@@ -62,19 +72,21 @@ class Start:
     covariance: NDArray[np.float64]
     duration_s: float
     text: str
+    warning: str = ""
 
 
 def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet.
+
+    At rest means that the LiDAR does not move against what it sees, however much the IMU is shaken; only along what the scene
+    does not determine a quiet IMU has to do. Moving, velocity and gravity come from a batch over the LiDAR's path and the
+    accelerometer.
 
     Raises:
         InputError: the accelerometer reports in g.
     """
     imu = joined_imu(frames)
     duration = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
-    extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
-    gyro_std = float(imu.gyro.std(axis=0).max())
-    accel_std = float(imu.accel.std(axis=0).max())
     norm = float(np.linalg.norm(imu.accel.mean(axis=0)))
     if _IN_G[0] < norm < _IN_G[1]:
         raise InputError(
@@ -82,48 +94,55 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
             f"{norm:.2f}",
             f"the accelerometer reports in g: multiply by {_STANDARD_G} (reading a recording: --accel-unit g)",
         )
-    low, high = _REST_ACCEL_NORM
-    still = gyro_std < _REST_GYRO_STD and accel_std < _REST_ACCEL_STD and low <= norm <= high and len(imu) > 10
+    extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
+    gyro_std, accel_std = float(imu.gyro.std(axis=0).max()), float(imu.accel.std(axis=0).max())
     evidence = f"gyro std {gyro_std:.3f} rad/s, accelerometer std {accel_std:.2f} m/s² around {norm:.2f} m/s²"
-    if still:
-        at_rest, moved, aligned = _standstill(frames, config, extrinsic)
-        evidence += f"; the last scan lies {moved * 100:.1f} cm off the first ones unmoved, {aligned * 100:.1f} cm aligned"
-        if at_rest:
-            state, covariance = _static_state(imu, extrinsic, config)
-            return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}")
+    scans = [frame.scan for frame in frames]
+    path = lidar_path(scans, config, gyro_guesses(imu, extrinsic.R_imu_lidar))
+    if path.failed or len(path) < min(len(frames), 3) or path.segment[-1] != path.segment[0]:
+        return f"the first scans do not overlap enough to see whether they move ({evidence}); waiting for more data"
+    rest = judge_rest(path, scans, config)
+    evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
+    quiet = gyro_std < _QUIET_GYRO and accel_std < _QUIET_ACCEL and len(imu) > 10
+    if rest.at_rest and (quiet or rest.determined):
+        low, high = _REST_ACCEL_NORM
+        if not low <= norm <= high:
+            return f"at rest, but the accelerometer shows {norm:.2f} m/s², not one gravity: check its unit and scale"
+        state, covariance = _static_state(imu, extrinsic, config)
+        return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}", _undecided(rest))
     if len(frames) < _MIN_MOVING_SCANS:
         return f"not at rest ({evidence}), and {len(frames)} scans are not enough for a moving start; waiting for more data"
-    path = _LidarPath(frames, config, extrinsic)
-    # The first scans were moved by a biased gyro and without a velocity: once more, knowing both.
-    path = _LidarPath(frames, config, replace(extrinsic, v_world_imu=path.first_velocity, bias_gyro=path.gyro_bias(imu)))
-    if path.failed:
+    # Once more, each scan undistorted with the gyroscope instead of a constant rate.
+    steady = ImuSamples(imu.time_ns, imu.gyro - _gyro_bias(path, imu, extrinsic), imu.accel)
+    path = lidar_path(scans, config, gyro_guesses(steady, extrinsic.R_imu_lidar), undistort=True)
+    if path.failed or path.segment[-1] != path.segment[0]:
         return f"not at rest ({evidence}), and the first scans do not overlap enough for a moving start; waiting for more data"
-    state, covariance, misfit = _moving_state(frames, path, extrinsic, config)
+    fit = _moving_fit(frames, path, imu, extrinsic)
+    if fit is None:
+        return f"not at rest ({evidence}), and the scene does not determine how the platform turns; waiting for more data"
+    if fit.sigma > _LARGEST_MISFIT_M:
+        return (
+            f"not at rest ({evidence}), and LiDAR and IMU do not fit better than {fit.sigma * 100:.1f} cm; waiting for more data"
+        )
+    state, covariance = _moving_state(frames, path, imu, fit, extrinsic, config)
     speed = float(np.linalg.norm(state.v_world_imu))
-    text = f"moving at {speed:.2f} m/s: {evidence}; batch over {len(frames)} scans fits to {misfit * 100:.1f} cm"
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[T_V : T_V + 3, T_V : T_V + 3])[-1]))
+    text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {evidence}; batch over {len(frames)} scans fits to {fit.sigma * 100:.1f} cm"
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
 
 
-def _standstill(frames: Sequence[Frame], config: LioConfig, extrinsic: NavState) -> tuple[bool, float, float]:
-    """Whether the last scans fit the first ones without any motion as well as with the best one; both misfits [m].
+def _undecided(rest: Rest) -> str:
+    if rest.determined:
+        return ""
+    return (
+        "the surroundings do not show whether the platform moves along "
+        f"{' and '.join(_axis_text(axis) for axis in rest.open_axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
+        "at a constant speed it would be as quiet"
+    )
 
-    A displacement found by registration cannot decide: a narrow field of view leaves directions in which it slides.
-    """
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-    voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), config.max_points)
-    for frame in frames[:_REST_SCANS]:
-        tree.insert(extrinsic.to_world(voxel_filter(frame.scan.p_lidar)[1]), downsample=True)
-    unmoved, aligned = [], []
-    for frame in frames[-_REST_SCANS:]:
-        points = voxel_filter(frame.scan.p_lidar)[0]
-        x = extrinsic.pack()
-        unmoved.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
-        align(points, tree, x, config)
-        aligned.append(PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False).at(x, rematch=True))
-    factor, margin = _REST_MISFIT
-    off, best = (float(np.mean([i.residual_rms for i in group])) for group in (unmoved, aligned))
-    kept = sum(i.used for i in unmoved) >= max(0.9 * sum(i.used for i in aligned), config.min_points * len(unmoved))
-    return bool(kept and off <= min(factor * best + margin, _REST_MISFIT_MAX)), off, best
+
+def _axis_text(axis: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:+.2f}" for value in axis) + ")"
 
 
 def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
@@ -145,7 +164,9 @@ def _gravity_rotation(up_imu: NDArray[np.float64]) -> NDArray[np.float64]:
     return rotation
 
 
-def _first_covariance(gyro_sigma: float, accel_sigma: float, velocity_sigma: float, gravity_sigma: float) -> NDArray[np.float64]:
+def _first_covariance(
+    config: LioConfig, *, gyro_sigma: float, accel_sigma: float, velocity_sigma: float, gravity_sigma: float
+) -> NDArray[np.float64]:
     """Prior at the start. Pose: the first scan makes the map, so the first pose is the datum and exact by definition.
 
     What is not known is how gravity lies in that frame: the tilt from the accelerometer's bias goes into `g`.
@@ -155,8 +176,8 @@ def _first_covariance(gyro_sigma: float, accel_sigma: float, velocity_sigma: flo
     sigma[T_BW : T_BW + 3] = gyro_sigma
     sigma[T_BA : T_BA + 3] = accel_sigma
     sigma[T_G : T_G + 3] = gravity_sigma
-    sigma[T_THETA_L : T_THETA_L + 3] = 3e-3
-    sigma[T_P_L : T_P_L + 3] = 3e-3
+    sigma[T_THETA_L : T_THETA_L + 3] = np.deg2rad(config.extrinsic_rotation_sigma_deg)
+    sigma[T_P_L : T_P_L + 3] = config.extrinsic_translation_sigma
     return np.diag(sigma**2)
 
 
@@ -177,65 +198,72 @@ def _static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tu
         extrinsic.p_imu_lidar,
     )
     gyro_sigma = max(float(imu.gyro.std(axis=0).max()) / np.sqrt(len(imu)), 1e-4)
-    covariance = _first_covariance(gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=0.1)
+    # The mean of a shaken accelerometer is not better known than its samples are many.
+    gravity_sigma = float(np.hypot(0.1, 2.0 * imu.accel.std(axis=0).max() / np.sqrt(len(imu))))
+    covariance = _first_covariance(
+        config, gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=gravity_sigma
+    )
     return state, covariance
 
 
-class _LidarPath:
-    """Poses of the IMU at the ends of the scans by the LiDAR alone, in the frame of the first one.
-
-    Rotation is predicted by the gyro, translation by constant velocity; each scan is matched to the map of those before.
-    """
-
-    def __init__(self, frames: Sequence[Frame], config: LioConfig, first: NavState) -> None:
-        tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-        voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), config.max_points)
-        x = first.pack()
-        self.rotations: list[NDArray[np.float64]] = []
-        self.positions: list[NDArray[np.float64]] = []
-        self.failed = False
-        self._ends = [frame.scan.end_ns * 1e-9 for frame in frames]
-        for index, frame in enumerate(frames):
-            before = NavState.unpack(x)
-            points, map_points = voxel_filter(deskew_at_constant_velocity(frame, x, config))
-            if index > 0:
-                self.failed |= not align(points, tree, x, config)
-                x[12:15] = (x[9:12] - before.p_world_imu) / ((frame.scan.end_ns - frame.begin_ns) * 1e-9)
-            now = NavState.unpack(x)
-            self.rotations.append(now.R_world_imu)
-            self.positions.append(now.p_world_imu)
-            tree.insert(now.to_world(map_points), downsample=True)
-
-    @property
-    def first_velocity(self) -> NDArray[np.float64]:
-        """(3,) mean velocity over the first scans, which the first one alone cannot tell."""
-        scans = min(4, len(self.positions) - 1)
-        mean: NDArray[np.float64] = (self.positions[scans] - self.positions[0]) / (self._ends[scans] - self._ends[0])
-        return mean
-
-    def gyro_bias(self, imu: ImuSamples) -> NDArray[np.float64]:
-        """(3,) mean difference between the gyro's and the LiDAR's turn rate [rad/s], IMU frame."""
-        steps = [so3.log(a.T @ b) for a, b in zip(self.rotations[:-1], self.rotations[1:], strict=True)]
-        lidar_rate = np.sum(steps, axis=0) / (self._ends[-1] - self._ends[0])
-        inside = (imu.time_ns * 1e-9 >= self._ends[0]) & (imu.time_ns * 1e-9 <= self._ends[-1])
-        bias: NDArray[np.float64] = imu.gyro[inside].mean(axis=0) - lidar_rate
-        return bias
+def _moving_fit(frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> TranslationFit | None:
+    """Velocity, gravity and bias from the LiDAR's path and the accelerometer, with the mounting and metres as given."""
+    mean, std = wide_prior()
+    mean[ARM], std[ARM] = extrinsic.p_imu_lidar, 0.01
+    std[SLOPE], std[BIAS] = _SLOPE_STD, _ACCEL_BIAS_STD
+    bias_gyro = _gyro_bias(path, imu, extrinsic)
+    seconds = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
+    return compare_accelerations(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0.0, (mean, std), stretch_s=seconds + 1.0)
 
 
-def align(points: NDArray[np.float32], tree: IkdTree, x: NDArray[np.float64], config: LioConfig) -> bool:
-    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. False when too few points match."""
-    measurement = PlaneMeasurement(points, tree, config, voxel=config.scan_voxel, with_extrinsic=False)
-    delta = np.zeros(TANGENT)
-    for _ in range(15):
-        information = measurement.at(x, rematch=True)
-        if information.used < config.min_points:
-            return False
-        directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
-        delta[:6] = strong_step(information.A, information.b, directions)
-        boxplus_into(x, delta, x)
-        if np.abs(delta).max() < 1e-4:
-            break
-    return True
+def _gyro_bias(path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> NDArray[np.float64]:
+    """(3,) mean difference between the gyroscope's and the LiDAR's turn rate [rad/s], IMU frame."""
+    steps = so3.log(np.swapaxes(path.R_path_lidar[:-1], 1, 2) @ path.R_path_lidar[1:])
+    span = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
+    inside = (imu.time_ns >= path.time_ns[0]) & (imu.time_ns <= path.time_ns[-1])
+    bias: NDArray[np.float64] = imu.gyro[inside].mean(axis=0) - extrinsic.R_imu_lidar @ steps.sum(axis=0) / span
+    return bias
+
+
+def _moving_state(
+    frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, fit: TranslationFit, extrinsic: NavState, config: LioConfig
+) -> tuple[NavState, NDArray[np.float64]]:
+    """State and covariance at the end of the first scan, carried there from the beginning of the batch."""
+    first = fit.stretches[0]
+    bias_gyro = _gyro_bias(path, imu, extrinsic)
+    attitude = BodyAttitude(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0)
+    end_ns = frames[0].scan.end_ns
+    grid = np.unique(
+        np.concatenate([[first.time_ns, end_ns], imu.time_ns[(imu.time_ns > first.time_ns) & (imu.time_ns < end_ns)]])
+    )
+    R_grid = attitude.at(grid)
+    accel = np.stack([np.interp(grid, imu.time_ns, imu.accel[:, i]) for i in range(3)], axis=1) - fit.bias
+    force = np.einsum("nij,nj->ni", R_grid, accel)
+    dt = np.diff(grid)[:, None] * 1e-9
+    v_path = first.state[3:] + (0.5 * (force[1:] + force[:-1]) * dt).sum(axis=0) + fit.gravity * float(dt.sum())
+    gravity = fit.gravity * (STANDARD_GRAVITY / float(np.linalg.norm(fit.gravity)))
+    R_path_imu = R_grid[-1]
+    R_world_path = _gravity_rotation(-gravity) if config.gravity_aligned else R_path_imu.T
+    state = NavState(
+        R_world_path @ R_path_imu,
+        np.zeros(3),
+        R_world_path @ v_path,
+        bias_gyro,
+        fit.bias,
+        R_world_path @ gravity,
+        extrinsic.R_imu_lidar,
+        extrinsic.p_imu_lidar,
+    )
+    covariance = _first_covariance(config, gyro_sigma=_GYRO_BIAS_STD, accel_sigma=0.0, velocity_sigma=0.0, gravity_sigma=0.0)
+    # [velocity, gravity, bias] of the batch: velocity and gravity along the path's axes.
+    known = np.r_[3:6, 6 + GRAVITY.start : 6 + GRAVITY.stop, 6 + BIAS.start : 6 + BIAS.stop]
+    turn = np.zeros((9, 9))
+    turn[:3, :3] = turn[3:6, 3:6] = R_world_path
+    turn[6:, 6:] = np.eye(3)
+    into = np.r_[T_V : T_V + 3, T_G : T_G + 3, T_BA : T_BA + 3]
+    floor = np.diag(np.repeat([0.02, 0.05, 0.02], 3) ** 2)
+    covariance[np.ix_(into, into)] = _TWICE * turn @ first.covariance[np.ix_(known, known)] @ turn.T + floor
+    return state, covariance
 
 
 def deskew_at_constant_velocity(frame: Frame, x: NDArray[np.float64], config: LioConfig) -> NDArray[np.float32]:
@@ -255,83 +283,6 @@ def deskew_at_constant_velocity(frame: Frame, x: NDArray[np.float64], config: Li
     deskew_into(frame.scan.p_lidar, frame.scan.time_ns, frame.begin_ns, nodes, count, weightless, points)
     x[:21] = weightless[:21]
     return points
-
-
-def _moving_state(
-    frames: Sequence[Frame], path: _LidarPath, extrinsic: NavState, config: LioConfig
-) -> tuple[NavState, NDArray[np.float64], float]:
-    """Velocity and gravity from positions p(t) = p₀ + v₀ t + ½ g t² + ∬ R a, linear in (p₀, v₀, g); |g| = 9.81 imposed.
-
-    R is the LiDAR path's rotation, so the biases are left to the filter; their prior is wide.
-    """
-    t0 = frames[0].scan.end_ns
-    imu = joined_imu(frames)
-    ends = np.array([(f.scan.end_ns - t0) * 1e-9 for f in frames])
-    # Specific force in the path's frame, integrated twice with the rotations of the path in between turned by the gyro.
-    time = np.concatenate([ends, (imu.time_ns - t0) * 1e-9])
-    time = np.unique(time[(time >= 0.0) & (time <= ends[-1])])
-    force = np.zeros((len(time), 3))
-    accel = np.stack([np.interp(time, (imu.time_ns - t0) * 1e-9, imu.accel[:, i]) for i in range(3)], axis=1)
-    steps = [so3.log(a.T @ b) for a, b in zip(path.rotations[:-1], path.rotations[1:], strict=True)]
-    for i, t in enumerate(time):
-        k = min(max(int(np.searchsorted(ends, t, side="right")) - 1, 0), len(steps) - 1)
-        share = (t - ends[k]) / (ends[k + 1] - ends[k])
-        force[i] = path.rotations[k] @ so3.exp(share * steps[k]) @ accel[i]
-    dt = np.diff(time)[:, None]
-    velocity = np.vstack([np.zeros(3), np.cumsum(0.5 * (force[1:] + force[:-1]) * dt, axis=0)])
-    swept = velocity[:-1] * dt + (2.0 * force[:-1] + force[1:]) / 6.0 * dt**2
-    position = np.vstack([np.zeros(3), np.cumsum(swept, axis=0)])
-    at_ends = np.searchsorted(time, ends)
-    target = np.array(path.positions) - position[at_ends]
-
-    # Prior: the mean specific force is gravity but for the mean acceleration, taken as 1 m/s² (one sigma).
-    sigma_position, sigma_mean_acceleration = 0.02, 1.0
-    up = force.mean(axis=0)
-    gravity: NDArray[np.float64] = -STANDARD_GRAVITY * up / np.linalg.norm(up)
-    basis = np.stack([np.ones_like(ends), ends, 0.5 * ends**2], axis=1) / sigma_position
-    solution = np.zeros((2, 3))
-    for _ in range(5):
-        tangent = np.linalg.svd(gravity[None, :])[2][1:]  # two directions orthogonal to g
-        # Unknowns: p₀ (3), v₀ (3), two tilts of g [m/s²].
-        rows = np.zeros((3 * len(ends) + 2, 8))
-        values = np.zeros(3 * len(ends) + 2)
-        for axis in range(3):
-            block = slice(axis * len(ends), (axis + 1) * len(ends))
-            rows[block, axis] = basis[:, 0]
-            rows[block, 3 + axis] = basis[:, 1]
-            rows[block, 6:] = np.outer(basis[:, 2], tangent[:, axis])
-            values[block] = target[:, axis] / sigma_position - basis[:, 2] * gravity[axis]
-        prior = -STANDARD_GRAVITY * up / np.linalg.norm(up)
-        rows[-2:, 6:] = np.eye(2) / sigma_mean_acceleration
-        values[-2:] = tangent @ (prior - gravity) / sigma_mean_acceleration
-        solution_vector, *_ = np.linalg.lstsq(rows, values, rcond=None)
-        tilted = gravity + tangent.T @ solution_vector[6:]
-        gravity = (tilted * (STANDARD_GRAVITY / np.linalg.norm(tilted))).astype(np.float64)
-        solution[:] = solution_vector[:6].reshape(2, 3)
-        if np.linalg.norm(solution_vector[6:]) < 1e-6:
-            break
-    misfit = float(np.sqrt(np.mean((rows @ solution_vector - values)[:-2] ** 2))) * sigma_position
-    information = rows.T @ rows
-    spread = np.linalg.inv(information) * max(1.0, (misfit / sigma_position) ** 2)
-    velocity_sigma = float(np.sqrt(spread[3:6, 3:6].diagonal().max()))
-    gravity_sigma = float(np.sqrt(spread[6:, 6:].diagonal().max()))
-
-    R = _gravity_rotation(np.asarray(-gravity, dtype=np.float64)) if config.gravity_aligned else np.eye(3)
-    R0 = path.rotations[0]
-    state = NavState(
-        R @ R0,
-        np.zeros(3),
-        R @ solution[1],
-        path.gyro_bias(imu),
-        np.zeros(3),
-        R @ gravity,
-        extrinsic.R_imu_lidar,
-        extrinsic.p_imu_lidar,
-    )
-    covariance = _first_covariance(
-        gyro_sigma=1e-2, accel_sigma=0.2, velocity_sigma=max(velocity_sigma, 0.05), gravity_sigma=max(gravity_sigma, 0.1)
-    )
-    return state, covariance, misfit
 
 
 def deskew_first(frame: Frame, state: NavState, config: LioConfig) -> NDArray[np.float32]:

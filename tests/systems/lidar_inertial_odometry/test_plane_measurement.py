@@ -11,9 +11,9 @@ from boxplus.filtering.degeneracy import pose_directions
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
-from boxplus.systems.lidar_inertial_odometry.start import align
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -90,14 +90,16 @@ def test_aligning_finds_the_pose(seed: int) -> None:
     off = np.zeros(24)
     off[:6] = 0.03 * random.normal(size=6)
     packed = truth.boxplus(off).pack()
-    assert align(points, tree, packed, LioConfig())
+    measurement = PlaneMeasurement(points, tree, LioConfig(), voxel=0.5, with_extrinsic=False)
+    assert align(packed, measurement, LioConfig()) is not None
     found = NavState.unpack(packed).boxminus(truth)
     assert np.abs(found[:6]).max() < 2e-3
     assert not found[6:18].any()
 
 
 def test_aligning_to_nothing_is_refused() -> None:
-    assert not align(np.ones((50, 3), np.float32), IkdTree(), NavState.identity().pack(), LioConfig())
+    nothing = PlaneMeasurement(np.ones((50, 3), np.float32), IkdTree(), LioConfig(), voxel=0.5, with_extrinsic=False)
+    assert align(NavState.identity().pack(), nothing, LioConfig()) is None
 
 
 @pytest.mark.parametrize("seed", range(3))

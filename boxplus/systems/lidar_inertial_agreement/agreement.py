@@ -1,0 +1,150 @@
+"""Do LiDAR and IMU agree, and how are they mounted, timed and scaled? One estimate that everything which has to know stands on.
+
+The start of the odometry, the extrinsic where none is given, the evidence of `boxplus inspect`, the calibration and the watch
+while running ask the same question. It is answered once:
+
+    path         how the LiDAR moved, from its scans alone
+    rotation     against the gyroscope: mounting, clocks, unit, sign
+    translation  against the accelerometer: gravity, velocity, bias, lever arm, sign and scale
+
+Each with a covariance, so that what the motion does not show is left open. See docs/agreement.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import so3
+from boxplus.sensors.gyro_attitude import GyroAttitude
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
+from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
+_OFFSET_KNOWN_S = 0.01
+_WILD_RAD_S = 4.0
+ROTATION_KNOWN_RAD = 0.05
+_DECLARED_ARM_STD = 0.02  # m
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """What the comparison of both sensors shows.
+
+    Attributes:
+        path: of the LiDAR.
+        rotation: None where too few scans could be compared.
+        translation: None where the path is too short or the mounting not known.
+        R_imu_lidar: (3, 3) the mounting that the accelerations were compared under.
+        imu_rate_hz: of the samples.
+        gyro_power: mean square of the gyroscope's rates about their mean [(rad/s)²], in its own unit.
+    """
+
+    path: LidarPath
+    rotation: RotationFit | None
+    translation: TranslationFit | None
+    R_imu_lidar: NDArray[np.float64]
+    imu_rate_hz: float
+    gyro_power: float
+
+
+def compare_sensors(
+    scans: Sequence[Scan],
+    imu: ImuSamples,
+    config: LioConfig,
+    *,
+    T_expected: NDArray[np.float64] | None = None,
+    T_declared: NDArray[np.float64] | None = None,
+    refine: bool = False,
+    expected: Sequence[Twist] | None = None,
+) -> Agreement:
+    """Compare the sensors over a stretch of a recording.
+
+    Args:
+        scans: consecutive sweeps, some seconds of them.
+        imu: samples of the same stretch; those that are not finite are left out.
+        config: of the LiDAR's noise and the sizes of cells.
+        T_expected: (4, 4) T_imu_lidar that the registration may start from, a guess.
+        T_declared: (4, 4) T_imu_lidar as somebody says it is; accelerations are compared under it unless rotations contradict it.
+        refine: register once more with the gyroscope, where it agrees: twice the time, a third of the error.
+        expected: of every scan, how an estimator believes that the LiDAR moved; a start for the registration and no more.
+    """
+    imu = usable(imu)
+    T_guess = T_declared if T_declared is not None else T_expected
+    R_guess = None if T_guess is None else T_guess[:3, :3]
+    path = lidar_path(scans, config, [] if R_guess is None else gyro_guesses(imu, R_guess), expected=expected)
+    rotation = compare_rotations(path, imu, R_guess) if len(imu) > 1 else None
+    if refine and rotation is not None and rotation.explained > _EXPLAINED:
+        steady = rotation
+        shift_ns = round(steady.offset_s * 1e9) if steady.offset_std_s < _OFFSET_KNOWN_S else 0
+        corrected = GyroAttitude(imu.time_ns, (imu.gyro - steady.bias) / unit_of(steady.scale))
+        path = lidar_path(
+            scans,
+            config,
+            [lambda time_ns: corrected.at(time_ns + shift_ns) @ steady.R_imu_lidar],
+            undistort=True,
+            expected=expected,
+        )
+        rotation = compare_rotations(path, imu, R_guess) or rotation
+    R = np.eye(3) if R_guess is None else R_guess
+    if rotation is not None and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
+        R = rotation.R_imu_lidar
+    translation = None
+    if (rotation is not None and rotation.explained > _EXPLAINED) or T_declared is not None:
+        bias = np.zeros(3) if rotation is None or rotation.explained < _EXPLAINED else rotation.bias
+        scale = 1.0 if rotation is None else unit_of(rotation.scale)
+        offset = 0.0 if rotation is None or rotation.offset_std_s > _OFFSET_KNOWN_S else rotation.offset_s
+        mean, std = wide_prior()
+        if T_declared is not None:
+            mean[6:9], std[6:9] = T_declared[:3, 3], _DECLARED_ARM_STD
+        scaled = ImuSamples(imu.time_ns, imu.gyro / scale, imu.accel)
+        translation = compare_accelerations(path, scaled, R, bias / scale, offset, (mean, std))
+    rate = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
+    power = float(((imu.gyro - imu.gyro.mean(axis=0)) ** 2).sum(axis=1).mean()) if len(imu) else 0.0
+    return Agreement(path, rotation, translation, R, rate, power)
+
+
+def gyro_guesses(imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> list[Turning]:
+    """How the LiDAR turned if the gyroscope and this mounting (3, 3) are right; where it turns wildly, also if it is in deg/s."""
+    if len(imu) < 2:
+        return []
+    attitude = GyroAttitude(imu.time_ns, imu.gyro)
+    guesses: list[Turning] = [lambda time_ns: attitude.at(time_ns) @ R_imu_lidar]
+    if float(np.median(np.linalg.norm(imu.gyro, axis=1))) > _WILD_RAD_S:
+        degrees = attitude.scaled(np.pi / 180.0)
+        guesses.append(lambda time_ns: degrees.at(time_ns) @ R_imu_lidar)
+    return guesses
+
+
+def usable(imu: ImuSamples) -> ImuSamples:
+    """Finite samples in order of time, each time once."""
+    finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+    _, first = np.unique(imu.time_ns[finite], return_index=True)
+    return ImuSamples(imu.time_ns[finite][first], imu.gyro[finite][first], imu.accel[finite][first])
+
+
+def unit_of(scale: float) -> float:
+    """The unit that a gyroscope's scale tells: 180/π for deg/s, its inverse for rad/s taken for deg/s, else 1."""
+    degrees = 180.0 / np.pi
+    return degrees if 30.0 < scale < 110.0 else 1.0 / degrees if 30.0 < 1.0 / max(scale, 1e-9) < 110.0 else 1.0
+
+
+def apart(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
+    """How far a mounting is from the found one [rad], about the axes known to three degrees; and which these are (3,)."""
+    std, axes = fit.rotation_std
+    seen = std < ROTATION_KNOWN_RAD
+    angle = axes.T @ so3.log(fit.R_imu_lidar @ R_imu_lidar.T)
+    return float(np.linalg.norm(angle[seen])), seen
+
+
+def apart_allowed(fit: RotationFit) -> float:
+    """How far a right mounting may seem to be from the found one [rad]."""
+    std, _ = fit.rotation_std
+    return float(np.deg2rad(2.5)) + 3.0 * float(np.linalg.norm(std[std < ROTATION_KNOWN_RAD]))

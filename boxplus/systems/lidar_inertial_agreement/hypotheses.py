@@ -1,0 +1,238 @@
+"""What is wrong, if something is: each known mistake against what the comparison of the sensors shows.
+
+A mistake is named only where its own explanation fits and the declared one does not, with a margin; where the motion does not
+decide, nothing is said. Every finding is a sentence for a user: what was seen, what it means, what to do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart, apart_allowed, unit_of
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
+from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
+
+Cause = Literal[
+    "gyro_unit",
+    "gyro_sign",
+    "gyro_scale",
+    "not_together",
+    "extrinsic",
+    "mirrored",
+    "time_offset",
+    "clock_drift",
+    "force_sign",
+    "length_scale",
+]
+
+_MOST_WEAK = 0.5
+_GOOD_PATH_M = 0.15  # median misfit of registrations that can be believed
+_TURNING_RAD_S = np.deg2rad(1.0)  # rms below which rotations say nothing about unit and sign
+_BELONGING_RAD_S = np.deg2rad(8.0)  # rms of one sensor that the other must show
+_TOGETHER = 0.5
+_FITS = 0.8
+_CLOSELY = 0.95
+_SCALE_OFF = 0.12
+_OFFSET_OK_S = 0.014
+_OFFSET_STD_S = 0.012
+_LEVER_OFF = 0.07
+_SLOPE_FLOOR = 0.02
+_MISFIT_M = 0.03
+_FEET = 3.28084
+_HALF_TURN_RAD = np.deg2rad(12.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A contradiction between the sensors, or between them and what was declared."""
+
+    cause: Cause
+    text: str
+
+
+def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None) -> list[Finding]:
+    """What the comparison contradicts; empty where the sensors agree or the motion does not decide.
+
+    Args:
+        agreement: from `compare_sensors`.
+        T_declared: (4, 4) T_imu_lidar in use; None where it is an estimate of the same data.
+    """
+    path, rotation, translation = agreement.path, agreement.rotation, agreement.translation
+    if rotation is None or not _path_counts(path):
+        return []
+    found = (
+        _of_unit(rotation)
+        or _of_sign(rotation)
+        or _of_belonging(agreement, rotation)
+        or _of_mirror(rotation, translation, T_declared)
+    )
+    if found is not None:
+        return [found]  # what follows from it is not worth a sentence of its own
+    findings = [_of_mounting(rotation, T_declared), _of_scale(rotation), _of_clocks(rotation, agreement.imu_rate_hz)]
+    if translation is not None:
+        findings.append(_of_lengths(translation))
+    return [finding for finding in findings if finding is not None]
+
+
+def _path_counts(path: LidarPath) -> bool:
+    """Whether a path can contradict anything: its scans fit one another, and the scene determines most of them."""
+    return len(path) > 0 and float(np.median(path.misfit)) < _GOOD_PATH_M and float(path.weak.mean()) < _MOST_WEAK
+
+
+def judges_rotation(agreement: Agreement) -> bool:
+    """Whether the motion was enough for unit, sign and mounting to show, had they been wrong."""
+    rotation = agreement.rotation
+    if rotation is None or not _path_counts(agreement.path) or rotation.explained < _FITS:
+        return False
+    return _turning(rotation) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() >= 2)
+
+
+def judges_clocks(rotation: RotationFit) -> bool:
+    """Whether the motion shows the offset of the clocks."""
+    return _turning(rotation) and rotation.explained > _CLOSELY and rotation.offset_std_s < _OFFSET_STD_S
+
+
+def _turning(rotation: RotationFit) -> bool:
+    return bool(np.linalg.norm(rotation.excitation) > max(_TURNING_RAD_S, 2.0 * rotation.sigma))
+
+
+def _of_unit(rotation: RotationFit) -> Finding | None:
+    unit = unit_of(rotation.scale)
+    if unit == 1.0 or not _turning(rotation) or max(rotation.explained, rotation.mirrored) < _FITS or rotation.scale_std > 0.2:
+        return None
+    if unit > 1.0:
+        text = (
+            f"over {rotation.intervals} scans the gyroscope turned {rotation.scale:.0f} times as far as the LiDAR: it reports "
+            "deg/s; convert it to rad/s (reading a recording: --gyro-unit deg/s)"
+        )
+    else:
+        text = (
+            f"over {rotation.intervals} scans the LiDAR turned {1.0 / rotation.scale:.0f} times as far as the gyroscope: its "
+            "rates were taken for deg/s and are rad/s (reading a recording: --gyro-unit rad/s)"
+        )
+    return Finding("gyro_unit", text)
+
+
+def _of_sign(rotation: RotationFit) -> Finding | None:
+    """No rotation has a determinant of −1: a gyroscope that only fits mirrored has its sign flipped."""
+    if not _turning(rotation) or rotation.mirrored < _FITS or 1.0 - rotation.mirrored > 0.3 * (1.0 - rotation.explained):
+        return None
+    return Finding(
+        "gyro_sign",
+        f"gyroscope and LiDAR turn in opposite senses (mirrored they agree to {rotation.mirrored:.0%}, as they come to "
+        f"{rotation.explained:.0%}): the gyroscope's sign is flipped, or one of its axes; negate its rates",
+    )
+
+
+def _of_belonging(agreement: Agreement, rotation: RotationFit) -> Finding | None:
+    strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(agreement.gyro_power)) / unit_of(rotation.scale))
+    if strong < max(_BELONGING_RAD_S, 4.0 * rotation.sigma_registration) or rotation.together > _TOGETHER:
+        return None
+    return Finding(
+        "not_together",
+        f"the LiDAR turns with {np.degrees(np.linalg.norm(rotation.excitation)):.1f} deg/s (rms) and the gyroscope with "
+        f"{np.degrees(np.sqrt(agreement.gyro_power)):.1f} deg/s, and only {rotation.together:.0%} of it agrees, under "
+        "any mounting and any clock offset up to half a second: the IMU is not the one of this LiDAR (--imu-topic, "
+        "--lidar-topic), or their clocks are farther apart",
+    )
+
+
+def _of_mirror(
+    rotation: RotationFit, translation: TranslationFit | None, T_declared: NDArray[np.float64] | None
+) -> Finding | None:
+    """Mirrored points turn like a mounting half a turn off, and accelerate against it."""
+    if T_declared is None or translation is None or rotation.explained < _FITS or not _reversed(translation):
+        return None
+    angle, seen = apart(rotation, T_declared[:3, :3])
+    if not seen.any() or abs(angle - np.pi) > _HALF_TURN_RAD:
+        return None
+    return Finding(
+        "mirrored",
+        f"the LiDAR turns as if mounted {np.degrees(angle):.0f} deg from the given T_imu_lidar and accelerates "
+        f"{translation.slope:.2f} times as the accelerometer does: the points are mirrored (one axis has the wrong sign, or two "
+        "are swapped)",
+    )
+
+
+def _reversed(translation: TranslationFit) -> bool:
+    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
+        return False
+    return translation.slope < -0.4 and translation.slope + 3.0 * float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < 0.0
+
+
+def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
+    if T_declared is None or rotation.explained < _FITS:
+        return None
+    angle, seen = apart(rotation, T_declared[:3, :3])
+    if not seen.any() or angle < apart_allowed(rotation):
+        return None
+    text = (
+        f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the given T_imu_lidar (known to "
+        f"{np.degrees(np.linalg.norm(rotation.rotation_std[0][seen])):.1f} deg)"
+    )
+    inverse, _ = apart(rotation, T_declared[:3, :3].T)
+    if inverse < 0.3 * angle:
+        advice = f"its inverse fits to {np.degrees(inverse):.1f} deg: T_imu_lidar maps LiDAR coordinates to IMU coordinates"
+    elif abs(angle - np.pi) < _HALF_TURN_RAD:
+        advice = "half a turn: the gyroscope's sign is flipped, the points are mirrored, or T_imu_lidar is of another mounting"
+    else:
+        advice = (
+            "check T_imu_lidar and that the topics are those of this mounting; found R_imu_lidar = "
+            f"{matrix_text(rotation.R_imu_lidar)}"
+        )
+    return Finding("extrinsic", f"{text}; {advice}")
+
+
+def _of_scale(rotation: RotationFit) -> Finding | None:
+    off = abs(rotation.scale - 1.0)
+    if not _turning(rotation) or rotation.explained < _FITS or off < max(_SCALE_OFF, 4.0 * rotation.scale_std):
+        return None
+    return Finding(
+        "gyro_scale",
+        f"the gyroscope turns {rotation.scale:.2f} ± {rotation.scale_std:.2f} times as far as the LiDAR: its scale is wrong, or "
+        "the times of one of them do not run at the right speed",
+    )
+
+
+def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
+    allowed = max(_OFFSET_OK_S, 0.5 / max(imu_rate_hz, 1.0))
+    offset, std = rotation.offset_s, rotation.offset_std_s
+    if not judges_clocks(rotation) or abs(offset) < max(allowed, 4.0 * std):
+        return None
+    return Finding(
+        "time_offset",
+        f"the LiDAR's times are {abs(offset) * 1e3:.0f} ± {std * 1e3:.0f} ms {'late' if offset < 0.0 else 'early'} on the "
+        f"IMU's clock: synchronise the clocks, or give --lidar-time-offset {offset:.3f}; a whole scan period is the sign of a "
+        "wrong --point-time-reference",
+    )
+
+
+def _of_lengths(translation: TranslationFit) -> Finding | None:
+    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
+        return None
+    slope = translation.slope
+    std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
+    if _reversed(translation):
+        text = (
+            f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): its sign is "
+            "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
+        )
+        return Finding("force_sign", text)
+    if abs(slope - 1.0) > max(_LEVER_OFF, 3.0 * std) and std < 0.3 and slope > 0.0:
+        name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
+        return Finding(
+            "length_scale",
+            f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): the points "
+            f"are not in metres{name}, or the accelerometer's scale is wrong",
+        )
+    return None
+
+
+def matrix_text(R: NDArray[np.float64]) -> str:
+    """A (3, 3) matrix on one line."""
+    return "[" + "; ".join(", ".join(f"{value:.4f}" for value in row) for row in R) + "]"

@@ -1,0 +1,361 @@
+"""How the LiDAR moved, from the scans alone: what the IMU is compared with.
+
+Every scan is registered to a map of those before it, point to plane (Xu et al., IEEE T-RO 2022, eq. 12), from the motion of the
+scan before (constant velocity, as in KISS-ICP: Vizzo et al., RA-L 2023), and undistorted with the motion that the registration
+finds. No sample of the IMU enters: whatever is wrong with it cannot have caused what is found here. What the scene does not
+determine stays without information, whatever number the registration has come to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions, strong_step
+from boxplus.filtering.nav_state import TANGENT, NavState, P, R, boxplus_into
+from boxplus.filtering.plane_information import ONE_LINE
+from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import REASONS, PlaneMeasurement
+
+_MOST_POINTS = 1500  # that a scan is registered with
+_MOST_MAP_POINTS = 5000  # that it leaves in the map
+_MOST_RAW = 12_000  # that it is undistorted and filtered from
+_STEPS = 12
+_SETTLED = 2e-4  # rad and m
+_PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
+_NODES = 21  # within a scan, of a known turning
+_SAME_MOTION = 2e-3  # rad and m between passes
+_FEWEST_USED = 60
+_FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
+_GOOD = 0.06  # m, misfit that needs no second start
+_LEAST_SHARE = 0.25  # of the points lie on the map, or the scan is not registered
+_SAME_START = 0.005, 0.02  # rad and m between two expectations
+_POOR = 1.5  # times the usual misfit: worth another guess
+_LONGEST_STEP_S = 1.0
+_SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
+
+
+@dataclass(frozen=True, slots=True)
+class LidarPath:
+    """Poses of the LiDAR at the middles of scans. Where a registration failed a new segment begins, without a tie.
+
+    Attributes:
+        time_ns: (K,) int64.
+        R_path_lidar: (K, 3, 3) float64; p_path_lidar: (K, 3) float64 [m]; the path's frame is the first pose of the segment.
+        information: (K, 6, 6) float64 about a pose [θ about the LiDAR's axes, p along the path's]; nothing along what the scene
+            does not determine. The first pose of a segment defines its frame and has none.
+        segment: (K,) int64.
+        weak: (K,) bool, whether the scene left a direction undetermined.
+        misfit: (K,) float64, rms distance of the points from their planes [m].
+        failed: scans that could not be registered.
+    """
+
+    time_ns: NDArray[np.int64]
+    R_path_lidar: NDArray[np.float64]
+    p_path_lidar: NDArray[np.float64]
+    information: NDArray[np.float64]
+    segment: NDArray[np.int64]
+    weak: NDArray[np.bool_]
+    misfit: NDArray[np.float64]
+    failed: int
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def part(self, chosen: NDArray[np.bool_]) -> LidarPath:
+        """The poses that are chosen (K,)."""
+        return LidarPath(
+            self.time_ns[chosen],
+            self.R_path_lidar[chosen],
+            self.p_path_lidar[chosen],
+            self.information[chosen],
+            self.segment[chosen],
+            self.weak[chosen],
+            self.misfit[chosen],
+            self.failed,
+        )
+
+
+Twist = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Turn rate (3,) [rad/s] and velocity (3,) [m/s] of the LiDAR, both in its own frame."""
+
+Turning = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""Attitudes (N, 3, 3) R_any_lidar of the LiDAR at times (N,) ns."""
+
+
+def lidar_path(
+    scans: Iterable[Scan],
+    config: LioConfig,
+    guesses: Sequence[Turning] = (),
+    *,
+    undistort: bool = False,
+    expected: Sequence[Twist] | None = None,
+) -> LidarPath:
+    """The path of the LiDAR through `scans`, in order of time; streamed.
+
+    Args:
+        scans: consecutive sweeps.
+        config: the noise of the points and the sizes of map cells and voxels; nothing of the IMU is used.
+        guesses: how the LiDAR may have turned, further starts for every registration; the one that fits best is kept.
+        undistort: whether to undistort with the first guess, where it has been found to be right, instead of a constant rate.
+        expected: of every scan, how an estimator believes that the LiDAR moved: one more start.
+    """
+    motion = LidarMotion(config, guesses, undistort=undistort)
+    for number, scan in enumerate(scans):
+        motion.add(scan, None if expected is None else expected[number])
+    return motion.path()
+
+
+class LidarMotion:
+    """Registers scans one after the other; arguments as for `lidar_path`."""
+
+    def __init__(self, config: LioConfig, guesses: Sequence[Turning] = (), *, undistort: bool = False) -> None:
+        self._config = config
+        self._guesses = tuple(guesses)
+        self._undistort = undistort and bool(guesses)
+        self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _MOST_POINTS)
+        self._map_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+        self._poses: list[_Pose] = []
+        self._failed = 0
+        self._segment = -1
+        self._usual = 0.0
+        self._restart()
+
+    def _restart(self) -> None:
+        self._tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
+        self._segment += 1
+        self._first: Scan | None = None
+        self._previous_ns: int | None = None
+        self._x = NavState.identity().pack()
+        self._rate, self._velocity = np.zeros(3), np.zeros(3)  # LiDAR frame, and along the path's axes
+
+    def path(self) -> LidarPath:
+        """What has been found so far."""
+        poses = self._poses
+        return LidarPath(
+            np.array([pose.time_ns for pose in poses], np.int64),
+            np.array([pose.R for pose in poses]).reshape(-1, 3, 3),
+            np.array([pose.p for pose in poses]).reshape(-1, 3),
+            np.array([pose.information for pose in poses]).reshape(-1, 6, 6),
+            np.array([pose.segment for pose in poses], np.int64),
+            np.array([pose.weak for pose in poses], bool),
+            np.array([pose.misfit for pose in poses], np.float64),
+            self._failed,
+        )
+
+    def add(self, scan: Scan, expected: Twist | None = None) -> None:
+        """Register the next scan; `expected` is one more start."""
+        if len(scan) < self._config.min_points:
+            self._failed += 1
+            self._restart()
+            return
+        scan = thinned(scan, _MOST_RAW)
+        middle_ns = (scan.start_ns + scan.end_ns) // 2
+        step_s = 0.0 if self._previous_ns is None else (middle_ns - self._previous_ns) * 1e-9
+        if not 0.0 < step_s < _LONGEST_STEP_S:
+            self._restart()
+            self._begin(scan, middle_ns)
+            return
+        fit = self._best(scan, middle_ns, step_s, expected)
+        if fit is not None and self._first is not None:
+            # The first scan was taken as it came; now that its motion is known, it makes the map anew.
+            self._tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
+            first_ns = (self._first.start_ns + self._first.end_ns) // 2
+            still = undistorted(self._first, self._nodes(self._first, first_ns, fit.rate, fit.velocity), first_ns)
+            self._tree.insert(self._map_filter(still)[1].astype(np.float64), downsample=True)
+            self._rate, self._velocity, self._first = fit.rate, fit.velocity, None
+            fit = self._best(scan, middle_ns, step_s, expected)
+        if fit is None:
+            self._failed += 1
+            self._restart()
+            self._begin(scan, middle_ns)
+            return
+        self._usual = fit.misfit if self._usual == 0.0 else 0.9 * self._usual + 0.1 * fit.misfit
+        self._x, self._rate, self._velocity = fit.x, fit.rate, fit.velocity
+        self._keep(middle_ns, fit.information, fit.weak, fit.misfit)
+        self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
+        self._previous_ns = middle_ns
+
+    def _begin(self, scan: Scan, middle_ns: int) -> None:
+        self._previous_ns = middle_ns
+        self._first = scan
+        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 6)), 0.0)
+        self._tree.insert(self._map_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
+
+    def _keep(self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float) -> None:
+        R_path_lidar, p_path_lidar = self._x[R : R + 9].reshape(3, 3).copy(), self._x[P : P + 3].copy()
+        self._poses.append(_Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.any()), misfit))
+
+    def _best(self, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
+        """The registration that fits best, from constant velocity, from the guesses and, if need be, from other speeds."""
+        starts = [(self._rate, self._velocity)]
+        for guess in self._guesses:
+            R_guess = guess(np.array([middle_ns - round(step_s * 1e9), middle_ns]))
+            rate = so3.log(R_guess[0].T @ R_guess[1]) / step_s
+            starts.append((rate, self._velocity))
+        if expected is not None:
+            rate, velocity = expected
+            starts.append((rate, self._x[R : R + 9].reshape(3, 3) @ so3.exp(0.5 * step_s * rate) @ velocity))
+        # Where two expect about the same, one is enough.
+        starts = [
+            start
+            for number, start in enumerate(starts)
+            if not any(
+                np.abs(start[0] - other[0]).max() * step_s < _SAME_START[0]
+                and np.abs(start[1] - other[1]).max() * step_s < _SAME_START[1]
+                for other in starts[:number]
+            )
+        ]
+        needed = len(starts)
+        starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
+        best: _Fit | None = None
+        for number, (rate, velocity) in enumerate(starts):
+            if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, _GOOD):
+                break
+            found = self._register(scan, middle_ns, step_s, rate, velocity)
+            if found is not None and (best is None or found.cost < best.cost):
+                best = found
+        return best
+
+    def _nodes(self, scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nodes (n, 22) of the motion within the scan, relative to the LiDAR at `at_ns`; rate and velocity in its frame there."""
+        time_ns = np.linspace(scan.start_ns, scan.end_ns, _NODES, dtype=np.int64) if self._undistort else np.array([at_ns])
+        nodes = np.zeros((len(time_ns), NODE))
+        seconds = (time_ns - at_ns) * 1e-9
+        nodes[:, N_TIME] = seconds
+        nodes[:, N_P : N_P + 3] = seconds[:, None] * velocity
+        nodes[:, N_V : N_V + 3] = velocity
+        if not self._undistort:
+            nodes[:, N_R : N_R + 9] = np.eye(3).ravel()
+            nodes[:, N_W : N_W + 3] = rate
+            return nodes
+        R_any = self._guesses[0](np.append(time_ns, at_ns))
+        nodes[:, N_R : N_R + 9] = (R_any[-1].T @ R_any[:-1]).reshape(-1, 9)
+        rates = so3.log(np.swapaxes(R_any[:-2], 1, 2) @ R_any[1:-1]) / np.maximum(np.diff(seconds), 1e-9)[:, None]
+        nodes[:-1, N_W : N_W + 3] = rates
+        nodes[-1, N_W : N_W + 3] = rates[-1]
+        return nodes
+
+    def _register(
+        self, scan: Scan, middle_ns: int, step_s: float, rate: NDArray[np.float64], velocity: NDArray[np.float64]
+    ) -> _Fit | None:
+        R_before, p_before = self._x[R : R + 9].reshape(3, 3), self._x[P : P + 3]
+        x = self._x.copy()
+        x[R : R + 9] = (R_before @ so3.exp(rate * step_s)).ravel()
+        x[P : P + 3] = p_before + velocity * step_s
+        directions: PoseDirections | None = None
+        for _ in range(_PASSES):
+            # Within the scan the motion is what it was found to be on the way here.
+            nodes = self._nodes(scan, middle_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity)
+            still = undistorted(scan, nodes, middle_ns)
+            points = self._filter(still)[0]
+            measurement = PlaneMeasurement(points, self._tree, self._config, voxel=self._filter.voxel_size, with_extrinsic=False)
+            directions = align(x, measurement, self._config)
+            if directions is None:
+                return None
+            moved = so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
+            change = max(np.abs(moved[0] - rate).max(), np.abs(moved[1] - velocity).max()) * step_s
+            rate, velocity = moved
+            if change < _SAME_MOTION:
+                break
+        information = measurement.at(x, rematch=True)
+        # A point among map points of one scan line is not used, but it does lie on the map.
+        on_line = measurement.rejected().get(REASONS[ONE_LINE], 0)
+        share = (information.used + on_line) / max(len(points), 1)
+        if (
+            directions is None
+            or information.used < _FEWEST_USED
+            or share < _LEAST_SHARE
+            or max(np.abs(rate).max() / _FASTEST[0], np.abs(velocity).max() / _FASTEST[1]) > 1.0
+        ):
+            return None
+        cost = information.residual_rms**2 * share + self._config.plane_threshold**2 * (1.0 - share)
+        return _Fit(
+            x,
+            rate,
+            velocity,
+            _honest(information.A[:6, :6], directions, information.residual_rms),
+            directions.vectors[:, directions.weak],
+            information.residual_rms,
+            cost,
+            self._map_filter(still)[1],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    time_ns: int
+    R: NDArray[np.float64]
+    p: NDArray[np.float64]
+    information: NDArray[np.float64]
+    segment: int
+    weak: bool
+    misfit: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    x: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    information: NDArray[np.float64]
+    weak: NDArray[np.float64]
+    misfit: float
+    cost: float
+    map_points: NDArray[np.float32]
+
+
+def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConfig) -> PoseDirections | None:
+    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
+    delta = np.zeros(TANGENT)
+    directions: PoseDirections | None = None
+    for step in range(_STEPS):
+        information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
+        if information.used < config.min_points:
+            return None
+        directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
+        delta[:6] = strong_step(information.A, information.b, directions)
+        boxplus_into(x, delta, x)
+        if np.abs(delta).max() < _SETTLED:
+            break
+    return directions
+
+
+def _honest(A: NDArray[np.float64], directions: PoseDirections, misfit: float) -> NDArray[np.float64]:
+    """The information (6, 6) of a registration, nothing along weak directions, and nowhere more than floor and misfit allow."""
+    scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
+    strong = directions.vectors[:, ~directions.weak]
+    covariance = np.linalg.inv(strong.T @ (A * np.outer(scale, scale)) @ strong)
+    # The floor is a variance of its own, added in the coordinates of the strong directions.
+    floor = strong.T @ np.diag((max(misfit / _GOOD, 1.0) * _SIGMA_FLOOR / scale) ** 2) @ strong
+    reduced = np.linalg.inv(covariance + floor)
+    back = strong / scale[:, None]
+    honest: NDArray[np.float64] = back @ reduced @ back.T
+    return honest
+
+
+def thinned(scan: Scan, most: int) -> Scan:
+    """Every n-th point, so that at most `most` stay."""
+    stride = -(-len(scan) // most)
+    if stride <= 1:
+        return scan
+    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns)
+
+
+def undistorted(scan: Scan, nodes: NDArray[np.float64], at_ns: int) -> NDArray[np.float32]:
+    """The points (N, 3) as seen at `at_ns` by a LiDAR that moves through `nodes`."""
+    out = np.empty_like(scan.p_lidar)
+    deskew_into(scan.p_lidar, scan.time_ns, at_ns, nodes, len(nodes), _AT_REST, out)
+    return out
+
+
+_AT_REST = NavState.identity().pack()

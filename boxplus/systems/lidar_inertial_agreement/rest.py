@@ -1,0 +1,101 @@
+"""Whether the LiDAR rests against what it sees.
+
+The hypothesis that all velocities are zero, twice: against the path that registration finds, and, where that path creeps along a
+direction that noisy surfaces only seem to determine, by how well the last scans fit the first ones unmoved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import NavState, P, R
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
+
+_DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
+_SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
+_NEAR_M = 0.03
+_DEVIATIONS = 3.0
+_POSE_SIGMA_M = 0.004
+_CREEP_M_S = 0.15
+_AS_WELL = 1.1  # times the cost
+_COMPARED, _POINTS = 3, 3000
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The hypothesis that all velocities are zero, against a path of the LiDAR alone.
+
+    Attributes:
+        at_rest: whether it fits, along the axes that the scene determines.
+        determined: whether these are all axes.
+        open_axes: (K, 3) unit axes along which the scene does not show it, in the frame of the path's first pose.
+        speed: along the determined axes [m/s].
+        turn_rate: [rad/s].
+    """
+
+    at_rest: bool
+    determined: bool
+    open_axes: NDArray[np.float64]
+    speed: float
+    turn_rate: float
+
+
+def judge_rest(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> Rest:
+    """Test a path and the scans it was found from; a path of a single pose is undetermined along every axis."""
+    last = np.flatnonzero(path.segment == path.segment[-1])
+    seconds = (path.time_ns[last] - path.time_ns[last[0]]) * 1e-9
+    if len(last) < 2:
+        return Rest(False, False, np.eye(3), 0.0, 0.0)
+    p = path.p_path_lidar[last]
+    values, vectors = np.linalg.eigh(path.information[last, 3:, 3:])
+    capped = np.where(values > 0.0, 1.0 / (1.0 / np.maximum(values, 1e-9) + _POSE_SIGMA_M**2), 0.0)
+    weight = np.einsum("nij,nj,nkj->nik", vectors, capped, vectors)
+    # p = v t from the first pose, which defines the frame.
+    H = np.einsum("n,nij->ij", seconds**2, weight)
+    b = np.einsum("n,nij,nj->i", seconds, weight, p)
+    information, axes = np.linalg.eigh(H)
+    std = 1.0 / np.sqrt(np.maximum(information, 1e-12))
+    seen = std < _DETERMINED_M_S
+    along = axes[:, seen]
+    speeds = (along.T @ b) / information[seen]
+    ends = np.abs(along.T @ p[-min(3, len(p) - 1) :].mean(axis=0))
+    turned = so3.log(path.R_path_lidar[last[0]].T @ path.R_path_lidar[last[-1]])
+    rate = float(np.linalg.norm(turned)) / float(seconds[-1])
+    slow = (np.abs(speeds) < _SLOW_M_S + _DEVIATIONS * std[seen]).all() and (
+        ends < _NEAR_M + _DEVIATIONS * std[seen] * seconds[-1]
+    ).all()
+    speed = float(np.linalg.norm(speeds))
+    at_rest = rate < _SLOW_RAD_S and bool(slow or (speed < _CREEP_M_S and _fits_unmoved(path, scans, config)))
+    return Rest(at_rest, bool(seen.all()), axes[:, ~seen].T, speed, rate)
+
+
+def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> bool:
+    """Whether the last scans fit the first ones without any motion as well as with the one that was found."""
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)
+    for scan in scans[:_COMPARED]:
+        tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
+    unmoved, moved = 0.0, 0.0
+    for k in range(1, _COMPARED + 1):
+        points = voxel_filter(scans[-k].p_lidar)[0]
+        for found in (False, True):
+            x = NavState.identity().pack()
+            if found:
+                x[R : R + 9], x[P : P + 3] = path.R_path_lidar[-k].ravel(), path.p_path_lidar[-k]
+            measurement = PlaneMeasurement(points, tree, config, voxel=voxel_filter.voxel_size, with_extrinsic=False)
+            fit = measurement.at(x, rematch=True)
+            # A point that matches nothing counts as far off: a scan that has moved away fits what is left of it.
+            share = measurement.on_map_share
+            cost = share * fit.residual_rms**2 + (1.0 - share) * config.plane_threshold**2
+            unmoved, moved = (unmoved, moved + cost) if found else (unmoved + cost, moved)
+    return unmoved <= _AS_WELL * moved

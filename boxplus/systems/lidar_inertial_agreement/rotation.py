@@ -1,0 +1,238 @@
+"""Gyroscope against LiDAR: the mounting's rotation, the clocks' offset, the gyroscope's scale and bias, from how both turned.
+
+Over the interval between two scans the LiDAR turns at the mean rate ω_L and the gyroscope shows s R_imu_lidar ω_L + b, at times
+that differ by the clocks' offset. Two sets of vectors give the rotation between them (Wahba, SIAM Review 1965; Kabsch 1976;
+Umeyama 1991); offset, scale and bias join in a Gauss-Newton estimate with one covariance for all eight, so that what the motion
+does not show is not claimed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import so3
+from boxplus.sensors.gyro_attitude import GyroAttitude
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+
+LARGEST_OFFSET_S = 0.6
+_OFFSET_STEP_S = 0.02
+FEWEST_INTERVALS = 8
+_ROUNDS = 8
+_NO_BETTER = 0.5
+_SEEN_RAD = 0.01  # of a registration, about its least known axis
+_DEGREES = 180.0 / np.pi
+_LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration alone
+_FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
+_IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
+
+
+@dataclass(frozen=True, slots=True)
+class RotationFit:
+    """What the comparison of both rotations shows.
+
+    Attributes:
+        R_imu_lidar: (3, 3). Where the motion leaves it open, the closest to what was expected.
+        offset_s: add this to the LiDAR's times to bring them to the IMU's clock [s].
+        scale: the gyroscope's rotation over the LiDAR's: 1, or 57.3 for a gyroscope in deg/s.
+        bias: (3,) of the gyroscope, in its own unit divided by `scale`'s.
+        covariance: (8, 8) of [θ about the IMU's axes, bias, log scale, offset].
+        sigma: rms of what is left of the rates [rad/s].
+        explained: share of the LiDAR's rotation rates (squared) that the gyroscope shows, 0 to 1.
+        mirrored: the same share if one of both were mirrored (no rotation has a determinant of −1), clocks as they are.
+        together: share of both sensors' rotation that is common to them, 0 to 1; small where either turns and the other does not.
+        sigma_registration: what of the LiDAR's rates changes from scan to scan without a trend [rad/s], its noise at most.
+        excitation: (3,) rms rates of the LiDAR along its principal axes, descending [rad/s].
+        intervals: pairs of scans compared.
+    """
+
+    R_imu_lidar: NDArray[np.float64]
+    offset_s: float
+    scale: float
+    bias: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    sigma: float
+    explained: float
+    mirrored: float
+    together: float
+    sigma_registration: float
+    excitation: NDArray[np.float64]
+    intervals: int
+
+    @property
+    def rotation_std(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(3,) standard deviations of R_imu_lidar [rad], ascending, and the axes in the IMU frame, one a column (3, 3)."""
+        variance, axes = np.linalg.eigh(self.covariance[:3, :3])
+        return np.minimum(np.sqrt(variance), np.pi), axes
+
+    @property
+    def offset_std_s(self) -> float:
+        return float(np.sqrt(self.covariance[7, 7]))
+
+    @property
+    def scale_std(self) -> float:
+        """Relative."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
+
+def compare_rotations(
+    path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.float64] | None = None, *, largest_offset_s: float = LARGEST_OFFSET_S
+) -> RotationFit | None:
+    """Compare the rotations of a LiDAR's path with a gyroscope's; None with fewer than eight scan pairs within its samples.
+
+    Args:
+        path: from `lidar_path`.
+        imu: finite samples in order of time.
+        R_expected: (3, 3) R_imu_lidar to stay close to where the motion does not tell; the identity when None.
+        largest_offset_s: of the clocks that is searched [s].
+    """
+    # A first pose defines the frame of its segment; of every other one all three rotations must have been seen.
+    seen = np.linalg.eigvalsh(path.information[:, :3, :3])[:, 0] > 1.0 / _SEEN_RAD**2
+    seen[1:] |= path.segment[1:] != path.segment[:-1]
+    pairs = np.flatnonzero((path.segment[1:] == path.segment[:-1]) & seen[1:])
+    attitude = GyroAttitude(imu.time_ns, imu.gyro)
+    begin_ns, end_ns = path.time_ns[pairs], path.time_ns[pairs + 1]
+    # Times without samples within the offsets that are searched cannot be compared at each of them.
+    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0)
+    pairs, begin_ns, end_ns = pairs[inside], begin_ns[inside], end_ns[inside]
+    if len(pairs) < FEWEST_INTERVALS:
+        return None
+    step_s = (end_ns - begin_ns)[:, None] * 1e-9
+    turned = np.swapaxes(path.R_path_lidar[pairs], 1, 2) @ path.R_path_lidar[pairs + 1]
+    rate_lidar = so3.log(turned) / step_s
+    expected = np.eye(3) if R_expected is None else R_expected
+
+    def plain(offset_s: float) -> NDArray[np.float64]:
+        shift = round(offset_s * 1e9)
+        return (attitude.integral(end_ns + shift) - attitude.integral(begin_ns + shift)) / step_s
+
+    # First unit and offset, with plain integrals: a gyroscope in deg/s turns several times around between two scans.
+    room_s = min(largest_offset_s, 0.5 * float(path.time_ns[-1] - path.time_ns[0]) * 1e-9)
+    steps = max(round(room_s / _OFFSET_STEP_S), 1)
+    offsets = np.arange(-steps, steps + 1) * _OFFSET_STEP_S
+    fits = [_Kabsch(plain(offset), rate_lidar, expected) for offset in offsets]
+    best = int(np.argmin([fit.cost for fit in fits]))
+    unit = _DEGREES if 7.6 < fits[best].scale < 430.0 else 1.0 / _DEGREES if fits[best].scale < 1.0 / 7.6 else 1.0
+    attitude = attitude.scaled(1.0 / unit)
+
+    def exact(offset_s: float) -> NDArray[np.float64]:
+        shift = round(offset_s * 1e9)
+        return so3.log(np.swapaxes(attitude.at(begin_ns + shift), 1, 2) @ attitude.at(end_ns + shift)) / step_s
+
+    # From the best offset of the search and from none: where they come to the same, the sharper one is right.
+    candidates = [_Refined(exact, rate_lidar, expected, offset) for offset in dict.fromkeys((0.0, float(offsets[best])))]
+    best_fit = max(candidates, key=lambda fit: fit.explained)
+    if candidates[0].explained > best_fit.explained - _NO_BETTER * (1.0 - best_fit.explained):
+        best_fit = candidates[0]
+    R, scale, bias, offset = best_fit.R, best_fit.scale, best_fit.bias, best_fit.offset_s
+    H, weight, residual = best_fit.H, best_fit.weight, best_fit.residual
+    freedom = max(3.0 * weight.sum() - 8.0, 1.0)
+    variance = max(float((weight * (residual**2).sum(axis=1)).sum()) / freedom, _LEAST_SIGMA**2 / 9.0)
+    wide = np.diag(1.0 / np.array([np.pi, np.pi, np.pi, 10.0, 10.0, 10.0, 3.0, 1.0]) ** 2)
+    covariance = np.linalg.inv(H / variance + wide) + np.diag(_FLOOR**2)
+    centred = rate_lidar - rate_lidar.mean(axis=0)
+    power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(pairs))[::-1], 0.0)
+    total = float((centred**2).sum())
+    # A flipped sign is looked for with clocks as they are: at some other offset anything fits a little.
+    final, unshifted = exact(offset), exact(0.0)
+    proper, improper = _Kabsch(final, rate_lidar, expected), _Kabsch(unshifted, rate_lidar, expected, mirrored=True)
+    explained, mirrored = proper.explained, improper.explained
+    # Of both: a gyroscope that turns while the LiDAR rests fits no better than the other way round.
+    both = float(((final - final.mean(axis=0)) ** 2).sum()) + proper.scale**2 * total
+    together = max(1.0 - 2.0 * float((proper.residual**2).sum()) / max(both, 1e-12), 0.0)
+    second = np.diff(rate_lidar, n=2, axis=0) / np.sqrt(6.0)
+    jitter = float(np.sqrt(np.median((second**2).sum(axis=1)))) if len(second) else 0.0
+    return RotationFit(
+        R,
+        offset,
+        scale * unit,
+        bias * unit,
+        covariance,
+        float(np.sqrt(variance)),
+        explained,
+        mirrored,
+        together,
+        jitter,
+        np.sqrt(power),
+        len(pairs),
+    )
+
+
+class _Refined:
+    """Gauss-Newton on rotation, bias, scale and offset together, robustly, from the best rotation at one offset."""
+
+    def __init__(
+        self,
+        exact: Callable[[float], NDArray[np.float64]],
+        rate_lidar: NDArray[np.float64],
+        R_expected: NDArray[np.float64],
+        offset_s: float,
+    ) -> None:
+        start = _Kabsch(exact(offset_s), rate_lidar, R_expected)
+        self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
+        for _ in range(_ROUNDS):
+            rate_imu = exact(self.offset_s)
+            slope = (exact(self.offset_s + 0.005) - exact(self.offset_s - 0.005)) / 0.01
+            seen = self.scale * rate_lidar @ self.R.T
+            self.residual = rate_imu - seen - self.bias
+            norm = np.linalg.norm(self.residual, axis=1)
+            sigma = max(1.4826 * float(np.median(norm)) / 1.54, 1e-3)  # the median of a 3-d normal's length is 1.54 sigma
+            self.weight: NDArray[np.float64] = 1.0 / (1.0 + (norm / (4.0 * sigma)) ** 2) ** 2
+            # Derivatives of the residual: R <- Exp(θ) R, bias, log scale, offset.
+            J = np.zeros((len(rate_lidar), 3, 8))
+            J[:, :, :3] = so3.hat(seen)
+            J[:, :, 3:6] = -np.eye(3)
+            J[:, :, 6] = -seen
+            J[:, :, 7] = slope
+            root = np.sqrt(self.weight)
+            flat = (J * root[:, None, None]).reshape(-1, 8)
+            self.H: NDArray[np.float64] = flat.T @ flat
+            # What the motion does not show stays: a pull too small to matter where it does.
+            prior = np.array([1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3]) * sigma**2
+            step = -np.linalg.solve(self.H + np.diag(prior), flat.T @ (self.residual * root[:, None]).reshape(-1))
+            self.R = so3.exp(step[:3]) @ self.R
+            self.bias = self.bias + step[3:6]
+            self.scale *= float(np.exp(np.clip(step[6], -0.7, 0.7)))
+            self.offset_s += float(np.clip(step[7], -0.02, 0.02))
+            if np.abs(step).max() < 1e-6:
+                break
+        self.explained = _Kabsch(exact(self.offset_s), rate_lidar, R_expected).explained
+
+
+class _Kabsch:
+    """rate_imu ≈ scale R rate_lidar + bias, robustly (Geman-McClure on the scale of the median residual)."""
+
+    def __init__(
+        self,
+        rate_imu: NDArray[np.float64],
+        rate_lidar: NDArray[np.float64],
+        R_expected: NDArray[np.float64],
+        *,
+        mirrored: bool = False,
+    ) -> None:
+        weight = np.ones(len(rate_imu))
+        for _ in range(4):
+            total = weight.sum()
+            mean_imu, mean_lidar = weight @ rate_imu / total, weight @ rate_lidar / total
+            a, b = rate_imu - mean_imu, rate_lidar - mean_lidar
+            power = max(float(((b * weight[:, None]) * b).sum()) / total, 1e-12)
+            H = (a * weight[:, None]).T @ b / total
+            pull = _IDENTITY * max(float(np.linalg.norm(H)), 1e-12)
+            U, _, Vt = np.linalg.svd(H + pull * R_expected)
+            sign = np.linalg.det(U @ Vt) * (-1.0 if mirrored else 1.0)
+            self.R: NDArray[np.float64] = U @ np.diag([1.0, 1.0, np.sign(sign)]) @ Vt
+            rotated = b @ self.R.T
+            self.scale: float = max(float((weight[:, None] * a * rotated).sum()) / float(total) / power, 1e-6)
+            self.bias: NDArray[np.float64] = mean_imu - self.scale * self.R @ mean_lidar
+            self.residual: NDArray[np.float64] = a - self.scale * rotated
+            norm = np.linalg.norm(self.residual, axis=1)
+            sigma = max(float(np.median(norm)), 1e-6)
+            weight = 1.0 / (1.0 + (norm / (3.0 * sigma)) ** 2) ** 2
+        left, turned = float((self.residual**2).sum()), float((b * b).sum())
+        self.explained: float = 1.0 - min(left / max(self.scale**2 * turned, 1e-12), 1.0)
+        # Relative to what turned, so that a scale near zero does not look like a good fit.
+        self.cost = float(np.median(norm)) / (self.scale * np.sqrt(power))

@@ -1,0 +1,150 @@
+"""The agreement of both sensors, watched while an estimator runs.
+
+Every few seconds the last scans are registered without the IMU and compared with it (`compare_sensors`), on a thread beside the
+estimator; the verdict is taken up a fixed number of scans later, so that the run does not depend on the machine. Where the
+estimator itself has a suspicion the comparison is made at once.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
+from boxplus.systems.lidar_inertial_agreement.hypotheses import Finding, contradictions, judges_clocks, judges_rotation
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist, thinned
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_WINDOW_S = 4.0
+_FEWEST_SCANS = 20
+_MOST_POINTS = 6000
+_TAKEN_UP_AFTER = 40  # scans
+_UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
+_DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
+_SUSPECTED_EVERY_S = 2.0
+_DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
+
+
+class Watch:
+    """Follows the scans and samples of one run.
+
+    Args:
+        config: of the odometry.
+        T_declared: T_imu_lidar (4, 4) as given; None where it is estimated while running.
+
+    Attributes:
+        contradiction: what the newest comparison that could decide found wrong; None while the sensors agree.
+    """
+
+    def __init__(self, config: LioConfig, T_declared: NDArray[np.float64] | None) -> None:
+        self.contradiction: Finding | None = None
+        self._config = config.model_copy(update={"threads": 1})
+        self._T_declared = T_declared
+        self._scans: deque[Scan] = deque()
+        self._imu: deque[ImuSamples] = deque()
+        self._expected: deque[Twist] = deque()
+        self._pool: ThreadPoolExecutor | None = None
+        self._pending: Future[Agreement] | None = None
+        self._scans_since = 0
+        self._due_ns: int | None = None
+        self._suspected_ns: int | None = None
+        self._decided = 0
+        self._first_offset: tuple[int, float, float] | None = None
+
+    def add(
+        self, scan: Scan, imu: ImuSamples, T_imu_lidar: NDArray[np.float64], expected: Twist, *, suspicious: bool = False
+    ) -> str | None:
+        """Take a scan and its samples in; returns a new contradiction, a sentence, or None.
+
+        Args:
+            scan, imu: in order of time.
+            T_imu_lidar: (4, 4) in use now.
+            expected: how the estimator believes that the LiDAR moved within the scan.
+            suspicious: whether to compare at once.
+        """
+        self._scans.append(thinned(scan, _MOST_POINTS))
+        self._imu.append(imu)
+        self._expected.append(expected)
+        while self._scans[-1].end_ns - self._scans[0].start_ns > _WINDOW_S * 1e9 and len(self._scans) > _FEWEST_SCANS:
+            self._scans.popleft()
+            self._imu.popleft()
+            self._expected.popleft()
+        if self._due_ns is None:
+            self._due_ns = scan.start_ns + round(_WINDOW_S * 1e9)
+        self._scans_since += 1
+        news = None
+        if self._pending is not None and self._scans_since >= _TAKEN_UP_AFTER:
+            news = self._take_up(self._pending.result())
+            self._pending = None
+        if len(self._scans) < _FEWEST_SCANS:
+            return news
+        if suspicious and self._pending is None and (self._suspected_ns is None or scan.end_ns > self._suspected_ns):
+            self._suspected_ns = scan.end_ns + round(_SUSPECTED_EVERY_S * 1e9)
+            return self._take_up(self._comparison(T_imu_lidar)()) or news
+        if self._pending is None and scan.end_ns >= self._due_ns:
+            if self._pool is None:
+                self._pool = ThreadPoolExecutor(1, thread_name_prefix="boxplus-watch")
+            self._pending = self._pool.submit(self._comparison(T_imu_lidar))
+            self._scans_since = 0
+        return news
+
+    def finish(self) -> str | None:
+        """No more scans will come: take up what is still under way, and compare the last scans if nothing has decided yet."""
+        news = None
+        if self._pending is not None:
+            news = self._take_up(self._pending.result())
+            self._pending = None
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+        return news
+
+    def _comparison(self, T_imu_lidar: NDArray[np.float64]) -> Callable[[], Agreement]:
+        scans, expected, config = list(self._scans), list(self._expected), self._config
+        imu = ImuSamples(*(np.concatenate([getattr(part, name) for part in self._imu]) for name in ("time_ns", "gyro", "accel")))
+        T_declared = self._T_declared
+        T_expected = T_imu_lidar.copy()
+        return lambda: compare_sensors(scans, imu, config, T_expected=T_expected, T_declared=T_declared, expected=expected)
+
+    def _take_up(self, agreement: Agreement) -> str | None:
+        findings = contradictions(agreement, self._T_declared)
+        decisive = bool(findings) or judges_rotation(agreement)
+        drift = self._drift(agreement)
+        if drift is not None:
+            findings.insert(0, drift)
+        end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
+        wait, news = _UNDECIDED_EVERY_S, None
+        if decisive:
+            wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
+            self._decided += 1
+            before, found = self.contradiction, findings[0] if findings else None
+            if found is None or before is None or found.cause != before.cause:
+                self.contradiction, news = found, found
+        self._due_ns = end_ns + round(wait * 1e9)
+        return None if news is None else news.text
+
+    def _drift(self, agreement: Agreement) -> Finding | None:
+        """Clocks that run at different speeds: the offset of two comparisons differs."""
+        rotation = agreement.rotation
+        if rotation is None or not judges_clocks(rotation):
+            return None
+        now = int(agreement.path.time_ns[-1])
+        if self._first_offset is None:
+            self._first_offset = (now, rotation.offset_s, rotation.offset_std_s)
+            return None
+        then, offset, std = self._first_offset
+        change, known = rotation.offset_s - offset, float(np.hypot(std, rotation.offset_std_s))
+        if abs(change) < max(_DRIFT_S, _DRIFT_DEVIATIONS * known):
+            return None
+        seconds = (now - then) * 1e-9
+        return Finding(
+            "clock_drift",
+            f"within {seconds:.0f} s the offset of the LiDAR's clock to the IMU's changed by {change * 1e3:+.0f} ± "
+            f"{known * 1e3:.0f} ms: the clocks drift apart or one of them steps; synchronise them",
+        )
