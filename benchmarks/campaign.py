@@ -6,7 +6,7 @@
     python benchmarks/campaign.py --only fault=clock_offset --only world=hall --seeds 0:1000
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
     python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
-    python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run
+    python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
 
 A seed draws world, motion, sensors, mounting and, in half of the runs, one fault. Every run ends `right`, flagged with the `right
 cause`, `flagged`, or `silent`ly wrong; lio_campaign/judge.py says what these mean.
@@ -43,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parse(arguments)
     if options.merge:
         lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]
-        print(report(sorted(lines, key=lambda line: line["seed"])))
+        chosen = [line for line in lines if all(line[key] == value for key, value in options.only)]
+        print(report(sorted(chosen, key=lambda line: line["seed"])))
         return
     work = _work(options)
     if isinstance(work, str):
