@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
+_UNSEEN = [*range(9), *range(11, 32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)]
+_AS_TEXT = {code: f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}" for code in _UNSEEN}
+
+
+def printable(text: str) -> str:
+    """`text` with what steers a terminal written out: names in files may hold escape sequences that hide or fake output.
+
+    These are control characters, tabs and line ends aside, and what turns the direction of writing.
+
+    Example:
+        >>> printable("/lidar\\x1b[2K")
+        '/lidar\\\\x1b[2K'
+    """
+    return text.translate(_AS_TEXT)
+
 
 class BoxplusError(Exception):
     """Base of every error raised on purpose by boxplus."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class InputError(BoxplusError, ValueError):

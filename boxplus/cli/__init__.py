@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from boxplus.errors import BoxplusError, InputError
+from boxplus.errors import BoxplusError, InputError, printable
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_UNTRUSTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 
@@ -76,6 +76,13 @@ app = typer.Typer(
 )
 
 
+class _LogFormatter(logging.Formatter):
+    """Log lines may quote a file."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
 def _print_version(wanted: bool) -> None:
     if wanted:
         import boxplus
@@ -91,7 +98,9 @@ def _common(
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the log as well.")] = False,
 ) -> None:
-    logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(levelname)s %(name)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_LogFormatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, handlers=[handler])
     logging.getLogger("boxplus").setLevel(logging.INFO if verbose else logging.WARNING)
 
 

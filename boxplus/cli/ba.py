@@ -42,6 +42,7 @@ class FormatChoice(StrEnum):
 
 
 def ba(
+    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="BAL file (plain or .bz2), or the folder of a COLMAP model (text or binary).")],
     output: OutputOption = None,
     loss: LossOption = "none",
@@ -70,7 +71,7 @@ def ba(
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
-    from boxplus.runs.output_folder import prepare_output_folder
+    from boxplus.runs.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
     from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 
@@ -87,7 +88,9 @@ def ba(
     with terminal.console.status("reading"):
         start = read_reconstruction(file, format.value)
     folder = output or Path(f"{file.resolve().name.removesuffix('.bz2').removesuffix('.txt')}_boxplus")
-    prepare_output_folder(folder, "boxplus ba", *_own_files(folder), overwrite=overwrite)
+    files, folders = _own_files(folder)
+    held = output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite)
+    ctx.with_resource(held)  # to the end of the command
     name = reconstruction_file_name(start, file, "adjusted")
     terminal.facts(file.name, {"input": _describe(start), "loss": "none" if robust is None else repr(robust)})
     with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:

@@ -56,8 +56,11 @@ def _print_table(diagnosis: Diagnosis) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from boxplus.errors import printable
+
     console = Console()
-    table = Table(title=f"{diagnosis.path.name}: {diagnosis.format}", title_justify="left", show_lines=False, pad_edge=False)
+    title = Text(printable(f"{diagnosis.path.name}: {diagnosis.format}"))
+    table = Table(title=title, title_justify="left", show_lines=False, pad_edge=False)
     table.add_column("")
     table.add_column("what", no_wrap=True)
     table.add_column("value", overflow="fold")

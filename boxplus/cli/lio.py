@@ -90,7 +90,7 @@ def run(
     from boxplus.recordings import open_recording
     from boxplus.runs.extrinsic import choose_extrinsic
     from boxplus.runs.odometry_run import run_odometry
-    from boxplus.runs.run_folder import prepare_run_folder
+    from boxplus.runs.run_folder import claim_run_folder
 
     terminal = RunTerminal()
     shown: View | None = None
@@ -98,19 +98,22 @@ def run(
         from boxplus.report.live_view import LiveView
 
         shown = LiveView(recording.name)
-    with open_recording(recording, config.recording) as opened:
-        prepare_run_folder(folder, overwrite=overwrite)
+    with (
+        stop_on_interrupt(terminal.announce_stop) as should_stop,
+        open_recording(recording, config.recording) as opened,
+        claim_run_folder(folder, overwrite=overwrite) as claimed,
+    ):
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
             extrinsic = choose_extrinsic(opened, config.odometry)
         terminal.print_evidence(opened.info, extrinsic)
-        with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.progress() as progress:
+        with terminal.progress() as progress:
             summary = run_odometry(
-                opened, folder, config, extrinsic=extrinsic, progress=progress, view=shown, should_stop=should_stop
+                opened, claimed, config, extrinsic=extrinsic, progress=progress, view=shown, should_stop=should_stop
             )
-    if report and summary.scans:
-        from boxplus.report import write_report
+        if report and summary.scans:
+            from boxplus.report import write_report
 
-        with terminal.status("drawing the report"):
-            write_report(folder)
+            with terminal.status("drawing the report"):
+                write_report(folder)
     terminal.print_results(summary, folder)
     return summary

@@ -63,6 +63,7 @@ class CrossBlockChoice(StrEnum):
 
 
 def pgo(
+    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
     output: OutputOption = None,
     start: Annotated[
@@ -103,7 +104,7 @@ def pgo(
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
-    from boxplus.runs.output_folder import prepare_output_folder
+    from boxplus.runs.output_folder import output_folder
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
@@ -122,7 +123,9 @@ def pgo(
             file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
         )
     folder = output or Path(f"{file.resolve().stem}_boxplus")
-    prepare_output_folder(folder, "boxplus pgo", *_own_files(folder), overwrite=overwrite)
+    files, folders = _own_files(folder)
+    held = output_folder(folder, "boxplus pgo", lambda: files, lambda: folders, overwrite=overwrite)
+    ctx.with_resource(held)  # to the end of the command
     name = "optimized.g2o" if kind == "g2o" else "optimized.graph"
     described = f"{'g2o' if kind == 'g2o' else 'TORO'}, {graph.dimension}D; {len(graph.ids):,} poses, {len(graph.edges):,} edges"
     terminal.facts(file.name, {"input": described, "loss": "none" if robust is None else repr(robust)})

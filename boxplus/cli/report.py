@@ -10,9 +10,10 @@ import typer
 
 def report(folder: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio'.", metavar="FOLDER")]) -> None:
     """Draw the report of a run again, also of an interrupted one, and say how far the run came."""
+    from boxplus.errors import printable
     from boxplus.report import write_report
     from boxplus.report.run_data import load_run
 
     data = load_run(folder)
-    typer.echo(data.summary.describe_state())
+    typer.echo(printable(data.summary.describe_state()))
     typer.echo(str(write_report(data)))

@@ -17,6 +17,7 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from boxplus.errors import printable
 from boxplus.recordings.info import RecordingInfo
 from boxplus.runs.extrinsic import Extrinsic
 from boxplus.runs.odometry_run import Progress
@@ -42,9 +43,8 @@ class RunTerminal:
 
     def print_evidence(self, info: RecordingInfo, extrinsic: Extrinsic) -> None:
         """How the recording is read, and why."""
-        self._console.print(
-            f"[bold]{info.path.name}[/bold]: {info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
-        )
+        facts = f": {info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
+        self._console.print(Text.assemble((printable(info.path.name), "bold"), facts))
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in ("reading", "found", "", "evidence"):
             table.add_column(heading, overflow="fold")
@@ -89,7 +89,7 @@ class RunTerminal:
         """The facts of the run, its warnings and its files."""
         console, timing = self._console, summary.timing
         style = "green" if summary.state == "finished" and summary.contradiction is None else "yellow"
-        console.print(Text(summary.describe_state(), style))
+        console.print(Text(printable(summary.describe_state()), style))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")
         table.add_column()
@@ -107,7 +107,7 @@ class RunTerminal:
         console.print(table)
         for warning in summary.warnings[:_SHOWN_WARNINGS]:
             times = f" ({warning.count} times)" if warning.count > 1 else ""
-            console.print(Text.assemble(("warning: ", "yellow"), warning.text + times))
+            console.print(Text.assemble(("warning: ", "yellow"), printable(warning.text) + times))
         if len(summary.warnings) > _SHOWN_WARNINGS:
             console.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
         for name in ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 from pathlib import Path
 from typing import Literal
 
@@ -11,11 +10,13 @@ from boxplus.formats.bal import BalProblem, read_bal, write_bal
 from boxplus.formats.colmap import read_colmap, write_colmap
 from boxplus.formats.colmap_model import ColmapModel
 from boxplus.formats.gbp import GbpProblem, read_gbp, write_gbp
+from boxplus.formats.numbers.lines import first_text
 
 Reconstruction = BalProblem | GbpProblem | ColmapModel
 ReconstructionFormat = Literal["auto", "bal", "gbp", "colmap"]
 
 _COLMAP_NAMES = ("cameras", "images", "points3D")
+_LOOKED_AT = 1 << 16  # bytes, for the second line of numbers
 
 
 def read_reconstruction(path: str | Path, format: ReconstructionFormat = "auto") -> Reconstruction:
@@ -45,15 +46,11 @@ def read_reconstruction(path: str | Path, format: ReconstructionFormat = "auto")
 def _has_intrinsics(source: Path) -> bool:
     """Whether the second line of numbers is `fx fy cx cy`, and not an observation."""
     seen = 0
-    try:
-        with bz2.open(source, "rt", errors="replace") if source.suffix == ".bz2" else source.open(errors="replace") as file:
-            for line in file:
-                words = line.split("#")[0].split()
-                seen += bool(words)
-                if seen == 2:
-                    return len(words) == 4 and not all(word.lstrip("+-").isdigit() for word in words[:2])
-    except OSError as error:
-        raise InputError("a readable file", f"{source}: {error}", "check the path and its permissions") from error
+    for line in first_text(source, _LOOKED_AT).splitlines():
+        words = line.split("#")[0].split()
+        seen += bool(words)
+        if seen == 2:
+            return len(words) == 4 and not all(word.lstrip("+-").isdigit() for word in words[:2])
     return False
 
 

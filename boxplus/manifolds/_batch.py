@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 
 
@@ -16,7 +17,7 @@ def as_batch(name: str, values: ArrayLike, tail: tuple[int, ...]) -> tuple[NDArr
     Raises:
         InputError: the trailing axes are not `tail`.
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = as_floats(values, name)
     if array.shape[array.ndim - len(tail) :] != tail or array.ndim < len(tail):
         shape = ", ".join(["...", *map(str, tail)])
         raise InputError(f"{name} of shape ({shape})", f"shape {array.shape}", f"put the {'×'.join(map(str, tail))} values last")

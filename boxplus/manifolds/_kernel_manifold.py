@@ -7,6 +7,7 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds._batch import pair_rows
 from boxplus.manifolds.manifold import Manifold
@@ -72,12 +73,7 @@ def checked_rows(name: str, x: ArrayLike, size: int, manifold: str) -> NDArray[n
     Raises:
         InputError: another shape, not numbers, NaN or infinity.
     """
-    try:
-        array = np.array(x, dtype=np.float64, ndmin=2, order="C")
-    except (TypeError, ValueError):
-        raise InputError(
-            f"{name} as numbers (n, {size}) on {manifold}", f"{type(x).__name__}", "give an array of floats"
-        ) from None
+    array = np.array(as_floats(x, f"{name} (n, {size}) on {manifold}"), ndmin=2, order="C")
     if array.ndim != 2 or array.shape[1] != size:
         raise InputError(f"{name} of shape (n, {size}) on {manifold}", f"shape {np.shape(x)}", "give one row for each variable")
     finite = np.isfinite(array).all(axis=1)

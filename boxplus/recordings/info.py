@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import printable
 from boxplus.recordings.options import AccelUnit, GyroUnit, TimeReference, TimeUnit
 
 Verdict = Literal["ok", "warning", "error"]
@@ -23,12 +24,18 @@ class Evidence:
         value: the result, short (`ns`).
         verdict: `ok`, `warning` (works, look at it) or `error` (the result cannot be trusted).
         text: one sentence with the numbers, and what to do if it is not fine.
+
+    Value and text may quote a file; what would steer a terminal is written out in them (`boxplus.errors.printable`).
     """
 
     key: str
     value: str
     verdict: Verdict
     text: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", printable(self.value))
+        object.__setattr__(self, "text", printable(self.text))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from boxplus.recordings.container import READ_ERRORS, Channel, foreign_errors
 
@@ -21,6 +21,7 @@ ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format"
 _LARGEST_RECORD = 1 << 31
+_LARGEST_CHUNK = 1 << 28
 
 
 class DamagedRecordError(ValueError):
@@ -245,25 +246,37 @@ def _skipping_damage(records: Iterator[_Record]) -> Iterator[_Record | None]:
 
 
 def _decompress(compression: str, data: bytes) -> bytes:
+    """The content of a chunk; no writer makes chunks anywhere near the limit, which a few kilobytes could otherwise exceed."""
     if compression in ("none", ""):
         return data
     if compression == "bz2":
-        return bz2.decompress(data)
-    if compression == "lz4":
+        inflated = _inflated(bz2.BZ2Decompressor(), data)
+    elif compression == "lz4":
         import lz4.frame
 
-        return bytes(lz4.frame.decompress(data))
-    if compression == "zstd":
-        return _decompress_zstd(data)
-    raise DamagedRecordError(f"unknown compression {compression!r}")
+        inflated = _inflated(lz4.frame.LZ4FrameDecompressor(), data)
+    elif compression == "zstd":
+        inflated = _inflated_zstd(data)
+    else:
+        raise DamagedRecordError(f"unknown compression {compression!r}")
+    if len(inflated) > _LARGEST_CHUNK:
+        raise DamagedRecordError(f"a chunk of {len(data)} bytes inflates to more than {_LARGEST_CHUNK} bytes")
+    return inflated
 
 
-def _decompress_zstd(data: bytes) -> bytes:
+def _inflated(decompressor: Any, data: bytes) -> bytes:
+    inflated = bytes(decompressor.decompress(data, max_length=_LARGEST_CHUNK + 1))
+    if not decompressor.eof and len(inflated) <= _LARGEST_CHUNK:
+        raise DamagedRecordError("the file is cut off in the middle of a chunk")
+    return inflated
+
+
+def _inflated_zstd(data: bytes) -> bytes:
     # rosbags brings one of these, depending on its version and on Python's.
     try:
         from backports import zstd
     except ImportError:
         import zstandard
 
-        return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(data))
-    return bytes(zstd.decompress(data))
+        return bytes(zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_CHUNK + 1))
+    return _inflated(zstd.ZstdDecompressor(), data)

@@ -172,7 +172,7 @@ def _facts(data: RunData) -> str:
         for e in recording.evidence
     )
     head = "<tr><th>reading</th><th>found</th><th></th><th>evidence</th></tr>"
-    settings = escape(data.folder.config.read_text(encoding="utf-8")) if data.folder.config.is_file() else ""
+    settings = escape(data.folder.config.read_text(encoding="utf-8", errors="replace")) if data.folder.config.is_file() else ""
     return (
         f"<section><h2>Run</h2>{html_table(rows)}</section>"
         f"<section><h2>How the recording was read</h2><table>{head}{evidence}</table>"

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se2 import SE2
@@ -44,7 +45,7 @@ def chordal_weights(information: ArrayLike) -> tuple[NDArray[np.float64], NDArra
     Raises:
         InputError: another shape, or a block that is singular.
     """
-    Omega = np.asarray(information, dtype=np.float64)
+    Omega = as_floats(information, "information")
     if Omega.ndim != 3 or Omega.shape[1:] not in ((6, 6), (3, 3)):
         raise InputError("information of shape (N, 6, 6) or (N, 3, 3)", f"{Omega.shape}", "give one matrix for each pose")
     spatial = Omega.shape[1] == 6
@@ -150,7 +151,7 @@ class _Chordal(Residual):
         count, d = len(self.measured), 3 if self.measured.shape[1] == 7 else 2
         sigma = np.ones((count, d * d + d))
         for name, weight, columns in (("kappa", kappa, slice(0, d * d)), ("tau", tau, slice(d * d, None))):
-            array = np.asarray(weight, dtype=np.float64)
+            array = as_floats(weight, "weight")
             if array.shape not in ((), (count,)) or not (np.isfinite(array) & (array > 0.0)).all():
                 raise InputError(
                     f"{name} as positive finite numbers, one for all or ({count},)",

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.residuals.point_to_plane import checked_normals
@@ -79,7 +80,7 @@ def plane_covariances(normals: ArrayLike, *, along: float = 1.0, across: float =
 
 
 def _checked_covariances(name: str, covariances: ArrayLike, count: int) -> NDArray[np.float64]:
-    array = np.array(covariances, dtype=np.float64)
+    array = np.array(as_floats(covariances, name))
     if array.shape != (count, 3, 3) or not np.isfinite(array).all():
         raise InputError(f"{name} finite, of shape ({count}, 3, 3)", f"shape {array.shape}", "give one for each correspondence")
     return array

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.product import Product
@@ -197,7 +198,7 @@ class ImuPreintegration(Residual):
         if rotation not in ("log", "vector"):
             raise InputError('rotation "log" or "vector"', repr(rotation), 'leave it out for "log"')
         self.rotation = rotation
-        self.gravity = np.array(gravity, dtype=np.float64)
+        self.gravity = np.array(as_floats(gravity, "gravity"))
         if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
             raise InputError("gravity as three finite numbers", repr(gravity), "give (0, 0, -9.81) in a world with z up")
         super().__init__(

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats, as_numbers
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.imu_midpoint import integrate_batch
@@ -230,7 +231,7 @@ class Preintegration:
         state = rows_of("velocity_bias_i", velocity_bias_i, len(self), 9)
         alpha, gamma, beta = self.corrected(state[:, 3:6], state[:, 6:])
         R = quaternion.to_matrix(pose[:, :4])
-        T, g = self.duration_s[:, None], np.asarray(gravity, dtype=np.float64)
+        T, g = self.duration_s[:, None], as_floats(gravity, "gravity")
         p = pose[:, 4:] + state[:, :3] * T + 0.5 * g * T**2 + (R @ alpha[:, :, None])[:, :, 0]
         v = state[:, :3] + g * T + (R @ beta[:, :, None])[:, :, 0]
         return np.hstack([quaternion.multiply(pose[:, :4], gamma), p]), np.hstack([v, state[:, 3:]])
@@ -250,7 +251,7 @@ def rows_of(name: str, values: ArrayLike, count: int, size: int) -> NDArray[np.f
     Raises:
         InputError: another shape.
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = as_floats(values, name)
     if array.shape not in ((size,), (count, size)):
         raise InputError(
             f"{name} of shape ({size},) or ({count}, {size})", f"shape {array.shape}", "give one row for each interval"
@@ -261,7 +262,7 @@ def rows_of(name: str, values: ArrayLike, count: int, size: int) -> NDArray[np.f
 def _checked_samples(
     time_ns: ArrayLike, gyro: ArrayLike, accel: ArrayLike
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    time = np.asarray(time_ns)
+    time = as_numbers(time_ns, "time_ns (S,)")
     if time.ndim != 1 or time.dtype.kind not in "iu":
         raise InputError(
             "time_ns as integer nanoseconds of shape (S,)",
@@ -279,7 +280,7 @@ def _checked_samples(
         )
     vectors = []
     for name, values in (("gyro", gyro), ("accel", accel)):
-        array = np.ascontiguousarray(values, dtype=np.float64)
+        array = np.ascontiguousarray(as_floats(values, f"{name} (S, 3)"))
         if array.shape != (time.size, 3):
             raise InputError(f"{name} of shape ({time.size}, 3)", f"shape {array.shape}", "give one row for every time stamp")
         if not np.isfinite(array).all():
@@ -289,8 +290,8 @@ def _checked_samples(
     return time, vectors[0], vectors[1]
 
 
-def _checked_intervals(intervals_ns: object, time: NDArray[np.int64]) -> NDArray[np.int64]:
-    intervals = np.atleast_2d(np.asarray(intervals_ns))
+def _checked_intervals(intervals_ns: ArrayLike, time: NDArray[np.int64]) -> NDArray[np.int64]:
+    intervals = np.atleast_2d(as_numbers(intervals_ns, "intervals_ns"))
     if intervals.ndim != 2 or intervals.shape[1] != 2 or intervals.dtype.kind not in "iu":
         raise InputError(
             "intervals_ns as integer nanoseconds of shape (N, 2)",
@@ -314,7 +315,7 @@ def _checked_intervals(intervals_ns: object, time: NDArray[np.int64]) -> NDArray
 
 
 def _checked_bias(name: str, bias: ArrayLike, count: int) -> NDArray[np.float64]:
-    array = np.asarray(bias, dtype=np.float64)
+    array = as_floats(bias, name)
     if array.shape not in ((3,), (count, 3)) or not np.isfinite(array).all():
         raise InputError(
             f"{name} finite, of shape (3,) or ({count}, 3)",

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_floats
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.lines import Line3D
@@ -211,7 +212,7 @@ def _line_matrices(camera: Pinhole | ArrayLike, count: int) -> NDArray[np.float6
                 "a lens bends straight lines: undistort the end points with `camera.undistort` and drop the distortion",
             )
         return camera.K_line[None]
-    K = np.asarray(camera, dtype=np.float64)
+    K = as_floats(camera, "camera")
     if K.shape not in ((3, 3), (count, 3, 3)):
         raise InputError(
             f"a Pinhole, or K of shape (3, 3) or ({count}, 3, 3)", f"shape {K.shape}", "one K for all segments, or one for each"

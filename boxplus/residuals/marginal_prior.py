@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
@@ -44,7 +45,7 @@ class MarginalPrior(Residual):
         roles: Sequence[str] | None = None,
         fixes_gauge: bool = False,
     ) -> None:
-        self.J, self.r0 = np.array(J, dtype=np.float64), np.array(r0, dtype=np.float64)
+        self.J, self.r0 = np.array(as_floats(J, "J")), np.array(as_floats(r0, "r0"))
         dof = sum(manifold.dof for manifold in manifolds)
         if len(manifolds) != len(x0) or not manifolds:
             raise InputError(

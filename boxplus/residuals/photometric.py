@@ -22,6 +22,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
@@ -144,7 +145,7 @@ class Photometric(Residual):
 
 def _checked_patches(pixels_1: ArrayLike, pattern: ArrayLike) -> NDArray[np.float64]:
     """Pixels (N, K, 2) of N patches."""
-    pixels, offsets = np.asarray(pixels_1, dtype=np.float64), np.asarray(pattern, dtype=np.float64)
+    pixels, offsets = as_floats(pixels_1, "pixels_1"), as_floats(pattern, "pattern")
     for name, array in (("pixels_1", pixels), ("pattern", offsets)):
         if array.ndim != 2 or array.shape[1] != 2 or not np.isfinite(array).all():
             raise InputError(f"{name} finite, of shape (N, 2)", f"shape {array.shape}", "give one row (u, v) for each pixel")
@@ -154,7 +155,7 @@ def _checked_patches(pixels_1: ArrayLike, pattern: ArrayLike) -> NDArray[np.floa
 def _checked_depth(depth_1: ArrayLike | None, count: int) -> NDArray[np.float64]:
     if depth_1 is None:
         raise InputError("depth_1", "none", "give the depth of every pixel, or make the inverse depth a variable")
-    depth = np.asarray(depth_1, dtype=np.float64)
+    depth = as_floats(depth_1, "depth_1")
     if depth.shape != (count,):
         raise InputError(f"depth_1 of shape ({count},)", f"shape {depth.shape}", "give one depth for each pixel")
     good = np.isfinite(depth) & (depth > 0.0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_numbers
 from boxplus.errors import InputError
 from boxplus.manifolds._batch import as_batch
 
@@ -69,7 +70,7 @@ def checked_image(name: str, image: ArrayLike) -> NDArray[np.float32]:
     Raises:
         InputError: not two axes, fewer than 2×2 pixels, or not finite.
     """
-    array = np.ascontiguousarray(image, dtype=np.float32)
+    array = np.ascontiguousarray(as_numbers(image, "image"), dtype=np.float32)
     if array.ndim != 2 or min(array.shape) < 2:
         raise InputError(
             f"{name} of shape (height, width), at least 2×2", f"shape {array.shape}", "convert colours to one grey value first"

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3
@@ -100,7 +101,7 @@ def checked_points(name: str, points: ArrayLike, count: int | None = None) -> ND
     Raises:
         InputError: another shape, another number than `count`, or not finite.
     """
-    array = np.array(points, dtype=np.float64, order="C")
+    array = np.array(as_floats(points, name), order="C")
     rows = "N" if count is None else str(count)
     if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
         raise InputError(f"{name} of shape ({rows}, 3)", f"shape {array.shape}", "give one row for each correspondence")

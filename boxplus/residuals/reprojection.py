@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_floats
 from boxplus.cameras.pinhole import Pinhole, project_point
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
@@ -111,7 +112,7 @@ def check_pixels(name: str, pixels: ArrayLike, columns: int = 2) -> NDArray[np.f
     Raises:
         InputError: another shape, or not finite; the message names the first row concerned.
     """
-    array = np.array(pixels, dtype=np.float64, order="C")
+    array = np.array(as_floats(pixels, "pixels"), order="C")
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{name} of shape (N, {columns}) [px]", f"shape {array.shape}", "give one row for each observation")
     finite = np.isfinite(array).all(axis=1)

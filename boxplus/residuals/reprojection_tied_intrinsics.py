@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
@@ -50,8 +51,8 @@ class ReprojectionTiedIntrinsics(Residual):
         information: ArrayLike | None = None,
     ) -> None:
         self._full = ReprojectionIntrinsics(camera, pixels, sigma=sigma, covariance=covariance, information=information)
-        self.offset = np.asarray(offset, dtype=np.float64)
-        self.basis = np.asarray(basis, dtype=np.float64)
+        self.offset = as_floats(offset, "offset")
+        self.basis = as_floats(basis, "basis")
         count = len(camera.parameters)
         if self.offset.shape != (count,) or self.basis.ndim != 2 or len(self.basis) != count:
             raise InputError(
@@ -84,7 +85,7 @@ class ReprojectionTiedIntrinsics(Residual):
 
     def intrinsics(self, q: ArrayLike) -> NDArray[np.float64]:
         """c = c₀ + B q (..., n) of (..., m)."""
-        return np.ascontiguousarray(self.offset + np.asarray(q, dtype=np.float64) @ self.basis.T)
+        return np.ascontiguousarray(self.offset + as_floats(q, "q") @ self.basis.T)
 
     def _expanded(self, x: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
         return x[0], x[1], self.intrinsics(x[2])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.whitening import Whitening
@@ -109,7 +110,7 @@ class Residual(ABC):
             )
         values, index = [], []
         for role, manifold, given in zip(self.roles, self.manifolds, x, strict=True):
-            array = np.ascontiguousarray(np.atleast_2d(np.asarray(given, dtype=np.float64)))
+            array = np.ascontiguousarray(np.atleast_2d(as_floats(given, role)))
             if array.ndim != 2 or array.shape[1] != manifold.size or len(array) not in (1, self.count):
                 raise InputError(
                     f"{role} of shape ({self.count}, {manifold.size}) or ({manifold.size},) on {manifold.name}",

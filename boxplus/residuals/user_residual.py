@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_array, as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangent_step import tangent_steps
@@ -238,7 +239,7 @@ class UserResidual(Residual):
 
 
 def _data(number: int, array: ArrayLike) -> NDArray[Any]:
-    values = np.asarray(array)
+    values = as_array(array, f"data[{number}]")
     if values.dtype.kind not in "fiub" or values.ndim == 0:
         raise InputError(
             f"data[{number}] as numbers (N, …)",
@@ -266,7 +267,7 @@ def _difference_steps(step: float | Sequence[ArrayLike], manifolds: tuple[Manifo
         raise InputError(f"one step, or {len(manifolds)}", f"{len(given)}", "give one for each connected variable")
     tables = []
     for manifold, one in zip(manifolds, given, strict=True):
-        h = np.asarray(one, dtype=np.float64)
+        h = as_floats(one, "step")
         if h.shape not in ((), (manifold.dof,)) or not (np.isfinite(h) & (h > 0.0) & (h < math.pi)).all():
             raise InputError(
                 f"a positive step, or ({manifold.dof},) for {manifold.name}",

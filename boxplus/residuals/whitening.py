@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 
 _SYMMETRY = 1e-6  # largest asymmetry, of the largest entry, that counts as rounding
@@ -66,7 +67,7 @@ class Whitening:
 
     @classmethod
     def _from_sigma(cls, sigma: ArrayLike, dim: int, count: int) -> Whitening:
-        array = np.asarray(sigma, dtype=np.float64)
+        array = as_floats(sigma, "sigma")
         if array.shape not in ((), (dim,), (count, 1), (count, dim)):
             raise InputError(
                 f"sigma as a number, ({dim},), ({count}, 1) or ({count}, {dim})",
@@ -96,7 +97,7 @@ class Whitening:
 
 def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse: bool) -> NDArray[np.float64]:
     """W (1 or N, d, d) of an information matrix, or of a covariance when `inverse`."""
-    array = np.asarray(matrix, dtype=np.float64)
+    array = as_floats(matrix, name)
     if array.shape not in ((dim, dim), (count, dim, dim)):
         raise InputError(
             f"{name} of shape ({dim}, {dim}) or ({count}, {dim}, {dim})",

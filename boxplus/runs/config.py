@@ -129,6 +129,9 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
             raise InputError(f"{sections} in {path}", f"{section!r}", advice)
         if values is not None and not isinstance(values, dict):
             raise InputError(f"keys and values below '{section}:' in {path}", repr(values), "write one 'key: value' a line")
+        for key in values or {}:
+            if not isinstance(key, str):
+                raise InputError(f"names of settings below '{section}:' in {path}", repr(key), "write e.g. 'scan_voxel: 0.5'")
     return {section: values or {} for section, values in content.items()}
 
 

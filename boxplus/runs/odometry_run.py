@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -17,7 +17,7 @@ from typing import Protocol
 
 import boxplus
 from boxplus._jit import on_compilation
-from boxplus.errors import BoxplusError, InputError, OutputError
+from boxplus.errors import BoxplusError, InputError, OutputError, printable
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.store import merge
@@ -25,7 +25,7 @@ from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.recording import Recording
 from boxplus.runs.config import RunConfig, dump_run_config
 from boxplus.runs.extrinsic import Extrinsic, choose_extrinsic
-from boxplus.runs.run_folder import RunFolder, prepare_run_folder
+from boxplus.runs.run_folder import RunFolder, claim_run_folder
 from boxplus.runs.run_summary import (
     ExtrinsicFacts,
     MapFacts,
@@ -74,7 +74,7 @@ class View(Protocol):
 
 def run_odometry(
     recording: Recording,
-    folder: str | Path,
+    folder: str | Path | RunFolder,
     config: RunConfig | None = None,
     *,
     extrinsic: Extrinsic | None = None,
@@ -90,7 +90,8 @@ def run_odometry(
 
     Args:
         recording: opened.
-        folder: created; see docs/output_folder.md for what it holds.
+        folder: created; see docs/output_folder.md for what it holds. Or what `claim_run_folder` yields, where the caller has to
+            do more in it before other runs may.
         config: settings; each has a default.
         extrinsic: from `choose_extrinsic`; None chooses.
         overwrite: replace the results of an earlier run in the folder.
@@ -102,16 +103,17 @@ def run_odometry(
         The facts of the run, as in `run.json`.
 
     Raises:
-        InputError: the folder holds something else.
+        InputError: the folder holds something else, or another process is writing there.
         OutputError: the folder cannot be written or the disk is full; what was written before is intact.
         RecordingError: nothing could be read.
     """
     config = config or RunConfig()
-    run_folder = prepare_run_folder(folder, overwrite=overwrite)
-    extrinsic = extrinsic or choose_extrinsic(recording, config.odometry)
-    config = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
-    run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view)
-    return run.execute(should_stop or (lambda: False))
+    claimed = nullcontext(folder) if isinstance(folder, RunFolder) else claim_run_folder(folder, overwrite=overwrite)
+    with claimed as run_folder:
+        extrinsic = extrinsic or choose_extrinsic(recording, config.odometry)
+        config = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
+        run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view)
+        return run.execute(should_stop or (lambda: False))
 
 
 class _Run:
@@ -264,10 +266,10 @@ class _Run:
             started=self._started,
             updated=datetime.now(UTC),
             recording=RecordingFacts(
-                path=str(info.path.resolve()),
+                path=printable(str(info.path.resolve())),
                 format=info.format,
-                lidar_topic=info.lidar_topic,
-                imu_topic=info.imu_topic,
+                lidar_topic=printable(info.lidar_topic),
+                imu_topic=printable(info.imu_topic),
                 duration_s=info.duration_s,
                 messages=info.message_count,
                 progress=self._recording.progress,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.formats.output import TEMPORARY_SUFFIX
-from boxplus.runs.output_folder import SUMMARY, prepare_output_folder
+from boxplus.runs.output_folder import SUMMARY, output_folder
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -81,17 +82,34 @@ class RunFolder:
             if path.is_file() and _MAP_FILE.fullmatch(inside):
                 yield path
 
+    def own_folders(self) -> Iterator[Path]:
+        """The folders in it that a run creates, inner ones first."""
+        yield from self.tiles.glob("tiles/*")
+        yield from (self.tiles / "tiles", self.tiles, self.plots)
 
-def prepare_run_folder(folder: str | Path, *, overwrite: bool = False) -> RunFolder:
-    """A folder to write a run into: new, empty, or (with `overwrite`) cleared of an earlier run's own files.
+    def holds_estimates(self) -> bool:
+        """Whether the trajectory has a single row; a killed run may have written rows that its `run.json` does not count."""
+        try:
+            with self.trajectory.open("rb") as file:
+                return sum(1 for _ in zip(file, range(2), strict=False)) > 1
+        except OSError:
+            return False
 
-    Nothing that a run did not write is ever removed.
+
+@contextmanager
+def claim_run_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[RunFolder]:
+    """A folder to write a run into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
+
+    An earlier run without a single estimate is replaced, any other one with `overwrite`. What a run did not write is never
+    removed.
 
     Raises:
-        InputError: the folder holds something else, or an earlier run and `overwrite` is not set.
+        InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is
+            not set.
         OutputError: it cannot be created or cleared.
     """
     run = RunFolder(Path(folder))
-    inner = (*run.tiles.glob("tiles/*"), run.tiles / "tiles", run.tiles, run.plots)
-    prepare_output_folder(run.path, "boxplus lio", run.own_files(), inner, overwrite=overwrite)
-    return run
+    with output_folder(
+        run.path, "boxplus lio", run.own_files, run.own_folders, overwrite=overwrite, holds_results=run.holds_estimates
+    ):
+        yield run

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from boxplus.errors import InputError, OutputError
 from boxplus.filtering.nav_state import T_BA, T_BW, T_P_L, T_THETA_L, T_V
 from boxplus.formats.output import output_error
 from boxplus.manifolds import quaternion
-from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status
 
 _SHARES = tuple(f"share_{axis}" for axis in ("rx", "ry", "rz", "px", "py", "pz"))
 
@@ -178,6 +179,11 @@ def read_scan_log(path: str | Path) -> ScanLog:
         time_ns = np.array([int(row[0]) for row in body], dtype=np.int64)
     except ValueError as error:
         raise InputError("numbers in scans.csv", f"{error} ({path})", "run 'boxplus lio' again") from error
+    unknown = {row[1] for row in body} - set(get_args(Status))
+    if unknown:
+        raise InputError(
+            f"a status of {', '.join(get_args(Status))} in scans.csv", f"{min(unknown)!r} ({path})", "run 'boxplus lio' again"
+        )
     for offset, name in enumerate(_TEXTS):
         texts[name] = [row[first + offset] for row in body]
     return ScanLog(time_ns, np.array([row[1] for row in body], dtype=np.str_), numbers, texts)

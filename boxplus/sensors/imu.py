@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_array
 from boxplus.errors import InputError
 
 
@@ -36,7 +37,7 @@ class ImuSamples:
         Raises:
             InputError: wrong shape, values that are not numbers, or times that are not integers.
         """
-        time = np.atleast_1d(np.asarray(time_ns))
+        time = np.atleast_1d(as_array(time_ns, "time_ns"))
         if time.ndim != 1 or time.dtype.kind not in "iu":
             raise InputError(
                 "time_ns as integer nanoseconds of shape (N,)",
@@ -45,7 +46,7 @@ class ImuSamples:
             )
         vectors = []
         for name, values in (("gyro", gyro), ("accel", accel)):
-            array = np.atleast_2d(np.asarray(values))
+            array = np.atleast_2d(as_array(values, name))
             if array.shape != (time.size, 3) or array.dtype.kind not in "fiu":
                 raise InputError(
                     f"{name} as numbers of shape ({time.size}, 3), one row per time stamp",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_array
 from boxplus.errors import InputError
 
 
@@ -52,12 +53,12 @@ class Scan:
         Raises:
             InputError: wrong shape, counts that do not match, or times that are not integers.
         """
-        points = np.asarray(p_lidar)
+        points = as_array(p_lidar, "p_lidar")
         if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
             raise InputError(
                 "p_lidar as numbers of shape (N, 3)", f"{points.dtype} of shape {points.shape}", "give one row x, y, z per point"
             )
-        time = np.asarray(time_ns)
+        time = as_array(time_ns, "time_ns")
         if time.dtype.kind not in "iu" or time.shape != (len(points),):
             raise InputError(
                 f"time_ns as integer nanoseconds of shape ({len(points)},), one per point",
@@ -67,7 +68,7 @@ class Scan:
         time = time.astype(np.int64, copy=False)
         strength = None
         if intensity is not None:
-            given = np.asarray(intensity)
+            given = as_array(intensity, "intensity")
             if given.shape != (len(points),) or given.dtype.kind not in "fiu":
                 raise InputError(
                     f"intensity as numbers of shape ({len(points)},), one per point",

@@ -142,6 +142,30 @@ def test_ctrl_c_finishes_the_files_with_exit_code_130(tmp_path: Path) -> None:
     assert '<span class="state interrupted">' in (out / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="SIGTERM ends a process at once on Windows")
+def test_a_signal_before_the_first_scan_leaves_a_word(bag: Path, tmp_path: Path) -> None:
+    """It comes while the extrinsic is looked for, which takes seconds; the process used to end without a trace."""
+    code = """
+import os, signal, boxplus.runs.extrinsic as module
+choose = module.choose_extrinsic
+def interrupted(*arguments):
+    os.kill(os.getpid(), signal.SIGTERM)
+    return choose(*arguments)
+module.choose_extrinsic = interrupted
+from boxplus.cli import main
+main()
+"""
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "lio", str(bag), "-o", str(out)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 130, done.stderr
+    summary = read_summary(out / "run.json")
+    assert (summary.state, summary.scans) == ("interrupted", 0)
+    code, _, err = call("lio", bag, "-o", out, "--no-report")
+    assert code == 0, err
+
+
 def test_report_of_another_folder(tmp_path: Path) -> None:
     code, _, err = call("report", tmp_path)
     assert code == 2

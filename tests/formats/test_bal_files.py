@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bz2
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from boxplus.errors import InputError
 from boxplus.formats.bal import BalProblem, read_bal, write_bal
 from boxplus.formats.gbp import read_gbp
 from boxplus.formats.numbers import lines as number_lines
+from boxplus.formats.reconstruction import read_reconstruction
 
 NAMES = ("cameras", "points", "camera_of", "point_of", "pixels")
 
@@ -144,3 +147,35 @@ def test_gbp_needs_its_intrinsics(tmp_path: Path) -> None:
     path.write_text("# a comment\n1 1 1\n500 500 320\n")
     with pytest.raises(InputError, match=r"the intrinsics fx fy cx cy – got '500 500 320' \(.*line 3\)"):
         read_gbp(path)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.99])
+def test_a_cut_bzip2_file_is_explained(tmp_path: Path, share: float) -> None:
+    """Also where the format is to be found from the content; a command said 'Aborted!'."""
+    whole = tmp_path / "whole.txt.bz2"
+    write_bal(whole, random_problem(1, cameras=30, points=500, observations=3000))
+    cut = tmp_path / "cut.txt.bz2"
+    cut.write_bytes(whole.read_bytes()[: max(int(share * whole.stat().st_size), 10)])
+    for read in (read_bal, read_reconstruction):
+        with pytest.raises(InputError, match=r"expected a whole bzip2 file – got the end inside of the data .*cut.txt.bz2"):
+            read(cut)
+
+
+@pytest.mark.parametrize("line", [b"0 " * 500_000, b"0 0 1.0 2.0\n" * 100_000])
+def test_a_bzip2_file_that_would_fill_the_memory_is_refused(tmp_path: Path, line: bytes) -> None:
+    """200 MB from some kilobytes: as one line, and as lines that are all in order."""
+    bomb = tmp_path / "bomb.txt.bz2"
+    compressor = bz2.BZ2Compressor()
+    with bomb.open("wb") as file:
+        file.write(compressor.compress(b"1 1 20000000\n"))
+        for _ in range(200_000_000 // len(line)):
+            file.write(compressor.compress(line))
+        file.write(compressor.flush())
+    assert bomb.stat().st_size < 40_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"at most \d+ MB of text in a bzip2 file of [\d.]+ kB|a line of more than"):
+            read_reconstruction(bomb)
+        assert tracemalloc.get_traced_memory()[1] < 1e9
+    finally:
+        tracemalloc.stop()

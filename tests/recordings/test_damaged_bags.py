@@ -1,5 +1,8 @@
 """Damaged recordings: what is readable is delivered, the rest is reported, nothing else happens."""
 
+import bz2
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +10,12 @@ import pytest
 from bags import CONTAINERS, Content, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.errors import RecordingError
-from boxplus.recordings import Recording, open_recording
+from boxplus.recordings import Recording, open_recording, sequential
+from boxplus.recordings.doctor import diagnose
 from boxplus.sensors.scan import Scan
 
 CONTENT = Content(scans=12, points=60, imu_rate=50)
@@ -108,3 +114,48 @@ def test_a_bag_with_nothing_readable_is_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"")
         with pytest.raises(RecordingError, match=r"a readable ROS bag or MCAP file – got " + name.replace(".", r"\.")):
             open_recording(tmp_path / name)
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
+def test_a_chunk_that_would_fill_the_memory_is_damage(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequential, "_LARGEST_CHUNK", 1 << 16)
+    for size, fits in ((1 << 16, True), ((1 << 16) + 1, False)):
+        chunk = compressed(compression, bytes(size))
+        if fits:
+            assert sequential._decompress(compression, chunk) == bytes(size)
+            with pytest.raises((ValueError, EOFError, RuntimeError)):
+                sequential._decompress(compression, chunk[:-9])
+        else:
+            with pytest.raises(sequential.DamagedRecordError, match="inflates to more than 65536 bytes"):
+                sequential._decompress(compression, chunk)
+
+
+def compressed(compression: str, data: bytes) -> bytes:
+    if compression == "bz2":
+        return bz2.compress(data)
+    if compression == "lz4":
+        return bytes(pytest.importorskip("lz4.frame").compress(data))
+    try:
+        from backports import zstd
+    except ImportError:
+        return bytes(pytest.importorskip("zstandard").ZstdCompressor().compress(data))
+    return bytes(zstd.compress(data))
+
+
+@pytest.mark.parametrize("definition", ["= = =", "int32[", "a/b/c/d e", "string<=3 x = 'a", "\x00", "float64 x 1\nMSG: y"])
+def test_damaged_message_definitions_stop_nothing(tmp_path: Path, definition: str) -> None:
+    """They are not needed: the messages that are read are known."""
+    path = write_bag(tmp_path, "sqlite3", CONTENT)
+    with closing(sqlite3.connect(next(path.rglob("*.db3")))) as database:
+        database.execute("UPDATE message_definitions SET encoded_message_definition = ?", (definition,))
+        database.commit()
+    result = read_all(path)
+    assert result is not None and len(result[0]) == CONTENT.scans
+
+
+def test_escape_sequences_in_a_topic_do_not_reach_a_terminal(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1", CONTENT)
+    path.write_bytes(path.read_bytes().replace(b"/points", b"/p\x1b[2K\x07"))
+    found = diagnose(path)
+    assert any("\\x1b[2K" in finding.value + finding.text for finding in found.evidence)
+    assert "\x1b" not in CliRunner().invoke(app, ["inspect", str(path)]).output

@@ -179,3 +179,19 @@ def test_folder_of_something_else(tmp_path: Path) -> None:
         InputError, match=r"expected run.json as this version of boxplus writes it – got versions: Field required"
     ):
         write_report(tmp_path)
+
+
+def test_a_config_in_another_encoding_is_shown_all_the_same(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "out"
+    shutil.copytree(folder, copy)
+    (copy / "config.yaml").write_bytes("# aus Zürich\n".encode("latin-1"))
+    assert "# aus Z\ufffdrich" in write_report(copy).read_text(encoding="utf-8")
+
+
+def test_an_unknown_status_is_refused(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "out"
+    shutil.copytree(folder, copy)
+    text = (copy / "scans.csv").read_text(encoding="utf-8")
+    (copy / "scans.csv").write_text(text.replace(",ok,", ",fine,", 1), encoding="utf-8")
+    with pytest.raises(InputError, match=r"expected a status of ok, weak, lost in scans.csv – got 'fine' \(.*scans.csv\)"):
+        load_run(copy)

@@ -137,3 +137,10 @@ def test_wrong_keys_in_a_file(tmp_path: Path) -> None:
         InputError, match="expected the key T_imu_lidar, or R_imu_lidar and p_imu_lidar – got the keys T_lidar_imu"
     ):
         parse_transform(str(file))
+
+
+@pytest.mark.parametrize("text", ["odometry: {1: 2}", "map:\n  null: 3", "recording: {2.5: a}"])
+def test_a_setting_without_a_name_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"expected names of settings below '\w+:' in .*config.yaml – got (1|None|2.5) – "):
+        load_run_config(tmp_path / "config.yaml")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import bz2
+import io
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NoReturn, cast
+from typing import NoReturn, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,11 @@ from boxplus.formats.numbers.parser import INTEGER, LINE, OTHER, REAL, powers_of
 CHUNK = 1 << 20
 """Bytes read at a time; everything made from a chunk stays in the processor's cache."""
 
-LONGEST_LINE = 1 << 28
+LONGEST_LINE = 1 << 24
 """A longer line [bytes] is taken as a sign that the file is no text."""
+
+INFLATED, INFLATED_RATIO = 1 << 26, 100
+"""A compressed file may hold as many bytes, and for each of its own as many more: text of numbers has about 3."""
 
 _SHOWN = 80  # characters of a line in an error message
 
@@ -112,9 +117,25 @@ def read_number_lines(path: str | Path, tags: Sequence[str] = ()) -> Iterator[Nu
         InputError: the file cannot be read, is binary, or is cut in the middle of its compressed data.
     """
     source = Path(path)
+    with _explaining(source), _open(source) as file:
+        yield from _chunks(file, source, tags)
+
+
+def first_text(path: str | Path, size: int) -> str:
+    """At most `size` bytes from the beginning of a text file, plain or bzip2.
+
+    Raises:
+        InputError: as `read_number_lines`.
+    """
+    source = Path(path)
+    with _explaining(source), _open(source) as file:
+        return bytes(file.read(size)).decode("utf-8", "replace")
+
+
+@contextmanager
+def _explaining(source: Path) -> Iterator[None]:
     try:
-        with _open(source) as file:
-            yield from _chunks(file, source, tags)
+        yield
     except EOFError:
         raise InputError("a whole bzip2 file", f"the end inside of the data ({source})", "copy the file again") from None
     except OSError as error:
@@ -122,13 +143,40 @@ def read_number_lines(path: str | Path, tags: Sequence[str] = ()) -> Iterator[Nu
         raise InputError("a readable text file", f"{source}: {reason}", "check the path and that the file is whole") from error
 
 
-def _open(source: Path) -> BinaryIO:
+def _open(source: Path) -> io.RawIOBase:
     with source.open("rb") as file:
         magic = file.read(3)
-    return cast(BinaryIO, bz2.open(source, "rb") if magic == b"BZh" else source.open("rb", buffering=0))
+    return _Inflated(source) if magic == b"BZh" else source.open("rb", buffering=0)
 
 
-def _chunks(file: BinaryIO, source: Path, tags: Sequence[str]) -> Iterator[NumberLines]:
+class _Inflated(io.RawIOBase):
+    """What a bzip2 file holds, up to a limit: a few kilobytes may otherwise fill the memory."""
+
+    def __init__(self, source: Path) -> None:
+        self._file = bz2.BZ2File(source)
+        self._source = source
+        self._limit = self._left = INFLATED + INFLATED_RATIO * source.stat().st_size
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        received = self._file.readinto(buffer)
+        self._left -= received
+        if self._left < 0:
+            raise InputError(
+                f"at most {self._limit / 1e6:.0f} MB of text in a bzip2 file of {self._source.stat().st_size / 1e3:.1f} kB",
+                f"more ({self._source})",
+                "check where the file comes from; if it is right, decompress it (bunzip2) and give the text file",
+            )
+        return received
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _chunks(file: io.RawIOBase, source: Path, tags: Sequence[str]) -> Iterator[NumberLines]:
     encoded = [tag.encode() for tag in tags]
     words = np.frombuffer(b"".join(encoded), np.uint8)
     word_ends = np.cumsum([len(word) for word in encoded], dtype=np.uint32)
@@ -139,7 +187,7 @@ def _chunks(file: BinaryIO, source: Path, tags: Sequence[str]) -> Iterator[Numbe
             if held > LONGEST_LINE:
                 raise InputError("a text file", f"a line of more than {held} bytes ({source})", "check what the file is")
             workspace = _Workspace(2 * len(workspace.buffer), bytes(workspace.buffer[:held]))
-        received = file.readinto(memoryview(workspace.buffer)[held:-1])  # type: ignore[attr-defined]
+        received = file.readinto(memoryview(workspace.buffer)[held:-1]) or 0
         if not checked:
             checked = True
             if b"\0" in workspace.buffer[: min(received, 4096)]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_array, as_floats
 from boxplus.errors import InputError
 
 
@@ -14,7 +15,7 @@ def as_points(points: ArrayLike, name: str) -> NDArray[np.float64]:
     Raises:
         InputError: wrong shape or not numbers.
     """
-    array = np.asarray(points)
+    array = as_array(points, name)
     if array.size == 0 and array.ndim <= 2 and array.shape[-1:] in ((0,), (3,)):
         return np.empty((0, 3))
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
@@ -30,7 +31,7 @@ def as_corner(corner: ArrayLike, name: str) -> NDArray[np.float64]:
     Raises:
         InputError: wrong shape or NaN.
     """
-    array = np.asarray(corner, dtype=np.float64)
+    array = as_floats(corner, name)
     if array.shape != (3,) or np.isnan(array).any():
         raise InputError(f"{name} as three numbers x, y, z", f"{array.tolist()}", "give coordinates in metres")
     return array

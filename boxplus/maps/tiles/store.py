@@ -18,6 +18,7 @@ from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
 from boxplus.formats.point_cloud import as_records
 from boxplus.maps.tiles.journal import read_journal
 from boxplus.maps.tiles.layout import (
+    MANIFEST,
     Manifest,
     TileIndex,
     list_journals,
@@ -94,6 +95,9 @@ class TileStore:
         unsorted: dict[TileIndex, list[NDArray[np.float32]]] = {}
         for generation, path in list_journals(base).items():
             records, cut = read_journal(path)
+            if len(records) and manifest.intensity is not None and manifest.intensity != (records.shape[1] == 4):
+                report.append(f"{path.name} has points {'without' if manifest.intensity else 'with'} intensities and is left out")
+                continue
             taken = 0
             for index, rows in split_by_tile(records, manifest.tile_size_m):
                 if (index, generation) not in written:
@@ -123,12 +127,22 @@ class TileStore:
         """
         edge = self.manifest.voxel_m if voxel is None else voxel
         for index in self.counts:
-            parts = [as_records(cloud.points, cloud.intensity) for cloud in map(read_ply, self._segments.get(index, []))]
+            parts = [self._read_segment(path) for path in self._segments.get(index, [])]
             records = np.concatenate(parts + self._unsorted.get(index, []))
             if edge is not None:
                 records = records[first_per_voxel(records, edge)]
             intensity = np.ascontiguousarray(records[:, 3]) if records.shape[1] == 4 else None
             yield Tile(index, np.ascontiguousarray(records[:, :3]), intensity)
+
+    def _read_segment(self, path: Path) -> NDArray[np.float32]:
+        cloud = read_ply(path)
+        if self.manifest.intensity is not None and self.manifest.intensity != (cloud.intensity is not None):
+            raise InputError(
+                f"points {'with' if self.manifest.intensity else 'without'} intensities, as {MANIFEST} says",
+                f"the opposite in {path}",
+                "the file is not of this map: remove it",
+            )
+        return as_records(cloud.points, cloud.intensity)
 
 
 def merge(

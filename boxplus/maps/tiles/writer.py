@@ -225,8 +225,11 @@ class TileWriter:
         if voxel is not None:
             records = records[first_per_voxel(records, voxel)]
             superseded = self._due_for_compaction(index, len(records))
+            older = [as_records(cloud.points, cloud.intensity) for cloud in map(read_ply, superseded)]
+            if any(rows.shape[1] != records.shape[1] for rows in older):
+                _log.warning("%s holds points with and without intensities; it is left as it is", tile_folder(self.folder, index))
+                superseded = []
             if superseded:
-                older = [as_records(cloud.points, cloud.intensity) for cloud in map(read_ply, superseded)]
                 records = np.concatenate([*older, records])
                 records = records[first_per_voxel(records, voxel)]
         with PlyWriter(segment_path(self.folder, index, generation)) as writer:

@@ -42,6 +42,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import (
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
+_NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
@@ -83,11 +84,17 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     accelerometer.
 
     Raises:
-        InputError: the accelerometer reports in g.
+        InputError: the accelerometer reports in g, or no gravity.
     """
     imu = joined_imu(frames)
     duration = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
     norm = float(np.linalg.norm(imu.accel.mean(axis=0)))
+    if norm < _NO_GRAVITY:
+        raise InputError(
+            "accelerations with gravity, about 9.8 m/s² on average at the start",
+            f"{norm:.2f} m/s²",
+            "the accelerometer delivers nothing, or its driver takes gravity out: give what it measures",
+        )
     if _IN_G[0] < norm < _IN_G[1]:
         raise InputError(
             "accelerations in m/s², about 9.8 on average at the start",

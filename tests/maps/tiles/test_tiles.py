@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.pcd import read_pcd
-from boxplus.formats.ply import read_ply
+from boxplus.formats.ply import PlyWriter, read_ply
 from boxplus.maps.tiles.journal import read_journal
 from boxplus.maps.tiles.layout import list_journals
 from boxplus.maps.tiles.store import TileStore, merge
@@ -329,3 +329,32 @@ def test_manifest_says_open_while_running(tmp_path: Path) -> None:
     writer.close()
     writer.close()
     assert json.loads((tmp_path / "map" / "manifest.json").read_text())["closed"] is True
+
+
+@pytest.mark.parametrize("with_intensity", [False, True])
+def test_a_tile_of_another_map_is_named(tmp_path: Path, with_intensity: bool) -> None:
+    """Points with and without intensities do not fit into one array; reading stopped with NumPy's error."""
+    points = cloud(50, scale=5.0)
+    intensity = np.ones(50, np.float32) if with_intensity else None
+    with TileWriter(tmp_path / "map") as writer:
+        writer.append(points, intensity)
+    (segment, *_) = sorted((tmp_path / "map").rglob("*.ply"))
+    with PlyWriter(segment) as other:
+        other.append(points, None if with_intensity else np.ones(50, np.float32))
+    with pytest.raises(
+        InputError, match=rf"expected points with(out)? intensities, as manifest.json says – got .* in .*{segment.name}"
+    ):
+        list(TileStore.open(tmp_path / "map").iter_tiles())
+
+
+def test_a_foreign_tile_does_not_stop_a_run(tmp_path: Path) -> None:
+    """Where segments are due to be joined; every point of the run stays."""
+    points = cloud(50, scale=5.0)
+    for generation in range(7):
+        with TileWriter(tmp_path / "map", voxel=0.01) as writer:
+            writer.append(points + generation)
+        if generation == 1:
+            segment = max((tmp_path / "map").rglob("*.ply"))
+            with PlyWriter(segment) as other:
+                other.append(points, np.ones(50, np.float32))
+    assert segment.exists()

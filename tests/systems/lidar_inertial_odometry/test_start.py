@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from small_drives import LIDAR, config, frames, room_walk
 
+from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import simulate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
 
 
@@ -92,3 +94,16 @@ def test_a_shaken_platform_is_at_rest_when_the_lidar_rests() -> None:
     assert isinstance(still, Start)
     # The mean of shaken samples is less well known, and the state says so.
     assert found.covariance[15, 15] > 1.5 * still.covariance[15, 15]
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.02])
+def test_an_accelerometer_without_gravity_is_refused(scale: float) -> None:
+    """All zero, or with gravity taken out by a driver: nothing says where up is."""
+    simulation = simulate("walk", duration_s=1.6, lidar=LIDAR)
+    odometry = LidarInertialOdometry(config(simulation))
+    with pytest.raises(InputError, match=r"expected accelerations with gravity, about 9.8 m/s² .* – got 0\.\d+ m/s² – "):
+        for event in simulation.events():
+            if isinstance(event, Scan):
+                odometry.push_scan(event)
+            else:
+                odometry.push_imu(ImuSamples.from_arrays(event.time_ns, event.gyro, scale * event.accel))

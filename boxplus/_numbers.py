@@ -1,0 +1,55 @@
+"""Arrays as they are given by a user: real numbers in a rectangle, or an error that says what came instead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+
+_KINDS = {
+    "c": "complex numbers",
+    "O": "Python objects",
+    "U": "text",
+    "S": "bytes",
+    "M": "dates",
+    "m": "durations",
+    "V": "records",
+}
+
+
+def as_numbers(values: ArrayLike, what: str) -> NDArray[Any]:
+    """`values` as an array of integers, floats or booleans, of whatever shape.
+
+    Raises:
+        InputError: rows of different lengths, complex numbers, text, dates, objects.
+    """
+    array = as_array(values, what)
+    if array.dtype.kind not in "fiub":
+        got = _KINDS.get(array.dtype.kind, "something else")
+        raise InputError(f"{what} as real numbers", f"{got} ({array.dtype})", "convert them to floats first")
+    return array
+
+
+def as_floats(values: ArrayLike, what: str) -> NDArray[np.float64]:
+    """`values` in float64, of whatever shape; Python objects where each of them is a number.
+
+    Raises:
+        InputError: as `as_numbers`.
+    """
+    array = as_array(values, what)
+    if array.dtype.kind == "O":
+        try:
+            return array.astype(np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{what} as real numbers", f"Python objects: {error}", "convert them to floats first") from None
+    return as_numbers(array, what).astype(np.float64, copy=False)
+
+
+def as_array(values: ArrayLike, what: str) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError) as error:  # NumPy says where the shape breaks
+        raise InputError(f"{what} as an array of numbers", f"something else: {error}", "give rows of equal length") from None
