@@ -200,6 +200,7 @@ class OptimizationTerminal:
             "linear solver": summary.linear_solver,
             "summed": summary.convention,
         }
+        rows |= {name: text for name, text in (("loop closures", summary.loops), ("optimality", summary.certificate)) if text}
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold", no_wrap=True)
         table.add_column(overflow="fold")

@@ -46,6 +46,13 @@ class ObjectiveChoice(StrEnum):
     chordal = "chordal"
 
 
+class RobustChoice(StrEnum):
+    """How false loop closures are dealt with."""
+
+    none = "none"
+    gnc = "gnc"
+
+
 class RotationErrorChoice(StrEnum):
     """What the rotation part of a 3D information matrix refers to."""
 
@@ -74,6 +81,13 @@ def pgo(
         ObjectiveChoice,
         typer.Option("--objective", help="logarithm: the error Log(Z⁻¹ Ti⁻¹ Tj) with its information; chordal: that of SE-Sync."),
     ] = ObjectiveChoice.logarithm,
+    robust_choice: Annotated[
+        RobustChoice,
+        typer.Option("--robust", help="gnc: tell false loop closures from true ones (graduated non-convexity), and refuse them."),
+    ] = RobustChoice.none,
+    certify: Annotated[
+        bool, typer.Option("--certify", help="Whether the minimum is the global one; with --objective chordal, which it is of.")
+    ] = False,
     rotation_error: Annotated[
         RotationErrorChoice,
         typer.Option(
@@ -98,8 +112,8 @@ def pgo(
     """Find the poses that agree best with the relative poses measured between them.
 
     The result is written in the format of the input, and as graph.ply (poses and edges). Exit codes: 0 done, 1 the problem does
-    not determine its variables or the results could not be written, 2 bad input, 130 interrupted (results up to there are
-    complete).
+    not determine its variables or the results could not be written, 2 bad input, 3 done but not to be trusted (not the global
+    minimum, or odometry and the loop closures kept contradict each other), 130 interrupted (results up to there are complete).
     """
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
@@ -114,6 +128,8 @@ def pgo(
         update={
             "start": start.value,
             "objective": objective.value,
+            "robust": robust_choice.value,
+            "certify": certify,
             "solver": solver_options(config.solver, method, linear_solver, max_iterations, time_limit, threads),
         }
     )
@@ -143,17 +159,21 @@ def pgo(
 
         with terminal.console.status("drawing the report"):
             write_graph_report(folder, summary, graph, result)
+    if result.loops is not None or robust is not None:
+        _write_edges(folder / "edges.csv", graph, result)
     summary.write(folder / "run.json")
-    terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "run.json"])
+    terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "edges.csv", "run.json"])
     if summary.state == "interrupted":
         raise typer.Exit(130)
+    if summary.doubt is not None:
+        raise typer.Exit(3)
 
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
     from boxplus.runs.optimization_summary import PLOTS
 
-    files = [folder / name for name in ("report.html", "optimized.g2o", "optimized.graph", "graph.ply", "run.json")]
+    files = [folder / name for name in ("report.html", "optimized.g2o", "optimized.graph", "graph.ply", "edges.csv", "run.json")]
     return files + [folder / "plots" / name for name in PLOTS], [folder / "plots"]
 
 
@@ -209,10 +229,26 @@ def _summary(
         errors_initial=ErrorFacts.of(result.errors_start),
         errors=ErrorFacts.of(result.errors),
         invalid=solution.invalid,
+        loops=None if result.loops is None else result.loops.report.sentence("loop closures"),
+        certificate=None if result.certificate is None else result.certificate.sentence,
+        doubt=result.doubt,
         notes=[*graph.warnings, *result.notes],
         timing_s={"start": result.timing_s["start"], **solution.timing_s},
         history=iteration_facts(solution),
     )
+
+
+def _write_edges(path: Path, graph: PoseGraph, result: PoseGraphResult) -> None:
+    """Weight and error of every edge, in the order of the file."""
+    from boxplus.formats.output import atomic_file
+    from boxplus.systems.pose_graph.problem import consecutive_edges
+
+    kinds = ("loop", "odometry")
+    rows = zip(graph.ids[graph.edges], consecutive_edges(graph), result.weights, result.errors, strict=True)
+    with atomic_file(path) as file:
+        file.write(b"from,to,kind,weight,error_sigma\n")
+        for (i, j), is_odometry, weight, error in rows:
+            file.write(f"{i},{j},{kinds[int(is_odometry)]},{weight:.6g},{error:.6g}\n".encode())
 
 
 def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
@@ -220,7 +256,7 @@ def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
     import numpy as np
 
     from boxplus.formats.scene_ply import write_scene_ply
-    from boxplus.systems.pose_graph.pose_graph import positions
+    from boxplus.systems.pose_graph.problem import positions
     from boxplus.systems.pose_graph.start import held_poses
 
     if graph.poses is None:

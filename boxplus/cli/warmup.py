@@ -53,7 +53,8 @@ def _optimize_pose_graphs() -> None:
     from boxplus.manifolds.se2 import SE2
     from boxplus.manifolds.se3 import SE3
     from boxplus.optimization.losses import Huber
-    from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph, pose_graph_problem
+    from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
+    from boxplus.systems.pose_graph.problem import pose_graph_problem
 
     count = 60  # more than the dense solver takes
     i = np.arange(count)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.information_matrix import ASYMMETRIC, INDEFINITE, NOT_FINITE, ZERO, examine, smallest_eigenvalue
+from boxplus.formats.information_matrix import ASYMMETRIC, INDEFINITE, NOT_FINITE, examine, smallest_eigenvalue
 
 QUATERNION_TOLERANCE = 1e-2
 """Largest |‖q‖ − 1| that is taken for rounding and normalised away."""
@@ -22,7 +22,6 @@ _FAULTS = {
         "one with NaN or infinity",
         "a standard deviation of zero has infinite information: give the measurement its real noise",
     ),
-    ZERO: ("a nonzero", "zero", "remove the edge: it says nothing"),
     ASYMMETRIC: ("a symmetric", "one that is not", "check the order of its entries"),
     INDEFINITE: ("a positive semi-definite", "one with the eigenvalue", "check the order of its entries"),
 }
@@ -43,14 +42,14 @@ class PoseGraph:
             edges. Quaternions are normalised.
         edges: (m, 2) int64, indices i and j into `ids`, i ≠ j.
         measurements: (m, 7) or (m, 3) float64, laid out as the poses.
-        information: (m, 6, 6) or (m, 3, 3) float64, symmetric and positive semi-definite.
+        information: (m, 6, 6) or (m, 3, 3) float64, symmetric and positive semi-definite; an edge may have none.
         fixed: (k,) int64, indices of the poses that the file holds fixed.
         source: where the graph comes from; error messages begin with it.
         warnings: what the reader had to leave out or to read otherwise, one sentence each.
 
     Raises:
         InputError: on construction, where shapes do not match, a value is not finite, a quaternion is not of unit length,
-            an index dangles, a name repeats, or an information matrix is not symmetric and semi-definite, or zero. The
+            an index dangles, a name repeats, or an information matrix is not symmetric and semi-definite. The
             message names the source and the line or index.
     """
 
@@ -160,7 +159,7 @@ def _checked_poses(values: NDArray[np.float64], name: str, where: Callable[[int]
 
 
 def _check_information(information: NDArray[np.float64], where: Callable[[int], str]) -> None:
-    """Refuse information matrices that are not finite, symmetric, semi-definite and different from zero."""
+    """Refuse information matrices that are not finite, symmetric and semi-definite."""
     verdicts = examine(information)
     for fault, (expected, got, advice) in _FAULTS.items():
         bad = np.flatnonzero(verdicts == fault)

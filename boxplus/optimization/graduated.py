@@ -36,7 +36,7 @@ _PROBABILITY = 0.99  # of an inlier to lie within the threshold, where none is g
 _STEPS = 10  # tried at each width but the last; the minimum of a width only gives the next weights
 _TOLERANCE = 1e-3  # relative decrease of the cost at which the next width begins
 _WIDTHS = 200  # at most; with a narrowing of 1.4, for residuals of 1e14 thresholds
-_DECIDED = 1e-3  # weights this near 0 or 1 are decided
+_WHOLE = 1.0 - 1e-3  # weights from here on count as one
 _LOWER = 1.0 - 1e-3  # of the cost reached: below it the last minimum is taken up again
 
 
@@ -102,8 +102,9 @@ def graduate(
         loss: what the weights come from; `truncated` takes a residual whole or not at all in the end.
         inlier_threshold: largest length of an inlier's whitened residual, in standard deviations; by default such that 99 % of
             inliers lie within, √(χ²(dim) at 0.99), which trusts the sigmas that were given.
-        weights: for groups by name, (N,) from 0 to 1, of the first minimum; ones where left out. What is known to be hopeless at
-            the start may begin with zero; it is taken up again if it turns out to fit.
+        weights: for groups by name, (N,) from 0 to 1, of the first minimum; ones where left out. Zeros let the other groups,
+            which hold no outliers, speak first: the safer way where these determine the variables, as odometry does. What begins
+            with zero is taken up as soon as it fits.
         narrowing: factor between one width and the next, above 1; 1.4 in the paper. Nearer to 1 is slower and safer.
         options, settings, start: as for `Problem.solve`; the options hold for the last width, those before end early.
         callback: called with every `Iteration` of every width; returns True to stop.
@@ -176,8 +177,9 @@ class _Widths:
         truncated = loss == "truncated"
         for group in self._groups:
             group.set_loss(Squared())
+        before = self._ratios(self._start)
         ratios, cost = self._solve(first)
-        worst = float(ratios[np.isfinite(ratios)].max(initial=0.0))
+        worst = max(float(r[np.isfinite(r)].max(initial=0.0)) for r in (before, ratios))
         if truncated and worst <= 1.0:
             return []  # no outlier to look for
         mu = 1.0 / (2.0 * worst - 1.0) if truncated else max(2.0 * worst, 1.0)
@@ -189,7 +191,8 @@ class _Widths:
             else:
                 weights = (mu / (mu + ratios)) ** 2
             ratios, cost = self._solve(weights)
-            undecided = int(np.count_nonzero((weights > _DECIDED) & (weights < 1.0 - _DECIDED)))
+            # At the widest, all weights are small, but those of far residuals alone are zero.
+            undecided = int(np.count_nonzero((weights > 0.0) & (weights < _WHOLE)))
             levels.append(Level(mu, cost, int(np.count_nonzero(ratios <= 1.0)), undecided))
             if undecided == 0 if truncated else mu == 1.0:
                 break
@@ -205,7 +208,11 @@ class _Widths:
             again = self._problem.solve(self._early, start=self.solution, callback=self._watch)
             found = again if again.cost < found.cost else found
         self.solution = found
-        return np.concatenate([g.squares(found.values) / self.thresholds[g.name] ** 2 for g in self._groups]), found.cost
+        return self._ratios(found.values), found.cost
+
+    def _ratios(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """‖W r‖²/c² (N,) of all residuals at a point."""
+        return np.concatenate([g.squares(values) / self.thresholds[g.name] ** 2 for g in self._groups])
 
     def _watch(self, iteration: Iteration) -> bool:
         self.is_stopped = self.is_stopped or (self._callback is not None and bool(self._callback(iteration)))

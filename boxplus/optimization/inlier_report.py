@@ -39,11 +39,13 @@ class InlierReport:
         )
 
 
-def inlier_report(squares: NDArray[np.float64], dim: int, threshold: float) -> InlierReport:
-    """Of ‖W r‖² (N,) of residuals with `dim` rows, kept up to `threshold` standard deviations."""
+def inlier_report(
+    squares: NDArray[np.float64], dim: int, threshold: float, kept_ones: NDArray[np.bool_] | None = None
+) -> InlierReport:
+    """Of ‖W r‖² (N,) of residuals with `dim` rows, kept up to `threshold` standard deviations or as `kept_ones` (N,) says."""
     from scipy.stats import chi2
 
-    within = squares <= threshold**2
+    within = squares <= threshold**2 if kept_ones is None else kept_ones
     kept = int(np.count_nonzero(within))
     tail = float(chi2.ppf(_TAIL, dim))
     inside = float(chi2.cdf(threshold**2, dim))

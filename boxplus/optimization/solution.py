@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.observability.null_space import find_null_space
+from boxplus.optimization.observability.singularity import describe_null_space
 from boxplus.optimization.variables import VariableRows, Variables
 
 
@@ -127,6 +129,14 @@ class Solution:
         """
         diagonal = np.einsum("kii->ki", self.covariance(selected))
         return np.asarray(np.sqrt(diagonal))
+
+    def undetermined(self) -> list[str]:
+        """A sentence for every way in which the residuals let variables move freely at the solution.
+
+        Costs about a factorisation where all are determined, and a few more where not.
+        """
+        self._problem.start(self.values)
+        return describe_null_space(self._problem, find_null_space(self._problem))
 
     def summary(self) -> str:
         """A few lines for a terminal or a log."""

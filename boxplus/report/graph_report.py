@@ -18,7 +18,8 @@ from boxplus.report.optimization_plots import plain, write_optimization_plots
 from boxplus.report.palette import FAINT, GRID, SERIES
 from boxplus.report.skeleton import figure_section, html_table
 from boxplus.runs.optimization_summary import OptimizationSummary
-from boxplus.systems.pose_graph.pose_graph import PoseGraphResult, positions
+from boxplus.systems.pose_graph.pose_graph import PoseGraphResult
+from boxplus.systems.pose_graph.problem import positions
 
 _WORST = 15
 _WORST_SHARE = 0.01

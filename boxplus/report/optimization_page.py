@@ -116,6 +116,7 @@ def _facts(summary: OptimizationSummary) -> str:
     ]
     if summary.chi2 is not None and summary.chi2_initial is not None:
         rows.append(("χ²", f"{summary.chi2_initial:.6f} at the start, {summary.chi2:.6f} at the end, without robust loss"))
+    rows += [(name, text) for name, text in (("loop closures", summary.loops), ("optimality", summary.certificate)) if text]
     rows += [
         ("not evaluated", ", ".join(f"{count} of {group}" for group, count in summary.invalid.items()) + " at the end"),
         ("time", stages),

@@ -83,6 +83,8 @@ class OptimizationSummary(_Part):
     errors_initial: ErrorFacts
     errors: ErrorFacts
     invalid: dict[str, int] = Field(description="residuals that could not be evaluated at the end, by group")
+    loops: str | None = Field(None, description="of a pose graph with --robust gnc: loop closures kept, and how clearly")
+    certificate: str | None = Field(None, description="of a pose graph with --certify: whether the minimum is the global one")
     notes: list[str]
     doubt: str | None = Field(None, description="why the result is not to be trusted; the exit code is then 3")
     timing_s: dict[str, float]

@@ -17,6 +17,7 @@ from boxplus.formats.g2o import read_g2o, write_g2o
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.formats.toro import read_toro, write_toro
 from boxplus.manifolds.se3 import SE3
+from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph import pose_graph
 from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
 
@@ -70,7 +71,7 @@ def test_the_page_shows_file_start_and_result(tmp_path: Path, dimension: int, wi
     assert result.exit_code == 0, result.output
     body = (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
     assert ('"text":"in the file"' in body) == with_poses
-    for told in ("start: chordal", "Edges with the largest errors", "ρ Cauchy(2.385)", "dense Cholesky"):
+    for told in ("start: graduated", "Edges with the largest errors", "ρ Cauchy(2.385)", "dense Cholesky"):
         assert told in body
     for name in ("before_after.png", "errors.png", "cost.png"):
         assert (tmp_path / "out" / "plots" / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -159,3 +160,43 @@ def test_the_report_command_sends_back_to_the_page_that_is_there(tmp_path: Path)
     result = CliRunner().invoke(app, ["report", str(tmp_path / "out")])
     assert result.exit_code == 2
     assert "one of 'boxplus pgo'" in words(result) and "open its report.html" in words(result)
+
+
+def test_false_loop_closures_are_refused_and_listed(tmp_path: Path) -> None:
+    simulated = simulate_pose_graph(poses=120, loops=40, block=3, seed=1, false_share=0.3)
+    write_g2o(tmp_path / "false.g2o", simulated.graph)
+    result = call(tmp_path / "false.g2o", "-o", tmp_path / "out", "--robust", "gnc")
+    assert result.exit_code == 0, result.output
+    assert "of 40 loop closures kept" in words(result)
+    rows = [line.split(",") for line in (tmp_path / "out" / "edges.csv").read_text().splitlines()]
+    assert rows[0] == ["from", "to", "kind", "weight", "error_sigma"] and len(rows) == 1 + len(simulated.graph.edges)
+    weights, errors = (np.array([float(row[column]) for row in rows[1:]]) for column in (3, 4))
+    assert (weights[simulated.is_false] == 0.0).all() and (weights[~simulated.is_loop] == 1.0).all()
+    assert errors[simulated.is_false].min() > errors[weights == 1.0].max()
+    assert "loop closures kept" in json.loads((tmp_path / "out" / "run.json").read_text())["loops"]
+    assert "loop closures kept" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_contradictions_and_local_minima_exit_with_3(tmp_path: Path) -> None:
+    simulated = simulate_pose_graph(poses=300, seed=1, false_share=0.3)
+    simulated.graph.information[~simulated.is_loop] *= 100.0
+    write_g2o(tmp_path / "proud.g2o", simulated.graph)
+    result = call(tmp_path / "proud.g2o", "-o", tmp_path / "out", "--robust", "gnc", "--no-report")
+    assert result.exit_code == 3 and "not to be trusted: odometry and the loop closures that were kept contradict" in words(
+        result
+    )
+    summary = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert summary["doubt"].startswith("odometry and the loop closures") and summary["state"] == "finished"
+    count, turn = 20, np.pi / 10
+    ring = np.stack([np.arange(count), np.roll(np.arange(count), -1)], 1)
+    theta = 2.0 * turn * np.arange(count)
+    steps = np.stack([np.cos(theta), np.sin(theta)], 1)
+    poses = np.column_stack([theta, np.cumsum(steps, axis=0) - steps])
+    measured = np.tile([turn, 1.0, 0.0], (count, 1))
+    wound = PoseGraph(2, np.arange(count), poses, ring, measured, np.tile(np.eye(3), (count, 1, 1)), np.array([0]))
+    write_g2o(tmp_path / "wound.g2o", wound)
+    asked = ("--objective", "chordal", "--certify", "--no-report")
+    local = call(tmp_path / "wound.g2o", "-o", tmp_path / "local", "--start", "file", *asked)
+    assert local.exit_code == 3 and "not certified" in words(local)
+    best = call(tmp_path / "wound.g2o", "-o", tmp_path / "best", *asked)
+    assert best.exit_code == 0 and "optimality certified: the global minimum of SE-Sync's objective" in words(best)

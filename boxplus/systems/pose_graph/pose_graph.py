@@ -16,25 +16,29 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
 from boxplus.formats.pose_graph import PoseGraph
-from boxplus.manifolds.se2 import SE2
-from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.convex_start import convex_cost
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback
-from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.optimization.variables import Variables
-from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_weights
-from boxplus.residuals.relative_pose import RelativePose
-from boxplus.residuals.relative_pose_2d import RelativePose2D
-from boxplus.residuals.residual import Residual
-from boxplus.systems.pose_graph.start import chordal_start, components, held_poses, spanning_tree_start
+from boxplus.systems.pose_graph.certificate import Certificate, certify
+from boxplus.systems.pose_graph.doubts import (
+    Fit,
+    misfit,
+    poor_fit_sentence,
+    silent_notes,
+    structure_notes,
+    undetermined_notes,
+    without_information,
+)
+from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
+from boxplus.systems.pose_graph.problem import Objective, pose_graph_problem, squared_errors, with_edges
+from boxplus.systems.pose_graph.start import held_poses
+from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
 
-Start = Literal["file", "spanning_tree", "chordal"]
-Objective = Literal["logarithm", "chordal"]
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
 _DAMPING = 1e-9
-_LISTED = 5  # poses named before the rest is left out
+_COUNTS = 0.5  # weight from which on an edge is expected to fit its information
 
 
 class PoseGraphConfig(BaseModel):
@@ -42,12 +46,18 @@ class PoseGraphConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    start: Literal["auto", "file", "spanning_tree", "chordal"] = Field(
-        "auto", description="where to start; auto: the cheapest of the file's poses and the chordal relaxation"
+    start: Wanted = Field(
+        "auto",
+        description="where to start; auto: the cheapest of the file's poses and the chordal relaxation, and further starts where "
+        "the residuals do not fit their information",
     )
     objective: Objective = Field(
         "logarithm", description="logarithm: Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j); chordal: the objective of SE-Sync"
     )
+    robust: Literal["none", "gnc"] = Field(
+        "none", description="gnc: false loop closures are told from true ones by graduated non-convexity and refused"
+    )
+    certify: bool = Field(False, description="whether the optimum is the global one, by SE-Sync's dual; chordal objective only")
     solver: SolverOptions = Field(
         SolverOptions(initial_damping=_DAMPING), description="see SolverOptions; Levenberg-Marquardt, hardly damped"
     )
@@ -61,11 +71,18 @@ class PoseGraphResult:
         graph: the input with the optimised poses.
         start: which start was taken, and `start_reason` why, in a sentence.
         poses_start: the poses there.
-        start_costs: the cost at every start that was compared, robust loss included.
+        start_costs: the cost at every start that was compared, with Huber in place of a loss that forgets.
         chi2_start, chi2: the objective over the edges without any robust loss, twice the cost of a problem without one.
         errors_start, errors: (m,) √ of what every edge adds to chi2: its error in standard deviations.
+        weights: (m,) weight of every edge at the end, 0 to 1: refused, or silenced by a robust loss.
+        fit: χ² of the edges that count against what their information promises.
+        minima: the objective at the end of every start that was followed; more than one where the residuals did not fit.
+        loops: the verdict on the loop closures, with `robust="gnc"`; None otherwise.
+        certificate: with `certify`; None otherwise.
         held: indices of the poses that were held: those the file fixes, and the first of every component without any.
-        notes: what a user should know of the structure, one sentence each.
+        notes: what a user should know of structure and result, one sentence each.
+        doubt: why the result is not to be trusted, where it is known not to be what it claims: not certified though that was
+            asked for, or odometry and the loops that were kept contradict each other; None otherwise.
         solution: with history, covariance, and why it stopped.
         timing_s: seconds of checking and building the problem, of the initialisation, and of the optimisation.
     """
@@ -79,8 +96,14 @@ class PoseGraphResult:
     chi2: float
     errors_start: NDArray[np.float64]
     errors: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    fit: Fit
+    minima: dict[Start, float]
+    loops: LoopVerdict | None
+    certificate: Certificate | None
     held: NDArray[np.int64]
     notes: tuple[str, ...]
+    doubt: str | None
     solution: Solution
     timing_s: dict[str, float]
 
@@ -90,133 +113,135 @@ def optimize_pose_graph(
 ) -> PoseGraphResult:
     """Minimise ½ Σ ρ(eᵀ Ω e) with e = Log(Z⁻¹ T_i⁻¹ T_j), or the chordal objective, over the poses.
 
+    Edges without information are left out and named. A loss that forgets (`Loss.is_redescending`) starts from the poses that
+    graduated non-convexity finds, as it settles on anything otherwise.
+
     Raises:
-        InputError: no edges; the start asked for is not in the file.
+        InputError: no edge with information; the start asked for is not in the file; a robust loss together with `robust`, the
+            chordal objective with `robust`, another one with `certify`.
         SingularProblemError: see `Problem.solve`.
     """
     config = config if config is not None else PoseGraphConfig()
-    if not len(graph.edges):
-        raise InputError(
-            "a graph with edges", f"{len(graph.ids)} poses and none ({graph.source})", "measure relative poses first"
-        )
+    _check(graph, config, loss)
     options = config.solver
     if "initial_damping" not in options.model_fields_set:
         options = options.model_copy(update={"initial_damping": _DAMPING})
     begin = time.perf_counter()
+    silent = without_information(graph)
+    whole, graph = graph, with_edges(graph, ~silent)
     held = held_poses(graph)
-    problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
+    problem, _ = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
+    starts = Starts(graph, config.start, options, callback)
     built = time.perf_counter()
-    candidates = _starts(graph, config.start)
-    costs = {name: problem.cost([start]) for name, start in candidates.items()}
-    chosen = min(candidates, key=lambda name: costs[name])
+    known = starts.candidates(loss, is_robust=config.robust == "gnc")
+    costs = {name: convex_cost(problem, [start]) for name, start in known.items()}
+    chosen = min(known, key=lambda name: costs[name])
     prepared = time.perf_counter()
-    solution = problem.solve(options, start=[candidates[chosen]], callback=callback)
-    solved = time.perf_counter()
     residual = problem.groups[0].residual
-    squared_start, squared = (_squared_errors(residual, graph, at) for at in (candidates[chosen], solution[poses]))
+    verdict = None
+    if config.robust == "gnc" and starts.is_loop.any():
+        verdict = judge_loops(graph, starts.is_loop, known[chosen], options, callback)
+        solution, minima = verdict.solution, {chosen: 2.0 * verdict.solution.cost}
+        weights = verdict.is_kept.astype(np.float64)
+        squared = squared_errors(residual, graph, solution.values[0])
+    else:
+        solution = problem.solve(options, start=[known[chosen]], callback=callback)
+        minima = {chosen: 2.0 * solution.cost}
+        squared = squared_errors(residual, graph, solution.values[0])
+        first = _fit(graph, squared, None, config)
+        if loss is None and config.start == "auto" and first.is_doubtful:
+            chosen, solution = starts.further(problem, chosen, solution, known, minima, first.enough)
+            squared = squared_errors(residual, graph, solution.values[0])
+        weights = problem.groups[0].loss_weights(solution.values)
+    solved = time.perf_counter()
+    poses_end = solution.values[0]
+    squared_start = squared_errors(residual, graph, known[chosen])
+    fit = _fit(graph, squared, weights, config)
+    certificate = certify(replace(graph, poses=poses_end)) if config.certify else None
+    notes = [*silent_notes(whole, silent), *structure_notes(graph, held), *solution.notes, *undetermined_notes(graph, solution)]
+    if fit.is_poor and verdict is None:
+        notes.append(poor_fit_sentence(fit, minima))
     return PoseGraphResult(
-        graph=replace(graph, poses=solution[poses]),
+        graph=replace(whole, poses=poses_end),
         start=chosen,
-        start_reason=_reason(config.start, chosen, costs),
-        poses_start=candidates[chosen],
+        start_reason=_reason(config.start, chosen, costs, minima),
+        poses_start=known[chosen],
         start_costs=costs,
         chi2_start=float(squared_start.sum()),
         chi2=float(squared.sum()),
-        errors_start=np.sqrt(squared_start),
-        errors=np.sqrt(squared),
+        errors_start=_spread(np.sqrt(squared_start), ~silent),
+        errors=_spread(np.sqrt(squared), ~silent),
+        weights=_spread(weights, ~silent),
+        fit=fit,
+        minima=minima,
+        loops=verdict,
+        certificate=certificate,
         held=held,
-        notes=_notes(graph, held, solution),
+        notes=tuple(notes),
+        doubt=_doubt(fit, verdict, certificate),
         solution=solution,
         timing_s={"set-up": built - begin, "start": prepared - built, "optimisation": solved - prepared},
     )
 
 
-def pose_graph_problem(
-    graph: PoseGraph,
-    *,
-    held: NDArray[np.int64] | None = None,
-    loss: Loss | None = None,
-    objective: Objective = "logarithm",
-) -> tuple[Problem, Variables]:
-    """The least-squares problem of a graph, with its poses as one block of variables.
-
-    Args:
-        held: poses that do not move; `held_poses(graph)` if left out.
-    """
-    problem = Problem()
-    values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
-    poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
-    i, j = graph.edges.T
-    problem.add_residuals(_residual(graph, objective), poses[i], poses[j], loss=loss, name="edges")
-    problem.fix(poses[held_poses(graph) if held is None else held])
-    return problem, poses
-
-
-def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "logarithm") -> float:
-    """The objective over the edges, for poses laid out as in the graph, without any robust loss and without ½."""
-    return float(_squared_errors(_residual(graph, objective), graph, poses).sum())
-
-
-def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) positions of poses laid out as in a graph [m]; z = 0 in the plane."""
-    return poses[:, 4:] if graph.dimension == 3 else np.column_stack([poses[:, 1:], np.zeros(len(poses))])
-
-
-def _squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m,) what every edge adds to chi2."""
-    i, j = graph.edges.T
-    whitened = np.einsum("nab,nb->na", residual.whitening.factors, residual.evaluate(poses[i], poses[j]))
-    return np.asarray((whitened * whitened).sum(axis=1))
-
-
-def _residual(graph: PoseGraph, objective: Objective) -> Residual:
-    if objective == "chordal":
-        kappa, tau = chordal_weights(graph.information)
-        return (ChordalPose if graph.dimension == 3 else ChordalPose2D)(graph.measurements, kappa=kappa, tau=tau)
-    kind = RelativePose if graph.dimension == 3 else RelativePose2D
-    return kind(graph.measurements, information=graph.information)
-
-
-def _starts(graph: PoseGraph, wanted: Literal["auto", "file", "spanning_tree", "chordal"]) -> dict[Start, NDArray[np.float64]]:
-    starts: dict[Start, NDArray[np.float64]] = {}
-    if wanted == "file" and graph.poses is None:
+def _check(graph: PoseGraph, config: PoseGraphConfig, loss: Loss | None) -> None:
+    if not graph.information.any():
         raise InputError(
-            "poses in the file to start from", f"only edges ({graph.source})", "start with `chordal` or `spanning_tree`"
+            "a graph with edges that carry information",
+            f"{len(graph.ids)} poses and none ({graph.source})",
+            "measure relative poses first",
         )
-    if wanted in ("auto", "file") and graph.poses is not None:
-        starts["file"] = graph.poses
-    if wanted in ("auto", "chordal"):
-        starts["chordal"] = chordal_start(graph)
-    if wanted == "spanning_tree":
-        starts["spanning_tree"] = spanning_tree_start(graph)
-    return starts
+    if config.robust == "gnc" and (loss is not None or config.objective != "logarithm"):
+        raise InputError(
+            "graduated non-convexity with the logarithmic error and no other robust loss",
+            f"loss {loss!r}, objective {config.objective}",
+            "leave the other out",
+        )
+    if config.certify and (loss is not None or config.objective != "chordal" or config.robust != "none"):
+        raise InputError(
+            "the chordal objective without a robust loss, of which alone optimality can be certified",
+            f"objective {config.objective}, loss {loss!r}, robust {config.robust}",
+            'set objective="chordal"',
+        )
 
 
-def _reason(wanted: str, chosen: Start, costs: dict[Start, float]) -> str:
+def _doubt(fit: Fit, verdict: LoopVerdict | None, certificate: Certificate | None) -> str | None:
+    if verdict is not None and fit.is_contradiction:
+        return (
+            f"odometry and the loop closures that were kept contradict each other: {misfit(fit)}; the odometry claims more than "
+            "it can, or false loop closures were kept"
+        )
+    return certificate.sentence if certificate is not None and not certificate.is_certified else None
+
+
+def _fit(graph: PoseGraph, squared: NDArray[np.float64], weights: NDArray[np.float64] | None, config: PoseGraphConfig) -> Fit:
+    """Of the edges that count; the chordal objective has no distribution to compare with."""
+    counted = np.ones(len(squared), dtype=np.bool_) if weights is None else weights > _COUNTS
+    return Fit.of(graph, squared, counted) if config.objective == "logarithm" else Fit(float(squared[counted].sum()), 0)
+
+
+def _spread(values: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Values of some edges among all; zero for the others."""
+    spread = np.zeros(len(rows))
+    spread[rows] = values
+    return spread
+
+
+def _reason(wanted: str, chosen: Start, costs: dict[Start, float], minima: dict[Start, float]) -> str:
     """Why a start was taken."""
     name = chosen.replace("_", " ")
+    if len(minima) > 1:
+        first = next(iter(minima))
+        ends = ", ".join(f"{value:.6g} ({other.replace('_', ' ')})" for other, value in minima.items())
+        why = _reason(wanted, first, costs, {first: minima[first]}) if chosen == first else f"{name}, which ends lowest"
+        return f"{why}; further starts were followed, as the residuals did not fit their information: χ² {ends}"
+    if chosen == "graduated":
+        return "graduated: the minimum over the loop closures that graduated non-convexity believes, as the loss forgets"
     if wanted != "auto":
         return f"{name}, as asked for; cost {costs[chosen]:.6g}"
+    if chosen == "spanning_tree":
+        return f"spanning tree, along the odometry, where no loop closure is believed yet; cost {costs[chosen]:.6g}"
     if len(costs) == 1:
         return f"{name}, as the graph has no poses of its own; cost {costs[chosen]:.6g}"
     others = ", ".join(f"{cost:.6g} ({other})" for other, cost in costs.items() if other != chosen)
     return f"{name}, with cost {costs[chosen]:.6g} cheaper than {others}"
-
-
-def _notes(graph: PoseGraph, held: NDArray[np.int64], solution: Solution) -> tuple[str, ...]:
-    """Sentences on pieces without edges between them, on poses without any edge, and the solver's own."""
-    label = components(graph)
-    sizes = np.bincount(label)
-    notes = []
-    if len(sizes) > 1:
-        free = np.setdiff1d(held, graph.fixed)
-        named = ", ".join(str(graph.ids[pose]) for pose in free[:_LISTED]) + (" …" if len(free) > _LISTED else "")
-        notes.append(
-            f"the graph falls into {len(sizes)} pieces without edges between them"
-            + (f"; poses {named}, the first of those that the file does not fix anywhere, are held" if len(free) else "")
-        )
-    alone = np.flatnonzero(sizes[label] == 1)
-    if len(alone):
-        named = ", ".join(str(graph.ids[pose]) for pose in alone[:_LISTED]) + (" …" if len(alone) > _LISTED else "")
-        notes.append(f"{len(alone)} poses have no edge and stay where they are: {named}")
-    return (*notes, *solution.notes)

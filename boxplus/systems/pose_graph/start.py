@@ -122,8 +122,8 @@ def _weights(graph: PoseGraph) -> tuple[NDArray[np.float64], NDArray[np.float64]
     split = 3 if graph.dimension == 3 else 1
     diagonal = np.einsum("nii->ni", graph.information)
     kappa, tau = diagonal[:, :split].mean(axis=1), diagonal[:, split:].mean(axis=1)
-    # An edge that says nothing of one of the two still must not leave the linear problem singular.
-    return np.maximum(kappa, 1e-9 * kappa.max()), np.maximum(tau, 1e-9 * tau.max())
+    # An edge that says nothing of one of the two still must not leave the linear problem singular; nor must all of them.
+    return np.maximum(kappa, 1e-9 * (kappa.max() or 1e9)), np.maximum(tau, 1e-9 * (tau.max() or 1e9))
 
 
 def _relaxed(

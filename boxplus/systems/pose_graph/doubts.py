@@ -1,0 +1,168 @@
+"""Whether to believe an optimised pose graph: do its residuals fit their information, and is everything determined?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.optimization.solution import Solution
+from boxplus.systems.pose_graph.start import components, held_poses
+from boxplus.systems.pose_graph.starts import Start
+
+_DOUBTFUL, _POOR, _CONTRADICTION = 2.6, 3.5, 6.0  # standard deviations of χ² above its mean
+_LEAST = 1.1  # times its mean: noise is never so well known that less contradicts it
+_SAME = 1e-3  # relative difference up to which two minima are one
+_WEAK = 1e-10  # pivot, scaled to a unit diagonal, below which an information matrix says nothing along some direction
+_LISTED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """χ² against what the information matrices promise.
+
+    Attributes:
+        chi2: of the counted edges.
+        dof: their rows less the degrees of freedom that the poses take up; the mean of χ² where the information is right.
+    """
+
+    chi2: float
+    dof: int
+
+    @property
+    def excess(self) -> float:
+        """By how many of its standard deviations χ² is above its mean."""
+        return (self.chi2 - self.dof) / math.sqrt(2.0 * self.dof) if self.dof > 0 else 0.0
+
+    @property
+    def enough(self) -> float:
+        """The largest χ² that is not doubtful."""
+        return self.dof + _DOUBTFUL * math.sqrt(2.0 * self.dof)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether noise alone would come by χ² once in 200 times: further starts are tried."""
+        return self.excess > _DOUBTFUL
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether noise alone does not explain χ², once in 5,000 times: a sentence is due."""
+        return self.excess > _POOR
+
+    @property
+    def is_contradiction(self) -> bool:
+        """Whether nothing explains χ² but that edges contradict each other: six standard deviations, and a tenth."""
+        return self.excess > _CONTRADICTION and self.chi2 > _LEAST * self.dof
+
+    @classmethod
+    def of(cls, graph: PoseGraph, squared: NDArray[np.float64], counted: NDArray[np.bool_]) -> Fit:
+        """Of the edges `counted` (m,), of which every one adds `squared` (m,) to χ²."""
+        d = graph.information.shape[1]
+        free = len(graph.ids) - len(held_poses(graph))
+        return cls(float(squared[counted].sum()), max(d * int(np.count_nonzero(counted)) - d * free, 0))
+
+
+def misfit(fit: Fit) -> str:
+    """`χ² is 3.3 times what the information matrices promise (…)`."""
+    promise = f"{fit.chi2:.6g} for {fit.dof:,} degrees of freedom"
+    return f"χ² is {fit.chi2 / fit.dof:.3g} times what the information matrices promise ({promise})"
+
+
+def poor_fit_sentence(fit: Fit, minima: Mapping[Start, float]) -> str:
+    """What a poor fit may mean, with the χ² that every start ended at."""
+    found = np.array(list(minima.values()))
+    ends = ", ".join(f"{name.replace('_', ' ')} {value:.6g}" for name, value in minima.items())
+    if len(found) > 1 and found.max() > (1.0 + _SAME) * found.min():
+        why = f"starts end in different minima ({ends}; the lowest is taken), so this one is likely local too"
+    elif len(found) > 1:
+        why = f"all starts end in the same minimum ({ends}), so the information is likely too optimistic, or edges are false"
+    else:
+        why = "a local minimum, false edges, or information that is too optimistic; `--start auto` tries further starts"
+    return f"{misfit(fit)}: {why}; --robust gnc tells false loop closures from true ones"
+
+
+def without_information(graph: PoseGraph) -> NDArray[np.bool_]:
+    """(m,) edges whose information matrix is zero."""
+    return np.asarray(~graph.information.any(axis=(1, 2)))
+
+
+def silent_notes(graph: PoseGraph, silent: NDArray[np.bool_]) -> list[str]:
+    """A sentence on edges without information, `silent` (m,)."""
+    edges = np.flatnonzero(silent)
+    told = f"{len(edges)} of {len(silent)} edges carry no information and were left out: {edge_names(graph, edges)}"
+    return [told] if len(edges) else []
+
+
+def edge_names(graph: PoseGraph, edges: NDArray[np.int64]) -> str:
+    """`0 → 1, 7 → 9 …`."""
+    names = ", ".join(f"{a} → {b}" for a, b in graph.ids[graph.edges[edges[:_LISTED]]])
+    return names + (" …" if len(edges) > _LISTED else "")
+
+
+def pose_names(graph: PoseGraph, poses: NDArray[np.int64]) -> str:
+    """`0, 1, 2 …`."""
+    return ", ".join(str(graph.ids[pose]) for pose in poses[:_LISTED]) + (" …" if len(poses) > _LISTED else "")
+
+
+def structure_notes(graph: PoseGraph, held: NDArray[np.int64]) -> list[str]:
+    """Sentences on pieces without edges between them, and on poses without any edge."""
+    label = components(graph)
+    sizes = np.bincount(label)
+    notes = []
+    if len(sizes) > 1:
+        free = np.setdiff1d(held, graph.fixed)
+        notes.append(
+            f"the graph falls into {len(sizes)} pieces without edges between them"
+            + (
+                f"; poses {pose_names(graph, free)}, the first of those that the file does not fix anywhere, are held"
+                if len(free)
+                else ""
+            )
+        )
+    alone = np.flatnonzero(sizes[label] == 1)
+    if len(alone):
+        notes.append(f"{len(alone)} poses have no edge and stay where they are: {pose_names(graph, alone)}")
+    return notes
+
+
+def undetermined_notes(graph: PoseGraph, solution: Solution) -> list[str]:
+    """Sentences on directions that the edges leave free; looked for only where information matrices are singular."""
+    weak = np.zeros(len(graph.edges), dtype=np.bool_)
+    _mark_singular(graph.information, weak)
+    if not weak.any():
+        return []
+    return [
+        f"the edges do not determine all poses; where they do not, the start decides: {told}" for told in solution.undetermined()
+    ]
+
+
+@kernel
+def _mark_singular(matrices: NDArray[np.float64], singular: NDArray[np.bool_]) -> None:
+    """Cholesky of every matrix scaled to a unit diagonal; singular where a pivot vanishes."""
+    dim = matrices.shape[1]
+    work = np.empty((dim, dim))
+    for m in range(matrices.shape[0]):
+        A = matrices[m]
+        singular[m] = False
+        for i in range(dim):
+            if A[i, i] <= 0.0:
+                singular[m] = True
+        if singular[m]:
+            continue
+        for i in range(dim):
+            for j in range(i + 1):
+                work[i, j] = A[i, j] / math.sqrt(A[i, i] * A[j, j])
+        for k in range(dim):
+            pivot = work[k, k]
+            if pivot < _WEAK:
+                singular[m] = True
+                break
+            for i in range(k + 1, dim):
+                factor = work[i, k] / pivot
+                for j in range(k + 1, i + 1):
+                    work[i, j] -= factor * work[j, k]

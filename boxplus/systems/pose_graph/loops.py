@@ -1,0 +1,151 @@
+"""False loop closures: graduated non-convexity over the edges of a pose graph, with what odometry says taken for granted.
+
+Truncated least squares (Yang, Antonante, Tzoumas and Carlone, RA-L 2020) over the loop closures alone; edges between successive
+poses are never outliers. The first widths hear odometry almost alone, so that loops come in as they agree with it and with each
+other. A true loop that was refused for its noise lies further off than its noise, as the minimum was found without it; it is
+judged once more by its innovation, with the covariance of the poses counted in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import SingularProblemError
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.optimization.graduated import graduate
+from boxplus.optimization.group import Group
+from boxplus.optimization.inlier_report import InlierReport, inlier_report
+from boxplus.optimization.losses import Squared
+from boxplus.optimization.minimize import Callback
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import Variables
+from boxplus.systems.pose_graph.problem import LOOPS, problem_with_loops_apart, with_edges
+from boxplus.systems.pose_graph.start import components
+
+_SEARCH = 0.99  # of true loops within the threshold of the search: the narrower it is, the fewer false ones get in on the way
+_KEEP = 0.999  # of true loops that the innovation keeps
+_JUDGED = 400  # refused loops that are judged by their innovation, the nearest ones
+_FAR = 100.0  # thresholds, squared, beyond which none is
+_ROUNDS = 3  # of readmission
+
+
+@dataclass(frozen=True, slots=True)
+class LoopVerdict:
+    """Which edges are believed.
+
+    Attributes:
+        is_loop: (m,) edges that could be outliers; the others are odometry.
+        is_kept: (m,) edges that the result rests on, odometry among them.
+        innovations: (m,) ‖W e‖ at the result, in standard deviations of the measurement.
+        report: how clear the decision was.
+        solution: the least-squares minimum over the kept edges.
+        widths: of the loss that were gone through.
+    """
+
+    is_loop: NDArray[np.bool_]
+    is_kept: NDArray[np.bool_]
+    innovations: NDArray[np.float64]
+    report: InlierReport
+    solution: Solution
+    widths: int
+
+
+def judge_loops(
+    graph: PoseGraph,
+    is_loop: NDArray[np.bool_],
+    start: NDArray[np.float64],
+    options: SolverOptions,
+    callback: Callback | None = None,
+) -> LoopVerdict:
+    """Tell true loops from false, and optimise over the true ones.
+
+    Args:
+        is_loop: (m,) edges that may be outliers, one at least.
+        start: poses; every width of the loss begins there.
+
+    Raises:
+        SingularProblemError: see `Problem.solve`.
+    """
+    from scipy.stats import chi2
+
+    problem, poses = problem_with_loops_apart(graph, is_loop)
+    group = problem.groups[-1]
+    search, keep = (math.sqrt(float(chi2.ppf(p, group.residual.dim))) for p in (_SEARCH, _KEEP))
+    # Odometry that holds everything together speaks first; else the loops are needed from the beginning.
+    whole = len(np.unique(components(with_edges(graph, ~is_loop)))) == len(np.unique(components(graph)))
+    found = graduate(
+        problem,
+        group,
+        loss="truncated",
+        inlier_threshold=search,
+        weights={LOOPS: np.zeros(group.residual.count)} if whole else None,
+        options=options,
+        start=[start],
+        callback=callback,
+    )
+    group.set_loss(Squared())
+    kept = found.inliers[LOOPS]
+    solution = _solve_kept(problem, group, kept, options, found.solution, callback)
+    for _ in range(_ROUNDS):
+        if solution.status == "stopped":
+            break
+        again = _readmitted(group, poses, solution, kept, keep)
+        if not again.any():
+            break
+        kept = kept | again
+        solution = _solve_kept(problem, group, kept, options, solution, callback)
+    innovations, is_kept = np.zeros(len(is_loop)), ~is_loop
+    for own, rows in zip(problem.groups, ([is_loop] if is_loop.all() else [~is_loop, is_loop]), strict=True):
+        innovations[rows] = np.sqrt(own.squares(solution.values))
+    is_kept[is_loop] = kept
+    report = inlier_report(innovations[is_loop] ** 2, group.residual.dim, keep, kept)
+    return LoopVerdict(is_loop, is_kept, innovations, report, solution, len(found.levels))
+
+
+def _solve_kept(
+    problem: Problem, group: Group, kept: NDArray[np.bool_], options: SolverOptions, start: Solution, callback: Callback | None
+) -> Solution:
+    problem.set_weights(group, kept.astype(np.float64))
+    return problem.solve(options, start=start, callback=callback)
+
+
+def _readmitted(
+    group: Group, poses: Variables, solution: Solution, kept: NDArray[np.bool_], threshold: float
+) -> NDArray[np.bool_]:
+    """(N,) refused loops whose innovation, measured by its own covariance, is no larger than that of true ones."""
+    again = np.zeros(len(kept), dtype=np.bool_)
+    squares = group.squares(solution.values)
+    nearest = np.argsort(np.where(kept, np.inf, squares), kind="stable")[:_JUDGED]
+    near = nearest[~kept[nearest] & (squares[nearest] <= _FAR * threshold**2)]
+    if not len(near):
+        return again
+    i, j = (connection.rows[near] for connection in group.connections)
+    residual, x = group.residual, solution[poses]
+    # Of all loops, as residuals are linearised a group at a time.
+    a, b = (connection.rows for connection in group.connections)
+    r, J = np.zeros((residual.count, residual.dim)), tuple(np.zeros((residual.count, residual.dim, residual.dim)) for _ in "ij")
+    valid = np.ones(residual.count, dtype=np.bool_)
+    residual.linearize_into(0, residual.count, (x, x), (a, b), r, J, valid)
+    W = residual.whitening.rows(near).factors
+    e, Ji, Jj = (np.matmul(W, part) for part in (r[near, :, None], J[0][near], J[1][near]))
+    try:
+        Pii, Pjj, Pij = (solution.covariance(poses[p], poses[q]) for p, q in ((i, i), (j, j), (i, j)))
+    except SingularProblemError:
+        return again  # poses that the kept edges leave loose: nothing to judge by
+    across = Ji @ Pij @ np.swapaxes(Jj, 1, 2)
+    S = (
+        np.eye(residual.dim)
+        + Ji @ Pii @ np.swapaxes(Ji, 1, 2)
+        + Jj @ Pjj @ np.swapaxes(Jj, 1, 2)
+        + across
+        + np.swapaxes(across, 1, 2)
+    )
+    innovation = (e * np.linalg.solve(S, e)).sum(axis=(1, 2))
+    again[near[innovation <= threshold**2]] = True
+    return again

@@ -1,0 +1,101 @@
+"""The least-squares problem of a pose graph, and what its edges add to the objective."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.manifolds.se2 import SE2
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.losses import Loss
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.variables import Variables
+from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_weights
+from boxplus.residuals.relative_pose import RelativePose
+from boxplus.residuals.relative_pose_2d import RelativePose2D
+from boxplus.residuals.residual import Residual
+from boxplus.systems.pose_graph.start import held_poses, spanning_tree_start
+
+Objective = Literal["logarithm", "chordal"]
+ODOMETRY, LOOPS = "odometry", "loops"
+"""Names of the groups of a problem with loops apart."""
+
+
+def pose_graph_problem(
+    graph: PoseGraph,
+    *,
+    held: NDArray[np.int64] | None = None,
+    loss: Loss | None = None,
+    objective: Objective = "logarithm",
+) -> tuple[Problem, Variables]:
+    """The least-squares problem of a graph, with its poses as one block of variables.
+
+    Args:
+        held: poses that do not move; `held_poses(graph)` if left out.
+    """
+    problem = Problem()
+    values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
+    poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
+    i, j = graph.edges.T
+    problem.add_residuals(residual_of(graph, objective), poses[i], poses[j], loss=loss, name="edges")
+    problem.fix(poses[held_poses(graph) if held is None else held])
+    return problem, poses
+
+
+def problem_with_loops_apart(graph: PoseGraph, is_loop: NDArray[np.bool_]) -> tuple[Problem, Variables]:
+    """The same with the logarithmic error, its edges in two groups: `ODOMETRY`, left out where there is none, and `LOOPS`."""
+    problem = Problem()
+    values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
+    poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
+    for name, rows in ((ODOMETRY, ~is_loop), (LOOPS, is_loop)):
+        if rows.any():
+            part = with_edges(graph, rows)
+            i, j = part.edges.T
+            problem.add_residuals(residual_of(part), poses[i], poses[j], name=name)
+    problem.fix(poses[held_poses(graph)])
+    return problem, poses
+
+
+def residual_of(graph: PoseGraph, objective: Objective = "logarithm") -> Residual:
+    """The residuals of all edges."""
+    if objective == "chordal":
+        kappa, tau = chordal_weights(graph.information)
+        return (ChordalPose if graph.dimension == 3 else ChordalPose2D)(graph.measurements, kappa=kappa, tau=tau)
+    kind = RelativePose if graph.dimension == 3 else RelativePose2D
+    return kind(graph.measurements, information=graph.information)
+
+
+def with_edges(graph: PoseGraph, rows: NDArray[np.bool_]) -> PoseGraph:
+    """The graph with some of its edges only."""
+    if rows.all():
+        return graph
+    return replace(graph, edges=graph.edges[rows], measurements=graph.measurements[rows], information=graph.information[rows])
+
+
+def consecutive_edges(graph: PoseGraph) -> NDArray[np.bool_]:
+    """(m,) edges between poses that follow each other in the order of their names: what robots call odometry."""
+    rank = np.empty(len(graph.ids), dtype=np.int64)
+    rank[np.argsort(graph.ids, kind="stable")] = np.arange(len(graph.ids))
+    i, j = rank[graph.edges].T
+    return np.asarray(np.abs(i - j) == 1)
+
+
+def squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(m,) what every edge adds to chi2."""
+    i, j = graph.edges.T
+    whitened = np.einsum("nab,nb->na", residual.whitening.factors, residual.evaluate(poses[i], poses[j]))
+    return np.asarray((whitened * whitened).sum(axis=1))
+
+
+def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "logarithm") -> float:
+    """The objective over the edges, for poses laid out as in the graph, without any robust loss and without ½."""
+    return float(squared_errors(residual_of(graph, objective), graph, poses).sum())
+
+
+def positions(graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) positions of poses laid out as in a graph [m]; z = 0 in the plane."""
+    return poses[:, 4:] if graph.dimension == 3 else np.column_stack([poses[:, 1:], np.zeros(len(poses))])

@@ -1,0 +1,124 @@
+"""Which starts an optimisation of a pose graph compares, and which it tries when the first one leads nowhere good."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.pose_graph import PoseGraph
+from boxplus.optimization.losses import Loss
+from boxplus.optimization.minimize import Callback
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Iteration, Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.systems.pose_graph.loops import judge_loops
+from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
+from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
+
+Start = Literal["file", "spanning_tree", "chordal", "chordal_objective", "graduated"]
+Wanted = Literal["auto", "file", "spanning_tree", "chordal"]
+_SAME = 1e-3  # relative difference up to which two minima are one
+
+
+class Starts:
+    """Starts of one graph.
+
+    Attributes:
+        is_loop: (m,) edges that graduated non-convexity may refuse: all that do not join successive poses, or all where nothing
+            else is there.
+    """
+
+    def __init__(self, graph: PoseGraph, wanted: Wanted, options: SolverOptions, callback: Callback | None) -> None:
+        if wanted == "file" and graph.poses is None:
+            raise InputError(
+                "poses in the file to start from", f"only edges ({graph.source})", "start with `chordal` or `spanning_tree`"
+            )
+        self.is_loop = ~consecutive_edges(graph)
+        self._graph, self._wanted, self._options, self._callback = graph, wanted, options, callback
+        self._stopped = False
+
+    def candidates(self, loss: Loss | None, *, is_robust: bool) -> dict[Start, NDArray[np.float64]]:
+        """Poses of every start that is compared.
+
+        Args:
+            loss: of the edges; one that forgets starts from what graduated non-convexity finds.
+            is_robust: the start is that of graduated non-convexity, which wants odometry that no false loop has bent.
+        """
+        graph, wanted = self._graph, self._wanted
+        forgets = loss is not None and loss.is_redescending
+        if (is_robust or forgets) and wanted == "auto":
+            found: dict[Start, NDArray[np.float64]] = {"spanning_tree": self._dead_reckoning()}
+        else:
+            found = {}
+            if wanted in ("auto", "file") and graph.poses is not None:
+                found["file"] = graph.poses
+            if wanted in ("auto", "chordal"):
+                found["chordal"] = chordal_start(graph)
+            if wanted == "spanning_tree":
+                found["spanning_tree"] = spanning_tree_start(graph)
+        if forgets and self.is_loop.any():
+            (start,) = found.values()
+            return {"graduated": self._graduated(start)}
+        return found
+
+    def further(
+        self,
+        problem: Problem,
+        first: Start,
+        solution: Solution,
+        known: dict[Start, NDArray[np.float64]],
+        minima: dict[Start, float],
+        enough: float,
+    ) -> tuple[Start, Solution]:
+        """The lowest minimum of all starts there are, or the first that is low enough.
+
+        Args:
+            first, solution: the start that was followed, and where it led.
+            known: starts by name; receives those that are tried.
+            minima: the objective at the end of every start; receives those that are tried.
+            enough: objective below which nothing further is tried.
+        """
+        best = (first, solution)
+        names: list[Start] = ["chordal_objective", "file", "chordal", "spanning_tree", "graduated"]
+        for name in names:
+            if min(minima.values()) <= enough:
+                break
+            if name in minima or (name == "file" and self._graph.poses is None) or self._stopped:
+                continue
+            if name == "graduated" and (not self.is_loop.any() or max(minima.values()) <= (1.0 + _SAME) * min(minima.values())):
+                continue  # the others agree
+            if name not in known:
+                try:
+                    known[name] = self._make(name)
+                except InputError:
+                    continue  # the chordal objective has no weights for edges that say nothing along some axis
+            tried = problem.solve(self._options, start=[known[name]], callback=self._watch)
+            minima[name] = 2.0 * tried.cost
+            if tried.cost < best[1].cost:
+                best = (name, tried)
+        return best
+
+    def _make(self, name: Start) -> NDArray[np.float64]:
+        if name == "graduated":
+            return self._graduated(self._dead_reckoning())
+        if name == "chordal_objective":
+            # Smooth where the logarithm jumps at half a turn, and with far fewer minima.
+            smooth, _ = pose_graph_problem(self._graph, objective="chordal")
+            return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=self._watch).values[0]
+        return chordal_start(self._graph) if name == "chordal" else spanning_tree_start(self._graph)
+
+    def _watch(self, iteration: Iteration) -> bool:
+        self._stopped = self._stopped or (self._callback is not None and bool(self._callback(iteration)))
+        return self._stopped
+
+    def _graduated(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        return judge_loops(self._graph, self.is_loop, start, self._options, self._watch).solution.values[0]
+
+    def _dead_reckoning(self) -> NDArray[np.float64]:
+        """Poses along the odometry, where it holds all together; else along a tree of all edges."""
+        odometry = with_edges(self._graph, ~self.is_loop)
+        same = len(np.unique(components(odometry))) == len(np.unique(components(self._graph)))
+        return spanning_tree_start(odometry if same else self._graph)
