@@ -60,14 +60,23 @@ class BalProblem:
                 row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
                 raise InputError(f"finite {name}", f"{array[row].tolist()} ({self.source}, row {row})", "remove or correct it")
             object.__setattr__(self, name, array)
-        for name, index, count in (("camera", self.camera_of, len(self.cameras)), ("point", self.point_of, len(self.points))):
-            bad = np.flatnonzero((index < 0) | (index >= count))
-            if bad.size:
-                raise InputError(
-                    f"{name} indices from 0 to {count - 1}",
-                    f"{index[bad[0]]} ({self.source}, observation {bad[0]})",
-                    "give indices from 0",
-                )
+        check_indices(self.camera_of, len(self.cameras), self.point_of, len(self.points), self.source)
+
+
+def check_indices(camera_of: NDArray[np.int64], cameras: int, point_of: NDArray[np.int64], points: int, source: str) -> None:
+    """Refuse observations (k,) of cameras and points that are not there.
+
+    Raises:
+        InputError: the message names the first one.
+    """
+    for name, index, count in (("camera", camera_of, cameras), ("point", point_of, points)):
+        bad = np.flatnonzero((index < 0) | (index >= count))
+        if bad.size:
+            raise InputError(
+                f"{name} indices from 0 to {count - 1}",
+                f"{index[bad[0]]} ({source}, observation {bad[0]})",
+                "give indices from 0",
+            )
 
 
 def read_bal(path: str | Path) -> BalProblem:

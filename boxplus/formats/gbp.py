@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.formats.bal import check_indices
 from boxplus.formats.bal_text import read_bal_text
 from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
@@ -24,6 +25,9 @@ class GbpProblem:
         points: (n, 3) float64, p_world [m].
         camera_of, point_of: (k,) int64, the camera and the point of each observation.
         pixels: (k, 2) float64, x to the right and y downwards [px].
+
+    Raises:
+        InputError: on construction, where an index is out of range.
     """
 
     intrinsics: NDArray[np.float64]
@@ -32,6 +36,9 @@ class GbpProblem:
     camera_of: NDArray[np.int64]
     point_of: NDArray[np.int64]
     pixels: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        check_indices(self.camera_of, len(self.T_camera_world), self.point_of, len(self.points), "bundle adjustment problem")
 
 
 def read_gbp(path: str | Path) -> GbpProblem:

@@ -110,7 +110,8 @@ class LeastSquares:
 
     def slope(self) -> float:
         """Largest |cos| of the angle between the residuals and a column of the Jacobian: zero at a minimum, free of units."""
-        reach = np.sqrt(2.0 * self.cost.cost * np.maximum(self.system.diagonal, 0.0))
+        # Roots before products: sigmas far from 1 overflow the product, and everything would seem to be at a right angle.
+        reach = np.sqrt(2.0 * self.cost.cost) * np.sqrt(np.maximum(self.system.diagonal, 0.0))
         steep = np.abs(self.system.gradient)
         return float(np.divide(steep, reach, out=np.zeros_like(steep), where=reach > 0.0).max(initial=0.0))
 

@@ -19,9 +19,9 @@ from boxplus.optimization.variables import Variables
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
+from boxplus.systems.bundle_adjustment.plausibility import input_notes, outlier_notes, sigma_notes, structure_notes
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
 
-_HEAVY, _LOAD = 0.01, 0.9  # a share of the observations, and of the cost, that only wrong matches carry
 _MOST = 0.5  # share of the observations that a robust loss may silence
 _BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
@@ -85,6 +85,12 @@ def adjust_bundle(
             "use levenberg_marquardt or dogleg",
         )
     begin = time.perf_counter()
+    if not np.any(reconstruction.point_of >= 0):
+        raise InputError(
+            "images that see points",
+            f"not a single observation of a point ({getattr(reconstruction, 'source', 'reconstruction')})",
+            "triangulate first",
+        )
     problem = Problem()
     sound = make_sound(reconstruction)
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
@@ -100,7 +106,9 @@ def adjust_bundle(
     adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
     cheirality = count_behind(sound, adjusted)
     depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
-    notes = [*cheirality.notes(reconstruction), *depth.notes(reconstruction)]
+    left = _redundancy(problem, points, point_of)
+    notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
+    notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left)]
     return BundleAdjustmentResult(
         reconstruction=adjusted,
         errors_start=errors_start,
@@ -109,8 +117,8 @@ def adjust_bundle(
         point_of=point_of,
         cheirality=cheirality,
         depth=depth,
-        notes=(*notes, *_outliers(errors, loss), *_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth, solution),
+        notes=(*notes, *structure_notes(len(points), camera_of, point_of, solution)),
+        doubt=_doubt(cheirality, depth, solution, left),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -118,23 +126,17 @@ def adjust_bundle(
     )
 
 
-def _outliers(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
-    """A sentence where a few observations carry nearly all of a cost without robust loss."""
-    squared = np.sort(errors[np.isfinite(errors)] ** 2)[::-1]
-    few = max(1, int(_HEAVY * len(squared)))
-    if loss is not None or len(squared) < 1.0 / _HEAVY or not squared[:few].sum() > _LOAD * squared.sum():
-        return []
-    if np.sqrt(squared[0]) < 1e-6:  # all exact but for rounding
-        return []
-    return [
-        f"{few} of {len(squared)} observations carry {squared[:few].sum() / squared.sum():.0%} of the cost, the largest error is "
-        f"{np.sqrt(squared[0]):.4g} px: wrong matches or a wrong start; use a robust loss (--loss huber)"
-    ]
+def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]) -> int:
+    """Measurements less unknowns, but for the seven that images never tell."""
+    others = sum(len(block) * block.manifold.dof for block in problem.blocks if block is not points)
+    return 2 * len(point_of) + 7 - others - 3 * len(np.unique(point_of))
 
 
-def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution) -> str | None:
+def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int) -> str | None:
     """Why the result is not to be trusted."""
     reasons = []
+    if left <= 0:
+        reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:
         reasons.append("the cameras do not move apart: their rotations are measured, depths and positions are not")
     if cheirality.bad_share > _BAD_SHARE:
@@ -158,23 +160,3 @@ def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.f
         group.residual.evaluate_into(0, group.residual.count, x, tuple(c.rows for c in group.connections), r, valid)
         distances.append(np.where(valid, np.linalg.norm(r, axis=1), np.nan))
     return np.concatenate(distances)
-
-
-def _notes(point_count: int, camera_of: NDArray[np.int64], point_of: NDArray[np.int64], solution: Solution) -> tuple[str, ...]:
-    """Sentences on the structure; that images alone do not tell where the whole scene lies is no news."""
-    gauge = [note for note in solution.notes if note.startswith("nothing ties ")]
-    notes = [note for note in solution.notes if note not in gauge]
-    if len(gauge) > 1:
-        notes.append(
-            f"the reconstruction falls into {len(gauge)} pieces that share no point: how they lie to each other, and their "
-            "relative scale, are not determined"
-        )
-    times = np.bincount(point_of, minlength=point_count)
-    once = int(np.count_nonzero(times == 1))
-    if once:
-        notes.append(f"{once} points are seen only once: their depth is not determined and stays near the start")
-    few = np.bincount(camera_of)
-    few_cameras = int(np.count_nonzero((few > 0) & (few < 4)))
-    if few_cameras:
-        notes.append(f"{few_cameras} cameras see fewer than 4 points: their pose is not determined and stays near the start")
-    return tuple(notes)

@@ -47,7 +47,9 @@ def parallax_ratio(
     m, n = len(cameras), int(np.count_nonzero(seen))
     left = sum(2 * group.residual.count for group in problem.groups) + 7 - 3 * n
     left -= sum(block.values.shape[0] * block.manifold.dof for block in problem.blocks if block is not points)
-    if left <= 0 or m < 2:
+    if m < 2:
+        return 0.0
+    if left <= 0:
         return float("inf")
     information = np.zeros((cameras.manifold.dof, cameras.manifold.dof))
     information[3:6, 3:6] = _IN_PLACE * np.eye(3)

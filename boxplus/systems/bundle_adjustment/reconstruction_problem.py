@@ -34,7 +34,7 @@ def add_reconstruction(
     """Add cameras, points and the used observations (k,) to a problem; returns cameras and points.
 
     Raises:
-        InputError: a camera model without a counterpart here; a focal length that is not positive; no observation.
+        InputError: a camera model without a counterpart here; a focal length that is not positive.
     """
     if isinstance(reconstruction, BalProblem):
         return _add_bal(problem, reconstruction, used, config, loss)
@@ -102,8 +102,6 @@ def _add_colmap(
         start = model.camera_params[number][free]
         intrinsics = problem.add_variables(refined.manifolds[2], start, name=_intrinsics_name(name))
         problem.add_residuals(refined, *connections, intrinsics, loss=loss, name=label)
-    if not problem.groups:
-        raise InputError("images that see points", f"not a single observation of a point ({model.source})", "triangulate first")
     return images, points
 
 

@@ -1,0 +1,188 @@
+"""What people feed to bundle adjustment by mistake: each is right all the same, refused, or flagged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import FORMATS, SIGMA, perturbed, reconstruction
+from small_problems import scene
+
+import boxplus as bp
+from boxplus.errors import BoxplusError, InputError, NotFiniteError
+from boxplus.formats.reconstruction import Reconstruction
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+
+
+def chosen(start: Reconstruction, rows: np.ndarray) -> Reconstruction:
+    """Of the observations only some."""
+    return replace(start, camera_of=start.camera_of[rows], point_of=start.point_of[rows], pixels=start.pixels[rows])
+
+
+def note_of(start: Reconstruction, beginning: str, **settings) -> str:
+    notes = adjust_bundle(start, **settings).notes
+    found = [note for note in notes if beginning in note]
+    assert len(found) == 1, notes
+    return found[0]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize(("value", "error"), [(np.nan, InputError), (np.inf, InputError), (1e200, NotFiniteError)])
+def test_pixels_that_are_no_numbers_are_refused(format, value, error):
+    start = reconstruction(60, format)
+    pixels = start.pixels.copy()
+    pixels[3] = value
+    with np.errstate(over="ignore"), pytest.raises(error):
+        adjust_bundle(replace(start, pixels=pixels))
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("index", [-5, 10_000])
+def test_dangling_indices_are_refused(format, index):
+    start = reconstruction(61, format)
+    name = "image_of" if format == "colmap" else "camera_of"
+    for which in (name, "point_of"):
+        of = getattr(start, which).copy()
+        of[-1] = index
+        with pytest.raises(InputError, match=r"indices|observations image by image"):
+            adjust_bundle(replace(start, **{which: of}))
+
+
+@pytest.mark.parametrize("focal", [-500.0, 0.0])
+@pytest.mark.parametrize("format", FORMATS)
+def test_focal_lengths_that_are_not_positive_are_refused(format, focal):
+    start = reconstruction(62, format)
+    if format == "bal":
+        cameras = start.cameras.copy()
+        cameras[2, 6] = focal
+        with pytest.raises(InputError, match=r"expected positive focal lengths \[px\] – got -?[0-9]+, camera 2 "):
+            adjust_bundle(replace(start, cameras=cameras))
+        return
+    intrinsics = np.array([focal, focal, 0.0, 0.0])
+    wrong = replace(start, intrinsics=intrinsics) if format == "gbp" else replace(start, camera_params=(intrinsics,))
+    with pytest.raises(InputError, match="expected fx positive and finite"):
+        adjust_bundle(wrong)
+
+
+def test_nothing_to_adjust_is_refused():
+    for format in ("bal", "gbp"):
+        with pytest.raises(InputError, match="not a single observation of a point"):
+            adjust_bundle(chosen(reconstruction(63, format), np.zeros(0, dtype=int)))
+
+
+def test_repeated_observations_are_counted():
+    start = reconstruction(64)
+    twice = chosen(start, np.concatenate([np.arange(len(start.pixels)), np.arange(30)]))
+    assert note_of(twice, "that has it already").startswith("30 observations are of a point in a camera that has it already")
+    assert not any("already" in note for note in adjust_bundle(start).notes)
+
+
+def test_a_camera_with_one_point_and_one_with_none_are_told():
+    start = reconstruction(65)
+    few = chosen(start, np.flatnonzero((start.camera_of != 0) | (np.cumsum(start.camera_of == 0) <= 1)))
+    assert note_of(few, "fewer than 4 points").startswith("1 cameras see fewer than 4 points")
+    assert "cameras[0]" in note_of(chosen(start, np.flatnonzero(start.camera_of != 0)), "no residual touches")
+    # The one observation is explained by the camera it is alone in, and nothing else moves for it.
+    without = adjust_bundle(chosen(start, np.flatnonzero(start.camera_of != 0)))
+    assert adjust_bundle(few).solution.cost == pytest.approx(without.solution.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_points_in_a_plane_are_no_problem(format):
+    rng = np.random.default_rng(66)
+    T, p, camera_of, point_of = scene(66, 8, 60)
+    start = perturbed(rng, T, p * [1.0, 1.0, 0.02], camera_of, point_of, format, 0.02, 0.05)
+    result = adjust_bundle(start, BundleAdjustmentConfig(sigma_px=SIGMA))
+    assert result.solution.status == "converged" and result.doubt is None
+    assert np.sqrt(np.mean(result.errors**2)) < 2.0 * SIGMA
+
+
+def test_two_scenes_in_one_file_are_told():
+    start = reconstruction(67)
+    half = start.camera_of < 4
+    two = replace(start, point_of=np.where(half, start.point_of, start.point_of + 150), points=np.vstack([start.points] * 2))
+    assert note_of(two, "pieces").startswith("the reconstruction falls into 2 pieces that share no point")
+
+
+@pytest.mark.parametrize(("sigma", "factor"), [(1e-9, "5e+08"), (1e9, "5e-10"), (20.0, "0.02")])
+def test_a_sigma_that_the_errors_contradict_is_told(sigma, factor):
+    note = note_of(reconstruction(68), "the errors are those of sigma = 0.", config=BundleAdjustmentConfig(sigma_px=sigma))
+    assert float(note.split("by a factor of ")[1].split(",")[0]) == pytest.approx(float(factor), rel=0.3)
+
+
+def test_a_sigma_that_fits_and_one_near_it_are_not():
+    for sigma in (0.2, 0.5, 1.0):
+        result = adjust_bundle(reconstruction(69), BundleAdjustmentConfig(sigma_px=sigma))
+        assert not any("the errors are those" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("format", ["bal", "gbp"])
+def test_pixels_in_another_unit_are_asked_about(format):
+    start = reconstruction(70, format)
+    pixels = start.pixels.copy()
+    pixels[start.camera_of == 3] /= 500.0
+    one = replace(start, pixels=pixels)
+    assert note_of(one, "are they in another unit?").startswith("the pixels of cameras 3 spread over 0.")
+    assert "are both in the same unit?" in note_of(replace(start, pixels=start.pixels / 500.0), "at a focal length of 500 px")
+    assert not any("unit?" in note for note in adjust_bundle(start).notes)
+
+
+def test_a_camera_in_another_unit_of_length_comes_back():
+    start = reconstruction(71)
+    T = start.T_camera_world.copy()
+    T[2, 4:] *= 1000.0
+    result = adjust_bundle(replace(start, T_camera_world=T))
+    assert result.solution.cost == pytest.approx(adjust_bundle(start).solution.cost, rel=1e-5)
+
+
+def test_one_image_and_too_few_measurements_are_not_trusted():
+    start = reconstruction(72)
+    one = chosen(start, np.flatnonzero(start.camera_of == 0))
+    result = adjust_bundle(replace(one, T_camera_world=start.T_camera_world[:1]))
+    assert "unknowns more than measurements" in result.doubt and "the cameras do not move apart" in result.doubt
+    few = chosen(start, np.flatnonzero((start.camera_of < 2) & (start.point_of < 8)))
+    few = replace(few, T_camera_world=start.T_camera_world[:2])
+    assert "unknowns more than measurements: small errors are no evidence" in adjust_bundle(few).doubt
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"sigma": 0.0}, "sigma positive and finite"),
+        ({"sigma": -1.0}, "sigma positive and finite"),
+        ({"sigma": np.inf}, "sigma positive and finite"),
+        ({"sigma": np.nan}, "sigma positive and finite"),
+        ({"covariance": np.zeros((2, 2))}, "covariance"),
+        ({"covariance": np.array([[1.0, 2.0], [2.0, 1.0]])}, "covariance"),
+        ({"information": np.array([[1.0, 0.5], [0.0, 1.0]])}, "information"),
+        ({"sigma": 1.0, "information": np.eye(2)}, "one of sigma, covariance, information"),
+    ],
+)
+def test_noise_that_is_none_is_refused_by_problems(settings, told):
+    with pytest.raises(InputError, match=told):
+        bp.residuals.Reprojection(bp.Pinhole(500.0, 500.0, 0.0, 0.0), np.zeros((3, 2)), **settings)
+
+
+@pytest.mark.parametrize("sigma", [1e-100, 1e-9, 1e9, 1e100])
+def test_any_sigma_gives_the_same_values(sigma):
+    """And covariances that go with its square."""
+    solutions = []
+    for s in (1.0, sigma):
+        start = reconstruction(73, points=20, share=1.0)
+        problem = bp.Problem()
+        T = problem.add_variables(bp.SE3Left, start.T_camera_world)
+        p = problem.add_variables(bp.Euclidean(3), start.points)
+        residual = bp.residuals.Reprojection(bp.Pinhole(500.0, 500.0, 0.0, 0.0), start.pixels, sigma=s)
+        problem.add_residuals(residual, T[start.camera_of], p[start.point_of])
+        problem.fix(T[:2])
+        solutions.append((problem.solve(), p))
+    (one, p), (other, q) = solutions
+    assert one.status == other.status == "converged"
+    np.testing.assert_allclose(other[q], one[p], atol=1e-5)
+    np.testing.assert_allclose(other.covariance(q[[3]]) / sigma**2, one.covariance(p[[3]]), rtol=1e-3)
+
+
+def test_every_refusal_is_of_one_family():
+    assert issubclass(InputError, BoxplusError) and issubclass(NotFiniteError, BoxplusError)
