@@ -26,6 +26,7 @@ from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
 from boxplus.systems.pose_graph.start import components, held_poses
 
 _CERTIFIED = 1e-6  # largest gap, as a share of the objective
+_ROUNDING = 1e-12  # or of the trace of M, where the objective vanishes
 _FIRST, _LAST = -14, 1  # decades of η, in units of the largest diagonal entry of M
 
 
@@ -37,7 +38,7 @@ class Certificate:
         objective: at the poses, Σ κ ‖R_j − R_i R_ij‖² + τ ‖t_j − t_i − R_i t_ij‖².
         lower_bound: no poses cost less.
         least_eigenvalue: the smallest eigenvalue of S, restricted to the rotations, is no less than this; 0 at a global minimum.
-        is_certified: the gap is a millionth of the objective at most.
+        is_certified: the gap is a millionth of the objective at most, or rounding.
     """
 
     objective: float
@@ -101,7 +102,9 @@ def certify(graph: PoseGraph) -> Certificate:
             except NotPositiveDefinite:
                 continue
             bound = dual - eta * scale * d * n
-            return Certificate(objective, bound, -eta * scale, objective - bound <= _CERTIFIED * max(objective, 1e-12 * scale))
+            return Certificate(
+                objective, bound, -eta * scale, objective - bound <= max(_CERTIFIED * objective, _ROUNDING * scale * d * n)
+            )
     return Certificate(objective, 0.0, -np.inf, False)  # the objective is a sum of squares
 
 
