@@ -44,6 +44,7 @@ def lio(
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
     *,
     options: RecordingOptions,
 ) -> None:
@@ -71,7 +72,7 @@ def lio(
         both = {"threads": min(2, os.cpu_count() or 1)}
         run_config = run_config.model_copy(update={"odometry": run_config.odometry.model_copy(update=both)})
     folder = output or Path(f"{recording.resolve().stem}_boxplus")
-    summary = run(recording, folder, run_config, overwrite=overwrite, view=view, report=not no_report)
+    summary = run(recording, folder, run_config, overwrite=overwrite, resume=resume, view=view, report=not no_report)
     if summary.state == "interrupted":
         raise typer.Exit(130)
     if summary.contradiction is not None:
@@ -79,7 +80,14 @@ def lio(
 
 
 def run(
-    recording: Path, folder: Path, config: RunConfig, *, overwrite: bool = False, view: bool = False, report: bool = True
+    recording: Path,
+    folder: Path,
+    config: RunConfig,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    view: bool = False,
+    report: bool = True,
 ) -> RunSummary:
     """Run the odometry with everything a terminal shows: evidence, progress, results.
 
@@ -101,14 +109,21 @@ def run(
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_recording(recording, config.recording) as opened,
-        claim_run_folder(folder, overwrite=overwrite) as claimed,
+        claim_run_folder(folder, overwrite=overwrite, resume=resume) as claimed,
     ):
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
             extrinsic = choose_extrinsic(opened, config.odometry)
         terminal.print_evidence(opened.info, extrinsic)
         with terminal.progress() as progress:
             summary = run_odometry(
-                opened, claimed, config, extrinsic=extrinsic, progress=progress, view=shown, should_stop=should_stop
+                opened,
+                claimed,
+                config,
+                extrinsic=extrinsic,
+                resume=resume,
+                progress=progress,
+                view=shown,
+                should_stop=should_stop,
             )
         if report and summary.scans:
             from boxplus.report import write_report

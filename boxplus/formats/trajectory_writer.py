@@ -25,12 +25,13 @@ class TrajectoryWriter:
     Args:
         folder: created where it does not exist.
         stem: beginning of the three file names.
+        after_ns: go on in the files of an earlier writer, whose last pose has this time [ns].
 
     Raises:
         OutputError: the folder or the files cannot be created.
     """
 
-    def __init__(self, folder: str | Path, stem: str = "trajectory") -> None:
+    def __init__(self, folder: str | Path, stem: str = "trajectory", *, after_ns: int | None = None) -> None:
         base = make_folder(folder)
         self.paths: dict[str, Path] = {
             "tum": base / f"{stem}.tum",
@@ -39,18 +40,21 @@ class TrajectoryWriter:
         }
         self.count = 0
         """Poses written so far."""
-        self._last_ns: int | None = None
+        self._last_ns = after_ns
         self._files: dict[str, int] = {}
         self._sizes = dict.fromkeys(self.paths, 0)
         try:
             for name, path in self.paths.items():
                 try:
-                    self._files[name] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0), 0o644)
+                    flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if after_ns is None else 0) | getattr(os, "O_BINARY", 0)
+                    self._files[name] = os.open(path, flags, 0o644)
+                    self._sizes[name] = os.lseek(self._files[name], 0, os.SEEK_END)
                 except OSError as error:
                     raise output_error(path, error) from error
-            header = ",".join(CSV_COLUMNS) + "\n"
-            self._write("csv", header)
-            self._sizes["csv"] = len(header)
+            if after_ns is None:
+                header = ",".join(CSV_COLUMNS) + "\n"
+                self._write("csv", header)
+                self._sizes["csv"] = len(header)
         except OutputError:
             self.close()
             raise

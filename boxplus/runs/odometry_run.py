@@ -20,9 +20,10 @@ from boxplus._jit import on_compilation
 from boxplus.errors import BoxplusError, InputError, OutputError, printable
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
-from boxplus.maps.tiles.store import merge
+from boxplus.maps.tiles.store import TileStore, merge
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.recording import Recording
+from boxplus.runs.checkpoint import Checkpoint, CheckpointWriter, cut_to_whole_rows, read_checkpoint, run_identity
 from boxplus.runs.config import RunConfig, dump_run_config
 from boxplus.runs.extrinsic import Extrinsic, choose_extrinsic
 from boxplus.runs.run_folder import RunFolder, claim_run_folder
@@ -79,6 +80,7 @@ def run_odometry(
     *,
     extrinsic: Extrinsic | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     view: View | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -95,6 +97,7 @@ def run_odometry(
         config: settings; each has a default.
         extrinsic: from `choose_extrinsic`; None chooses.
         overwrite: replace the results of an earlier run in the folder.
+        resume: go on with a run that was killed or interrupted, from its last checkpoint.
         progress: called after every event that was read.
         view: shown every estimate.
         should_stop: asked between events; True ends the run in good order, with the state "interrupted".
@@ -103,16 +106,21 @@ def run_odometry(
         The facts of the run, as in `run.json`.
 
     Raises:
-        InputError: the folder holds something else, or another process is writing there.
+        InputError: the folder holds something else, or another process is writing there; nothing to resume, or a run over
+            another recording or with other settings.
         OutputError: the folder cannot be written or the disk is full; what was written before is intact.
         RecordingError: nothing could be read.
     """
     config = config or RunConfig()
-    claimed = nullcontext(folder) if isinstance(folder, RunFolder) else claim_run_folder(folder, overwrite=overwrite)
+    claimed = (
+        nullcontext(folder) if isinstance(folder, RunFolder) else claim_run_folder(folder, overwrite=overwrite, resume=resume)
+    )
     with claimed as run_folder:
         extrinsic = extrinsic or choose_extrinsic(recording, config.odometry)
         config = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
         run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view)
+        if resume:
+            run.resume()
         return run.execute(should_stop or (lambda: False))
 
 
@@ -141,6 +149,9 @@ class _Run:
             self._statistics.warnings.add(extrinsic.warning)
         self._started = datetime.now(UTC)
         self._began = time.perf_counter()
+        self._identity = run_identity(recording.info, dump_run_config(config, recording.info))
+        self._events, self._resumed = 0, 0
+        self._written_until_ns: int | None = None
         self._odometry_ended: float | None = None
         self._seconds = dict.fromkeys(("reading", "odometry", "writing", "merging"), 0.0)
         self._summary_due = 0.0
@@ -150,10 +161,21 @@ class _Run:
         self._stage = "odometry"
         self._status = "starting"
 
+    def resume(self) -> None:
+        """Go on from the checkpoint in the folder.
+
+        Scans that came after it are estimated again, and written where their rows are not there yet.
+        """
+        checkpoint = read_checkpoint(self._folder, self._identity)
+        self._written_until_ns = cut_to_whole_rows(self._folder, checkpoint.statistics.scans)
+        self._odometry.restore(checkpoint.odometry)
+        self._statistics, self._registered = checkpoint.statistics, checkpoint.registered
+        self._events, self._resumed = checkpoint.events, checkpoint.resumed + 1
+
     def execute(self, should_stop: Callable[[], bool]) -> RunSummary:
         """Everything; see `run_odometry`."""
         with atomic_file(self._folder.config) as file:
-            file.write(dump_run_config(self._config, self._recording.info).encode())
+            file.write(self._identity["config"].encode())
         self._write_summary("running")
         try:
             state = self._process(should_stop)
@@ -176,12 +198,17 @@ class _Run:
         map_config = self._config.map
         with ExitStack() as stack:
             stack.enter_context(on_compilation(self._on_compilation))
-            trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
-            scan_log = stack.enter_context(ScanLogWriter(self._folder.scans))
+            after_ns = self._written_until_ns
+            trajectory = stack.enter_context(TrajectoryWriter(self._folder.path, after_ns=after_ns))
+            scan_log = stack.enter_context(ScanLogWriter(self._folder.scans, go_on=after_ns is not None))
+            checkpoints = CheckpointWriter(self._folder.checkpoint)
             if map_config.save:
                 tiles = TileWriter(self._folder.tiles, tile_size=map_config.tile_size, voxel=map_config.voxel)
                 self._tiles = stack.enter_context(tiles)
+                tiles.stored = TileStore.open(self._folder.tiles).point_count if self._resumed else 0
             events = iter(self._recording)
+            for _ in range(self._events):
+                next(events, None)
             while not should_stop():
                 began = time.perf_counter()
                 event = next(events, None)
@@ -193,10 +220,19 @@ class _Run:
                     self._keep(estimate, trajectory, scan_log)
                 self._show_progress()
                 if event is None:
+                    self._folder.checkpoint.unlink(missing_ok=True)
                     return "finished"
+                self._events += 1
+                if checkpoints.is_due:
+                    checkpoints.write(self._checkpoint())
                 if time.perf_counter() > self._summary_due:
                     self._write_summary("running")
+            checkpoints.write(self._checkpoint())
         return "interrupted"
+
+    def _checkpoint(self) -> Checkpoint:
+        odometry = self._odometry.snapshot()
+        return Checkpoint(self._identity, self._events, self._resumed, self._registered, self._statistics, odometry)
 
     def _push(self, event: Scan | ImuSamples) -> list[Estimate]:
         self._statistics.add_event(event)
@@ -206,10 +242,13 @@ class _Run:
         """Write one estimate. Points of a lost scan do not enter the map: nobody knows where they belong."""
         began = time.perf_counter()
         state = estimate.state
-        trajectory.append(estimate.time_ns, state.R_world_imu, state.p_world_imu, estimate.pose_covariance, estimate.status)
-        scan_log.append(estimate)
+        is_new = self._written_until_ns is None or estimate.time_ns > self._written_until_ns
+        if is_new:
+            trajectory.append(estimate.time_ns, state.R_world_imu, state.p_world_imu, estimate.pose_covariance, estimate.status)
+            scan_log.append(estimate)
         if self._tiles is not None and estimate.status != "lost":
-            self._tiles.append(estimate.points_world(), estimate.intensity)
+            if is_new:
+                self._tiles.append(estimate.points_world(), estimate.intensity)
             self._registered += len(estimate.p_lidar)
         self._statistics.add(estimate)
         self._status = estimate.status
@@ -263,6 +302,7 @@ class _Run:
             state=state,
             error=error,
             process=os.getpid(),
+            resumed=self._resumed,
             started=self._started,
             updated=datetime.now(UTC),
             recording=RecordingFacts(

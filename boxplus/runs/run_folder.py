@@ -8,7 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
+from boxplus.runs.folder_lock import locked_folder
 from boxplus.runs.output_folder import SUMMARY, output_folder
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
@@ -39,6 +41,11 @@ class RunFolder:
     def scans(self) -> Path:
         """One row a scan: velocity, biases, diagnosis, timing."""
         return self.path / "scans.csv"
+
+    @property
+    def checkpoint(self) -> Path:
+        """From where a killed run can go on; gone when it has come to its end."""
+        return self.path / "checkpoint.npz"
 
     @property
     def trajectory(self) -> Path:
@@ -72,7 +79,7 @@ class RunFolder:
 
     def own_files(self) -> Iterator[Path]:
         """The files in the folder that a run writes."""
-        top = [self.summary, self.config, self.scans, self.map_ply, self.map_pcd, self.report]
+        top = [self.summary, self.config, self.scans, self.map_ply, self.map_pcd, self.report, self.checkpoint]
         top += [self.trajectory.with_name(f"trajectory.{ending}") for ending in ("tum", "kitti.txt", "csv")]
         top += [self.plots / name for name in PLOTS]
         for path in top:
@@ -97,18 +104,29 @@ class RunFolder:
 
 
 @contextmanager
-def claim_run_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[RunFolder]:
+def claim_run_folder(folder: str | Path, *, overwrite: bool = False, resume: bool = False) -> Iterator[RunFolder]:
     """A folder to write a run into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
 
     An earlier run without a single estimate is replaced, any other one with `overwrite`. What a run did not write is never
-    removed.
+    removed. To `resume` a run, all of it stays.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is
-            not set.
+            not set; no run to resume.
         OutputError: it cannot be created or cleared.
     """
     run = RunFolder(Path(folder))
+    if resume:
+        if not run.checkpoint.is_file():
+            raise InputError(
+                "the folder of a run that did not come to its end, with a checkpoint",
+                f"none in {run.path}",
+                "start the run without --resume; a checkpoint is written every few seconds",
+            )
+        with locked_folder(run.path, "boxplus lio") as lock:
+            lock.keep_file = False
+            yield run
+        return
     with output_folder(
         run.path, "boxplus lio", run.own_files, run.own_folders, overwrite=overwrite, holds_results=run.holds_estimates
     ):

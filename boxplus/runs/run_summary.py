@@ -116,6 +116,7 @@ class RunSummary(_Part):
     state: State
     error: str | None = None
     process: int = Field(description="process id of the run")
+    resumed: int = Field(0, description="how often the run went on after it had been killed or interrupted")
     started: datetime
     updated: datetime
     recording: RecordingFacts

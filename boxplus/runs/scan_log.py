@@ -43,18 +43,24 @@ SCAN_COLUMNS = ("time_ns", "status", *_NUMBERS, *_TEXTS)
 class ScanLogWriter:
     """Appends one row per estimate to `scans.csv`; each row reaches the operating system at once.
 
+    Args:
+        path: the file.
+        go_on: after the rows of an earlier writer.
+
     Raises:
         OutputError: the file cannot be created.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, go_on: bool = False) -> None:
         self._path = path
-        self._size = 0
         try:
-            self._file: int | None = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0), 0o644)
+            flags = os.O_WRONLY | os.O_CREAT | (0 if go_on else os.O_TRUNC) | getattr(os, "O_BINARY", 0)
+            self._file: int | None = os.open(path, flags, 0o644)
+            self._size = os.lseek(self._file, 0, os.SEEK_END)
         except OSError as error:
             raise output_error(path, error) from error
-        self._write([*SCAN_COLUMNS])
+        if not go_on:
+            self._write([*SCAN_COLUMNS])
 
     def append(self, estimate: Estimate) -> None:
         """Write one row.

@@ -114,8 +114,8 @@ class IkdTree:
             self.build(points)
 
     @changes
-    def build(self, points: ArrayLike) -> InsertReport:
-        """Replace all contents by `points`, (N, 3) [m], in a balanced tree; no downsampling.
+    def build(self, points: ArrayLike, *, origin: ArrayLike | None = None) -> InsertReport:
+        """Replace all contents by `points`, (N, 3) [m], in a balanced tree; no downsampling. `origin` (3,) [m]: of another tree.
 
         Points that are not finite or too far from the origin are rejected and counted.
 
@@ -124,7 +124,9 @@ class IkdTree:
         """
         world = as_points(points, "points")
         self._rebuilder.cancel(self._pool)
-        self._placed = False
+        self._placed = origin is not None
+        if origin is not None:
+            self.origin = as_corner(origin, "origin")
         relative, not_finite, too_far = self._to_relative(world)
         self._pool = build_pool(np.pad(relative, ((0, 0), (0, 1))))
         self._job["live"], self._job["queued"], self._job["depth"] = len(relative), 0, 0

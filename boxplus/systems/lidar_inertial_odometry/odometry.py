@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ _BLIND_PASSES = 3
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
+_NOT_IN_SNAPSHOT = ("config", "map", "_voxel_filter", "_density")
 
 
 class LidarInertialOdometry:
@@ -125,6 +127,20 @@ class LidarInertialOdometry:
         if self.config.extrinsic_estimation != "off" or self.config.T_imu_lidar is None:
             return None
         return np.array(self.config.T_imu_lidar)
+
+    def snapshot(self) -> dict[str, object]:
+        """Everything the next estimates depend on, but for the settings: to be written at once, as it goes on changing."""
+        state = {name: value for name, value in vars(self).items() if name not in _NOT_IN_SNAPSHOT}
+        return state | {"map": (self.map.points(), self.map.origin), "scan_voxel": self._voxel_filter.voxel_size}
+
+    def restore(self, state: dict[str, object]) -> None:
+        """Go on where `snapshot` was taken, in an odometry of the same settings that has not begun."""
+        for name, value in state.items():
+            if name not in ("map", "scan_voxel"):
+                setattr(self, name, value)
+        points, origin = cast(tuple[NDArray[np.float64], NDArray[np.float64]], state["map"])
+        self.map.build(points, origin=origin if len(points) else None)
+        self._voxel_filter.voxel_size = cast(float, state["scan_voxel"])
 
     def _advance(self, frames: list[Frame]) -> list[Estimate]:
         estimates: list[Estimate] = []

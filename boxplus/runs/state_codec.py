@@ -1,0 +1,148 @@
+"""Objects of boxplus as a file of arrays and JSON, and back: what a checkpoint is made of.
+
+Reading one runs no code of the file, as unpickling would: only classes of boxplus are made, without calling anything of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from array import array
+from collections import Counter, deque
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from boxplus.errors import InputError
+from boxplus.formats.output import atomic_file
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+def write_state(path: Path, state: dict[str, Any]) -> None:
+    """Write `state` in one step: numbers, text, containers, arrays, and objects of boxplus made of these.
+
+    What runs on another thread becomes None: whoever began it has to begin it again.
+
+    Raises:
+        OutputError: the disk is full; the file before stays.
+        TypeError: something else is in it.
+    """
+    encoder = _Encoder()
+    tree = encoder.encode(state)
+    text = np.frombuffer(json.dumps(tree).encode(), np.uint8)
+    with atomic_file(path) as file:
+        arrays: dict[str, Any] = {f"a{k}": values for k, values in enumerate(encoder.arrays)}
+        np.savez(file, tree=text, **arrays)
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """What `write_state` wrote.
+
+    Raises:
+        InputError: missing, damaged, or of another version of boxplus.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            tree = json.loads(stored["tree"].tobytes())
+            found = _Decoder([stored[f"a{k}"] for k in range(len(stored.files) - 1)]).decode(tree)
+    except Exception as error:
+        raise InputError(
+            "the checkpoint of a run, of this version of boxplus",
+            f"{path}: {error or type(error).__name__}",
+            "start the run anew",
+        ) from error
+    if not isinstance(found, dict):
+        raise InputError("the checkpoint of a run", f"something else in {path}", "start the run anew")
+    return found
+
+
+class _Encoder:
+    def __init__(self) -> None:
+        self.arrays: list[NDArray[Any]] = []
+        self._known: dict[int, int] = {}
+        self._alive: list[object] = []  # an id is only its object's while that lives
+
+    def encode(self, value: Any) -> Any:
+        if isinstance(value, np.generic):
+            value = value.item()
+        if isinstance(value, _PLAIN):
+            return value
+        if isinstance(value, Executor | Future):
+            return None
+        if isinstance(value, np.ndarray):
+            self.arrays.append(value)
+            return {"array": len(self.arrays) - 1}
+        if isinstance(value, list):
+            return [self.encode(entry) for entry in value]
+        if isinstance(value, tuple | set):
+            return {type(value).__name__: [self.encode(entry) for entry in value]}
+        if isinstance(value, deque):
+            return {"deque": [self.encode(entry) for entry in value], "maxlen": value.maxlen}
+        if isinstance(value, array):
+            return {"numbers": value.tolist(), "typecode": value.typecode}
+        if isinstance(value, dict):
+            kind = "counter" if isinstance(value, Counter) else "dict"
+            return {kind: [[self.encode(key), self.encode(entry)] for key, entry in value.items()]}
+        return self._encode_object(value)
+
+    def _encode_object(self, value: Any) -> Any:
+        kind = type(value)
+        if not kind.__module__.startswith("boxplus."):
+            raise TypeError(f"a checkpoint holds no {kind.__module__}.{kind.__qualname__}")
+        if id(value) in self._known:
+            return {"same": self._known[id(value)]}
+        self._known[id(value)] = len(self._known)
+        self._alive.append(value)
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        if isinstance(value, BaseModel):
+            return {"model": name, "json": value.model_dump_json()}
+        slots = [slot for base in kind.__mro__ for slot in getattr(base, "__slots__", ()) if hasattr(value, slot)]
+        names = [*getattr(value, "__dict__", {}), *slots]
+        return {"object": name, "attributes": {attribute: self.encode(getattr(value, attribute)) for attribute in names}}
+
+
+class _Decoder:
+    def __init__(self, arrays: list[NDArray[Any]]) -> None:
+        self._arrays = arrays
+        self._objects: list[Any] = []
+
+    def decode(self, tree: Any) -> Any:
+        if isinstance(tree, _PLAIN):
+            return tree
+        if isinstance(tree, list):
+            return [self.decode(entry) for entry in tree]
+        kind, content = next(iter(tree.items()))
+        if kind == "array":
+            return self._arrays[content]
+        if kind == "same":
+            return self._objects[content]
+        if kind in ("model", "object"):
+            return self._decode_object(content, tree)
+        if kind == "numbers":
+            return array(tree["typecode"], content)
+        if kind in ("dict", "counter"):
+            pairs = {self.decode(key): self.decode(entry) for key, entry in content}
+            return Counter(pairs) if kind == "counter" else pairs
+        entries = [self.decode(entry) for entry in content]
+        return deque(entries, tree["maxlen"]) if kind == "deque" else {"tuple": tuple, "set": set}[kind](entries)
+
+    def _decode_object(self, name: str, tree: Any) -> Any:
+        module, _, qualified = name.partition(":")
+        if not module.startswith("boxplus.") or not qualified.isidentifier():
+            raise TypeError(f"{name} is no class of boxplus")
+        kind = getattr(importlib.import_module(module), qualified)
+        if not isinstance(kind, type) or kind.__module__ != module:
+            raise TypeError(f"{name} is no class of boxplus")
+        if issubclass(kind, BaseModel):
+            self._objects.append(kind.model_validate_json(tree["json"]))
+            return self._objects[-1]
+        made = object.__new__(kind)
+        self._objects.append(made)
+        for attribute, value in tree["attributes"].items():
+            object.__setattr__(made, attribute, self.decode(value))
+        return made
