@@ -7,9 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.group import Group
 from boxplus.optimization.variables import VariableRows, Variables
+
+_POINTS = (Euclidean(2), Euclidean(3))
 
 
 class Layout:
@@ -79,7 +82,7 @@ class Layout:
     def largest_of_kind(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
         """For every tangent the largest entry among those of its kind, the same axis of all variables of the block.
 
-        Entries of one kind have one unit and compare, whatever the units of the problem.
+        Entries of one kind have one unit and compare, whatever the units of the problem. The axes of points are of one kind.
 
         Args:
             diagonal: (dof,) not negative.
@@ -90,7 +93,7 @@ class Layout:
             if len(free):
                 own = slice(int(self.start[free[0]]), int(self.start[free[-1] + 1]))
                 kinds = diagonal[own].reshape(len(free), tangent.dof)
-                largest[own].reshape(kinds.shape)[:] = kinds.max(axis=0)
+                largest[own].reshape(kinds.shape)[:] = kinds.max() if tangent in _POINTS else kinds.max(axis=0)
         return largest
 
     def describe(self, number: int) -> str:

@@ -168,3 +168,10 @@ def test_the_origin_of_the_world_does_not_matter(format):
     assert other.solution.cost == pytest.approx(one.solution.cost, rel=1e-6)
     assert_allclose(other.reconstruction.points - shift, one.reconstruction.points, atol=1e-5)
     assert_allclose(other.depth.ratio, one.depth.ratio, rtol=1e-5)
+
+
+def test_a_file_with_far_points_converges(shared_data):
+    """Far points creep: damped by axis instead of alike along all axes, they take more than the 100 steps there are."""
+    result = adjust_bundle(read_bal(shared_data / "bal" / "ladybug-49-7776-pre.txt.bz2"))
+    assert result.solution.status == "converged"
+    assert result.solution.cost <= 1.33442404e4 and len(result.cheirality.dropped) == 9
