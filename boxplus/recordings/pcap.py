@@ -86,6 +86,17 @@ def _recording(
 # --- Ouster ---
 
 
+def _ouster_errors() -> tuple[type[Exception], ...]:
+    """What ouster-sdk raises on metadata that it cannot use, which derives from no built-in class."""
+    import importlib
+
+    try:
+        found: type[Exception] = importlib.import_module("ouster.sdk.open_source").SourceURLException
+    except (ImportError, AttributeError):  # other versions raise the built-in ones
+        return ()
+    return (found,)
+
+
 def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recording:
     core = _decoder("ouster.sdk.core", "ouster-sdk")
     sdk = _decoder("ouster.sdk", "ouster-sdk")
@@ -103,9 +114,12 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
             counts[kind] += 1
             first_ns = first_ns or int(packet.host_timestamp)
             last_ns = int(packet.host_timestamp)
-    except READ_ERRORS as error:
+    except READ_ERRORS + _ouster_errors() as error:
+        reason = " ".join(str(error).split())
         raise RecordingError(
-            "an Ouster capture with its metadata", f"{path.name}: {error}", f"check that {metadata.name} belongs to it"
+            "an Ouster capture with its metadata",
+            f"{path.name}: {reason}",
+            f"check that {metadata.name} is whole and belongs to it",
         ) from error
     check_start(options, (last_ns - first_ns) * 1e-9)
     T_sensor_imu = np.array(sensor.imu_to_sensor_transform, dtype=np.float64)

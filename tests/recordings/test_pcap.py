@@ -3,13 +3,14 @@
 import importlib.util
 import struct
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from boxplus.errors import RecordingError
-from boxplus.recordings import open_recording
+from boxplus.recordings import open_recording, pcap
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
@@ -32,6 +33,31 @@ def test_ouster_capture(shared_data: Path) -> None:
     assert 9.0 < np.median(norm) < 11.5
     assert T_imu_lidar is not None
     np.testing.assert_allclose(T_imu_lidar[:3, 3], [-0.006253, 0.011775, -0.007645], atol=1e-9)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ouster") is None, reason="ouster-sdk (extra 'sensors') is not installed")
+@pytest.mark.parametrize("damaged", [b"", b"{}", b"3", b'{"prod_line": "OS', b"\xff\xfe{}"])
+def test_damaged_metadata_is_refused(shared_data: Path, tmp_path: Path, damaged: bytes) -> None:
+    """The decoder raises a class of its own for it."""
+    (tmp_path / "drive.pcap").write_bytes((shared_data / OUSTER).read_bytes())
+    (tmp_path / "drive.json").write_bytes(damaged)
+    with pytest.raises(
+        RecordingError, match=r"an Ouster capture with its metadata – got drive.pcap: .* check that drive.json is whole"
+    ):
+        open_recording(tmp_path / "drive.pcap")
+
+
+def test_errors_of_the_decoder_are_known_by_what_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    class SourceURLException(Exception):
+        pass
+
+    module = types.ModuleType("ouster.sdk.open_source")
+    for name in ("ouster", "ouster.sdk"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    monkeypatch.setitem(sys.modules, "ouster.sdk.open_source", module)
+    assert pcap._ouster_errors() == ()
+    module.SourceURLException = SourceURLException  # type: ignore[attr-defined]
+    assert pcap._ouster_errors() == (SourceURLException,)
 
 
 @pytest.mark.skipif(
