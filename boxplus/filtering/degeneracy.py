@@ -1,10 +1,18 @@
 """Directions of the pose that a scan does not determine, and the update without them.
 
-The information of m points about the pose is Σ h hᵀ / r, h = [s × C, u] (SPEC.md 9.7). Divided by r, by m, and with
-rotations measured in units of the points' root-mean-square lever arm, its eigenvalues say which share of the points
-measures a direction: about 1/3 each in a well-shaped room, 0 along a perfect corridor. Noise in the normals alone makes
-that share a few thousandths, so an eigenvalue below the threshold is noise, not a measurement, however many points there
-are. In such a direction the update is projected out and the filter keeps its prediction.
+The information of points about the pose is S = Σ w h hᵀ, h = [s × C, u] with C = Rᵀu (SPEC.md 9.7). The normals u come from
+noisy points of the map. A row is linear in its normal, h = M u, so noise of the normals alone gives a direction the information
+
+    N = Σ w M Cov(u) Mᵀ,      E[S] = S of the true normals + N
+
+Along a corridor S is N, however many points there are. A direction v is measured when vᵀS v exceeds vᵀN v by a factor, the
+threshold: the directions are those of the generalised eigenvalue problem S v = λ N v, and λ depends neither on the units of
+rotation and translation nor on the number of points. In a weak direction the update is projected out and the filter keeps
+its prediction. (Errors in variables: Fuller, Measurement Error Models, 1987, section 2.2; for degeneracy of a registration by
+eigenvalues see Zhang, Kaess, Singh, ICRA 2016.)
+
+S and N are taken over planes whose normals are known to a few degrees (`plane_information`): planes across an edge are as
+good as noise for the question, and would hide how well the others measure.
 """
 
 from __future__ import annotations
@@ -14,46 +22,63 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+# No normal is known better than this [rad]: edges of the world are not that straight, and N must not vanish.
+_LEAST_TILT = 1e-3
+
 
 @dataclass(frozen=True, slots=True)
 class PoseDirections:
-    """Eigen-directions of a scan's information about the pose.
+    """Directions of the pose, by how far a scan's information about them exceeds what noise would give.
 
     Attributes:
-        shares: (6,) ascending, share of the points that measures each direction.
-        vectors: (6, 6), column i is the unit direction of `shares[i]`: rotation (IMU axes, times `lever_arm`), then position.
+        ratios: (6,) ascending, information over that from noise of the normals alone; 1 is noise.
+        vectors: (6, 6), column i is the unit direction of `ratios[i]`: rotation (IMU axes, times `lever_arm`), then position.
         lever_arm: root mean square distance of the points from the IMU [m].
-        weak: (6,) bool, share below the threshold.
+        weak: (6,) bool, ratio below the threshold.
+        basis: (6, 6), the same directions over [θ, p], such that basisᵀ N basis = I.
     """
 
-    shares: NDArray[np.float64]
+    ratios: NDArray[np.float64]
     vectors: NDArray[np.float64]
     lever_arm: float
     weak: NDArray[np.bool_]
+    basis: NDArray[np.float64]
 
 
-def pose_directions(A: NDArray[np.float64], lever_arm: float, threshold: float) -> PoseDirections:
-    """Analyse the pose block of A (12, 12), the information of a scan.
+def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: float, threshold: float) -> PoseDirections:
+    """The directions of the pose that a scan's information distinguishes.
 
-    The three position rows of A carry unit normals, so their trace is Σ 1/r: the scale is taken from A itself.
+    Args:
+        S: (6, 6) information about the pose [θ, p].
+        N: (6, 6) what noise of the normals alone would contribute to it.
+        lever_arm: root mean square distance of the points from the IMU [m].
+        threshold: least ratio of S to N of a measured direction.
     """
     scale = np.array([1.0 / lever_arm] * 3 + [1.0] * 3)
-    total = max(float(np.trace(A[3:6, 3:6])), np.finfo(float).tiny)
-    shares, vectors = np.linalg.eigh(A[:6, :6] * np.outer(scale, scale) / total)
-    return PoseDirections(shares, vectors, lever_arm, shares < threshold)
+    scales = np.outer(scale, scale)
+    # The position rows carry unit normals: their trace is the sum of the weights.
+    floor = max(_LEAST_TILT**2 * float(np.trace(S[3:6, 3:6])), np.finfo(float).tiny)
+    root = np.linalg.cholesky(N * scales + floor * np.eye(6))
+    whitening = np.linalg.inv(root)
+    ratios, rotated = np.linalg.eigh(whitening @ (S * scales) @ whitening.T)
+    scaled = whitening.T @ rotated
+    vectors = scaled / np.linalg.norm(scaled, axis=0)
+    return PoseDirections(ratios, vectors, lever_arm, ratios < threshold, scale[:, None] * scaled)
 
 
 def project_out_weak(
     A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A and b without what they claim about the weak directions of the pose."""
+    """A and b without what they claim about the weak directions of the pose; what they say of the others stays whole.
+
+    The projector Π = V_s V_sᵀ N maps weak directions to zero and leaves the others, which are conjugate to them in N: ΠᵀAΠ, Πᵀb.
+    """
     if not directions.weak.any():
         return A, b
-    strong = directions.vectors[:, ~directions.weak]
-    scale = np.array([directions.lever_arm] * 3 + [1.0] * 3)
+    strong = ~directions.weak
+    dual = np.linalg.inv(directions.basis)  # Vᵀ N
     projector = np.eye(12)
-    # In scaled coordinates the projector is V Vᵀ; information transforms with the inverse scale.
-    projector[:6, :6] = (strong @ strong.T) * np.outer(1.0 / scale, scale)
+    projector[:6, :6] = directions.basis[:, strong] @ dual[strong]
     return projector.T @ A @ projector, projector.T @ b
 
 
@@ -65,8 +90,7 @@ def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: Pose
 
 def strong_covariance(A: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
     """(6, 6) covariance of the pose from A alone, zero along the weak directions."""
-    scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
-    strong = directions.vectors[:, ~directions.weak]
-    reduced = strong.T @ (A[:6, :6] * np.outer(scale, scale)) @ strong
-    covariance: NDArray[np.float64] = np.outer(scale, scale) * (strong @ np.linalg.solve(reduced, strong.T))
+    strong = directions.basis[:, ~directions.weak]
+    reduced = strong.T @ A[:6, :6] @ strong
+    covariance: NDArray[np.float64] = strong @ np.linalg.solve(reduced, strong.T)
     return covariance

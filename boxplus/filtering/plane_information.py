@@ -16,6 +16,8 @@ MEASURED_DOF = 12
 # Variance of a map point as far as the tilt of a plane goes [m²]: five points of one or two scan lines are not independent,
 # and what they say beside these lines is worth less than their noise suggests.
 _TILT_VARIANCE = 0.1**2
+# Variance of a plane's normal [rad²] beyond which it counts less and less for the question which directions are measured.
+_SURE_TILT = 0.1**2
 
 
 @kernel(inline=True)
@@ -44,6 +46,47 @@ def _row(
         h[9], h[10], h[11] = cx, cy, cz
 
 
+@kernel(inline=True)
+def _add_criterion(
+    x: NDArray[np.float64],
+    imu: tuple[float, float, float],
+    plane: NDArray[np.float64],
+    weight: float,
+    h: NDArray[np.float64],
+    row: NDArray[np.float64],
+    signal: NDArray[np.float64],
+    noise: NDArray[np.float64],
+) -> None:
+    """signal += w h hᵀ, noise += w M Cov(u) Mᵀ of one plane, M u = [s × Rᵀu, u] (`filtering.degeneracy`).
+
+    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² of the plane's own points about it: as large as the noise really is,
+    whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian. A plane across
+    an edge, of which this makes nothing but noise, does not count.
+    """
+    sx, sy, sz = imu
+    tilt = 0.0
+    for first in (5, 9):
+        tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
+    tilt *= plane[4]
+    weight /= 1.0 + tilt / _SURE_TILT
+    for first in (5, 9):
+        gx, gy, gz = plane[first], plane[first + 1], plane[first + 2]
+        factor = weight * plane[4] / (1.0 + plane[4] * (gx * gx + gy * gy + gz * gz))
+        cx = x[R] * gx + x[R + 3] * gy + x[R + 6] * gz
+        cy = x[R + 1] * gx + x[R + 4] * gy + x[R + 7] * gz
+        cz = x[R + 2] * gx + x[R + 5] * gy + x[R + 8] * gz
+        row[0], row[1], row[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
+        row[3], row[4], row[5] = gx, gy, gz
+        for i in range(6):
+            wh = factor * row[i]
+            for j in range(i, 6):
+                noise[i, j] += wh * row[j]
+    for i in range(6):
+        wh = weight * h[i]
+        for j in range(i, 6):
+            signal[i, j] += wh * h[j]
+
+
 @kernel
 def accumulate_planes(
     x: NDArray[np.float64],
@@ -53,11 +96,14 @@ def accumulate_planes(
     range_variance: float,
     map_variance: float,
     with_extrinsic: bool,
+    with_criterion: bool,
     A: NDArray[np.float64],
     b: NDArray[np.float64],
+    signal: NDArray[np.float64],
+    noise: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
-    """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L].
+    """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L], and to what tells weak directions of the pose.
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
@@ -66,9 +112,13 @@ def accumulate_planes(
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
         A, b: (12, 12), (12,), added to; the upper triangle of A is filled only.
+        with_criterion: whether `signal` and `noise` are wanted.
+        signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
+            alone would give; the upper triangles are filled only.
         sums: (2,) += [used points, Σ z²].
     """
     h = np.empty(MEASURED_DOF)
+    row = np.empty(6)
     size = MEASURED_DOF if with_extrinsic else 6
     for n in range(p_lidar.shape[0]):
         if fate[n] != USED and fate[n] != GATED:
@@ -98,5 +148,7 @@ def accumulate_planes(
             b[i] += wh * z
             for j in range(i, size):
                 A[i, j] += wh * h[j]
+        if with_criterion:
+            _add_criterion(x, (sx, sy, sz), plane, weight, h, row, signal, noise)
         sums[0] += 1.0
         sums[1] += z * z

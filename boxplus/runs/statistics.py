@@ -149,7 +149,7 @@ class RunStatistics:
                     text = "had too few points on known planes for an update: the motion is predicted from the IMU alone"
                 else:
                     text = "; ".join(
-                        f"{d} ({d.information_share:.2%} of the points' information)" for d in estimate.weak_directions
+                        f"{d} ({d.information_ratio:.1f} times the information of noise)" for d in estimate.weak_directions
                     )
                     text = f"was not determined by the LiDAR in its {text}"
                 self._weak.append(WeakInterval(begin_s=since_s, end_s=since_s, status=estimate.status, scans=1, text=text))

@@ -19,7 +19,9 @@ def _accumulate(
     x: NavState, points: np.ndarray, planes: np.ndarray, fate: np.ndarray, with_extrinsic: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     A, b, sums = np.zeros((12, 12)), np.zeros(12), np.zeros(2)
-    accumulate_planes(x.pack(), points, planes, fate, 4e-4, 4e-4, with_extrinsic, A, b, sums)
+    accumulate_planes(
+        x.pack(), points, planes, fate, 4e-4, 4e-4, with_extrinsic, True, A, b, np.zeros((6, 6)), np.zeros((6, 6)), sums
+    )
     return A + np.triu(A, 1).T, b, sums
 
 
@@ -136,3 +138,30 @@ def test_a_point_weighs_less_the_less_is_known() -> None:
     assert certain > weight(0.2, 0.0, 0.0) > 0
     assert certain > weight(0.0, 1e-2, 0.0) > 0
     assert certain > weight(0.0, 0.0, 5.0) > 0
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_the_noise_of_the_normals_is_what_tilted_normals_add(seed: int) -> None:
+    """N against the scatter of the rows of A when each normal is drawn from its own covariance, a point at a time."""
+    random = np.random.default_rng(seed)
+    x, point = random_state(random), (8.0 * random.normal(size=(1, 3))).astype(np.float32)
+    plane = _planes_at(x, point, np.zeros(1), random)
+    _, _, frame = np.linalg.svd(plane[:, :3])
+    g = frame[1:] * random.uniform(0.5, 2.0, (2, 1))
+    centroid = _world(x, point)[0]
+    for first, vector in zip((5, 9), g, strict=True):
+        plane[0, first : first + 3], plane[0, first + 3] = vector, vector @ centroid
+    A, (S, N) = np.zeros((12, 12)), np.zeros((2, 6, 6))
+    accumulate_planes(x.pack(), point, plane, np.zeros(1, np.uint8), 4e-4, 4e-4, False, True, A, np.zeros(12), S, N, np.zeros(2))
+    weight = S[3:6, 3:6].trace()
+    assert np.allclose(S / weight, A[:6, :6] / A[3:6, 3:6].trace())
+    assert weight == pytest.approx(A[3:6, 3:6].trace() / (1.0 + 1e-4 * np.sum(g**2) / 0.01))
+    s = x.R_imu_lidar @ point[0].astype(np.float64) + x.p_imu_lidar
+    signs = np.array([[a, b] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])  # four draws of exact mean and covariance
+    expected = np.zeros((6, 6))
+    for tilt in 0.01 * signs @ g:  # the plane's own points lie 1 cm off it
+        row = np.concatenate([np.cross(s, x.R_world_imu.T @ tilt), tilt])
+        expected += weight * np.outer(row, row) / len(signs)
+    found = N + np.triu(N, 1).T
+    assert np.allclose(found, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())

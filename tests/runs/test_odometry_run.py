@@ -272,9 +272,8 @@ def test_gaps_are_found(tmp_path: Path) -> None:
 
 
 def test_corridor_says_what_was_not_measured(tmp_path: Path) -> None:
-    config = load_run_config(settings=["weak_threshold=0.1"])
-    summary = run_odometry(as_recording(simulate("corridor", duration_s=6.0, lidar=LIDAR)), tmp_path / "out", config)
-    assert summary.status["weak"] > 0.8 * summary.scans
+    summary = run_odometry(as_recording(simulate("corridor", duration_s=6.0, lidar=LIDAR)), tmp_path / "out")
+    assert summary.status["weak"] > 0.5 * summary.scans
     text = summary.warnings[0].text
     assert re.match(rf"{summary.status['weak']} of {summary.scans} scans are weak; the longest stretch, from ", text)
     assert "was not determined by the LiDAR in its " in text

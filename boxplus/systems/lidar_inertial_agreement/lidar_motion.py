@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, pose_directions, strong_step
+from boxplus.filtering.degeneracy import PoseDirections, strong_step
 from boxplus.filtering.nav_state import TANGENT, NavState, P, R, boxplus_into
 from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
@@ -322,7 +322,7 @@ def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConf
         information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
         if information.used < config.min_points:
             return None
-        directions = pose_directions(information.A, measurement.lever_arm, config.weak_threshold)
+        directions = information.directions
         delta[:6] = strong_step(information.A, information.b, directions)
         boxplus_into(x, delta, x)
         if np.abs(delta).max() < _SETTLED:
@@ -333,7 +333,8 @@ def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConf
 def _honest(A: NDArray[np.float64], directions: PoseDirections, misfit: float) -> NDArray[np.float64]:
     """The information (6, 6) of a registration, nothing along weak directions, and nowhere more than floor and misfit allow."""
     scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
-    strong = directions.vectors[:, ~directions.weak]
+    # Orthonormal, in units of the lever arm, and across all that is weak.
+    strong = np.linalg.qr(directions.vectors[:, directions.weak], mode="complete")[0][:, directions.weak.sum() :]
     covariance = np.linalg.inv(strong.T @ (A * np.outer(scale, scale)) @ strong)
     # The floor is a variance of its own, added in the coordinates of the strong directions.
     floor = strong.T @ np.diag((max(misfit / _GOOD, 1.0) * _SIGMA_FLOOR / scale) ** 2) @ strong

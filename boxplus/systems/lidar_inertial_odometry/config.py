@@ -54,7 +54,9 @@ class LioConfig(BaseModel):
         0.1, ge=0, lt=1, description="with less than this share of a scan's points on the map, three scans in a row, it is lost"
     )
     weak_threshold: float = Field(
-        0.004, ge=0, lt=1, description="a direction with less than this share of the points' information is only predicted"
+        2.5,
+        ge=0,
+        description="a direction is only predicted when the points say less about it than so many times what noise would",
     )
     threads: int = Field(1, ge=1, description="threads that share the work of a scan; the result does not depend on it")
 

@@ -24,12 +24,12 @@ class WeakDirection:
     Attributes:
         rotation_imu: (3,) part of the unit direction that turns, about the IMU's axes (scaled by `lever_arm`).
         translation_world: (3,) part that moves, along the world's axes.
-        information_share: information along it, as a fraction of what all points would give if every one measured it.
+        information_ratio: information along it over what noise of the planes' normals alone would give; 1 is noise.
     """
 
     rotation_imu: NDArray[np.float64]
     translation_world: NDArray[np.float64]
-    information_share: float
+    information_ratio: float
 
     def __str__(self) -> str:
         parts = []

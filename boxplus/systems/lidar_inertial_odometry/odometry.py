@@ -360,7 +360,7 @@ class _Outcome:
     def weak_directions(self) -> tuple[WeakDirection, ...]:
         directions = self.posterior.last.directions
         return tuple(
-            WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.shares[i]))
+            WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.ratios[i]))
             for i in np.flatnonzero(directions.weak if self.taken else [])
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
-from boxplus.filtering.degeneracy import pose_directions
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions
 from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
 from boxplus.filtering.plane_information import (
@@ -69,6 +69,7 @@ class PlaneMeasurement:
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
         self._matched_at = np.zeros(PACKED)
+        self._directions: PoseDirections
         # Points that share map neighbours share their error: finer voxels give more points, not more information.
         self._range_variance = (config.range_sigma * max(1.0, _INDEPENDENT / voxel)) ** 2
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
@@ -76,10 +77,12 @@ class PlaneMeasurement:
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
-        if rematch or not self._matched:
+        matches = rematch or not self._matched
+        if matches:
             self._match(x)
         A = np.zeros((MEASURED_DOF, MEASURED_DOF))
         b = np.zeros(MEASURED_DOF)
+        signal, noise = np.zeros((2, 6, 6))
         sums = np.zeros(2)
         config = self._config
         accumulate_planes(
@@ -90,15 +93,20 @@ class PlaneMeasurement:
             self._range_variance,
             config.map_sigma**2,
             self._with_extrinsic,
+            matches,
             A,
             b,
+            signal,
+            noise,
             sums,
         )
         A += np.triu(A, 1).T
+        if matches:  # in between the planes stay, and what they can tell
+            signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
+            self._directions = pose_directions(signal, noise, self.lever_arm, config.weak_threshold)
         used = int(sums[0])
-        directions = pose_directions(A, self.lever_arm, config.weak_threshold)
         rms = float(np.sqrt(sums[1] / used)) if used else 0.0
-        return Information(A * self._weight, b * self._weight, directions, used, rms)
+        return Information(A * self._weight, b * self._weight, self._directions, used, rms)
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""

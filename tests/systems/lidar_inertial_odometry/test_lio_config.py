@@ -79,7 +79,7 @@ def test_a_box_that_would_oscillate_is_refused() -> None:
         {"gyro_noise": 0.0},
         {"threads": 0},
         {"min_points": 5},
-        {"weak_threshold": 1.0},
+        {"weak_threshold": -1.0},
         {"extrinsic_estimation": "maybe"},
         {"start_duration": 0.0},
     ],
