@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -139,10 +139,14 @@ def graduate(
     final = last.model_copy(update={"max_iterations": 0}) if widths.is_stopped else last
     solution = problem.solve(final, start=widths.solution, callback=callback)
     squares = {group.name: group.squares(solution.values) for group in chosen}
+    inliers = {name: s <= widths.thresholds[name] ** 2 for name, s in squares.items()}
+    if levels:  # the last width ends at the minimum
+        within = sum(int(np.count_nonzero(own)) for own in inliers.values())
+        levels[-1] = replace(levels[-1], cost=solution.cost, inliers=within)
     return GraduatedSolution(
         solution,
         {group.name: group.loss_weights(solution.values) for group in chosen},
-        {name: s <= widths.thresholds[name] ** 2 for name, s in squares.items()},
+        inliers,
         widths.thresholds,
         tuple(levels),
         {g.name: inlier_report(squares[g.name], g.residual.dim, widths.thresholds[g.name]) for g in chosen},

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.formats.pose_graph import PoseGraph
 from boxplus.optimization.solution import Solution
-from boxplus.systems.pose_graph.start import components, held_poses
+from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start
 
 _DOUBTFUL, _POOR, _CONTRADICTION = 2.6, 3.5, 6.0  # standard deviations of χ² above its mean
 _LEAST = 1.1  # times its mean: noise is never so well known that less contradicts it
 _SAME = 1e-3  # relative difference up to which two minima are one
-_WEAK = 1e-10  # pivot, scaled to a unit diagonal, below which an information matrix says nothing along some direction
+_WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an information matrix says nothing along some direction
 _LISTED = 5
 
 
@@ -60,10 +60,10 @@ class Fit:
         return self.excess > _CONTRADICTION and self.chi2 > _LEAST * self.dof
 
     @classmethod
-    def of(cls, graph: PoseGraph, squared: NDArray[np.float64], counted: NDArray[np.bool_]) -> Fit:
-        """Of the edges `counted` (m,), of which every one adds `squared` (m,) to χ²."""
+    def of(cls, graph: PoseGraph, squared: NDArray[np.float64], counted: NDArray[np.bool_], held: int) -> Fit:
+        """Of the edges `counted` (m,), of which every one adds `squared` (m,) to χ², with `held` poses held."""
         d = graph.information.shape[1]
-        free = len(graph.ids) - len(held_poses(graph))
+        free = len(graph.ids) - held
         return cls(float(squared[counted].sum()), max(d * int(np.count_nonzero(counted)) - d * free, 0))
 
 
@@ -143,26 +143,19 @@ def undetermined_notes(graph: PoseGraph, solution: Solution) -> list[str]:
 
 @kernel
 def _mark_singular(matrices: NDArray[np.float64], singular: NDArray[np.bool_]) -> None:
-    """Cholesky of every matrix scaled to a unit diagonal; singular where a pivot vanishes."""
+    """Elimination of every matrix; singular where a pivot vanishes against its diagonal entry."""
     dim = matrices.shape[1]
     work = np.empty((dim, dim))
     for m in range(matrices.shape[0]):
-        A = matrices[m]
+        work[:] = matrices[m]
         singular[m] = False
-        for i in range(dim):
-            if A[i, i] <= 0.0:
-                singular[m] = True
-        if singular[m]:
-            continue
-        for i in range(dim):
-            for j in range(i + 1):
-                work[i, j] = A[i, j] / math.sqrt(A[i, i] * A[j, j])
         for k in range(dim):
             pivot = work[k, k]
-            if pivot < _WEAK:
+            if not pivot > _WEAK * matrices[m, k, k]:
                 singular[m] = True
                 break
             for i in range(k + 1, dim):
-                factor = work[i, k] / pivot
-                for j in range(k + 1, i + 1):
-                    work[i, j] -= factor * work[j, k]
+                if work[i, k] != 0.0:
+                    factor = work[i, k] / pivot
+                    for j in range(k + 1, i + 1):
+                        work[i, j] -= factor * work[j, k]

@@ -148,15 +148,15 @@ def optimize_pose_graph(
         solution = problem.solve(options, start=[known[chosen]], callback=callback)
         minima = {chosen: 2.0 * solution.cost}
         squared = squared_errors(residual, graph, solution.values[0])
-        first = _fit(graph, squared, None, config)
+        first = _fit(graph, squared, None, config, len(held))
         if loss is None and config.start == "auto" and first.is_doubtful:
             chosen, solution = starts.further(problem, chosen, solution, known, minima, first.enough)
             squared = squared_errors(residual, graph, solution.values[0])
-        weights = problem.groups[0].loss_weights(solution.values)
+        weights = np.ones(len(squared)) if loss is None else problem.groups[0].loss_weights(solution.values)
     solved = time.perf_counter()
     poses_end = solution.values[0]
     squared_start = squared_errors(residual, graph, known[chosen])
-    fit = _fit(graph, squared, weights, config)
+    fit = _fit(graph, squared, weights, config, len(held))
     certificate = certify(replace(graph, poses=poses_end)) if config.certify else None
     notes = [*silent_notes(whole, silent), *structure_notes(graph, held), *solution.notes, *undetermined_notes(graph, solution)]
     if fit.is_poor and verdict is None:
@@ -214,10 +214,12 @@ def _doubt(fit: Fit, verdict: LoopVerdict | None, certificate: Certificate | Non
     return certificate.sentence if certificate is not None and not certificate.is_certified else None
 
 
-def _fit(graph: PoseGraph, squared: NDArray[np.float64], weights: NDArray[np.float64] | None, config: PoseGraphConfig) -> Fit:
+def _fit(
+    graph: PoseGraph, squared: NDArray[np.float64], weights: NDArray[np.float64] | None, config: PoseGraphConfig, held: int
+) -> Fit:
     """Of the edges that count; the chordal objective has no distribution to compare with."""
     counted = np.ones(len(squared), dtype=np.bool_) if weights is None else weights > _COUNTS
-    return Fit.of(graph, squared, counted) if config.objective == "logarithm" else Fit(float(squared[counted].sum()), 0)
+    return Fit.of(graph, squared, counted, held) if config.objective == "logarithm" else Fit(float(squared[counted].sum()), 0)
 
 
 def _spread(values: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
