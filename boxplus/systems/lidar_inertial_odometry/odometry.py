@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.iterated_update import Posterior, iterated_update
 from boxplus.filtering.map_datum import MapDatum
-from boxplus.filtering.nav_state import TANGENT, NavState, V
+from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
@@ -28,10 +27,12 @@ from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
+from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 
 _LONGEST_START_SCANS = 30
 _BLIND_PASSES = 3
@@ -70,6 +71,7 @@ class LidarInertialOdometry:
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._datum = MapDatum(NavState.identity().pack(), self._cov)
+        self._gap: str | None = None
         self._time_ns = 0
         c = self.config
         self._density = np.array([c.gyro_noise, c.accel_noise, c.gyro_bias_walk, c.accel_bias_walk]) ** 2
@@ -82,7 +84,7 @@ class LidarInertialOdometry:
     @property
     def contradiction(self) -> str | None:
         """What makes the estimate not to be trusted, whatever its status: gyroscope and LiDAR turn differently; a sentence."""
-        return self._consistency.contradiction
+        return self._consistency.contradiction or self._gap
 
     @property
     def time_steps(self) -> list[str]:
@@ -145,6 +147,8 @@ class LidarInertialOdometry:
     def _advance(self, frames: list[Frame]) -> list[Estimate]:
         estimates: list[Estimate] = []
         for frame in frames:
+            if self.start is not None and frame.duration_s > LONGEST_GAP_S:
+                frame = self._interrupt(frame)
             if self.start is not None:
                 estimates.append(self._process(frame))
                 continue
@@ -153,6 +157,16 @@ class LidarInertialOdometry:
             if seconds >= self.config.start_duration:
                 estimates += self._try_start()
         return estimates
+
+    def _interrupt(self, frame: Frame) -> Frame:
+        """Nothing says how the platform moved since the last scan: back to the search for a start, with a new map."""
+        self._gap = " ".join(filter(None, [self._consistency.contradiction, gap_text(frame.duration_s)]))
+        self._consistency = Consistency(self.config, self._declared())
+        self.start, self._standstill = None, None
+        self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
+        self._box = SlidingBox(self.config.box_side, self.config.detection_range)
+        self._excitation = RotationExcitation()
+        return after_gap(frame)
 
     def _try_start(self, *, final: bool = False) -> list[Estimate]:
         """Find the first state, then process every scan that waited for it: no scan is lost to the start."""
@@ -165,23 +179,24 @@ class LidarInertialOdometry:
             self._sequencer.rejected["scan before a start could be found"] += forgotten
             del self._waiting[:forgotten]
             return []
+        if self._gap is not None:
+            found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
-        self._datum = MapDatum(self._x, self._cov)
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
+        self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov))
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         first, *rest = self._waiting
         self._waiting = []
         p_lidar = deskew_first(first, found.state, self.config)
         self._insert(self._voxel_filter(p_lidar)[1])
-        self._warnings = [found.warning] if found.warning else []
-        estimates = [self._estimate(first, p_lidar)]
-        return estimates + [self._process(frame) for frame in rest]
+        self._warnings = [text for text in (self._gap, found.warning) if text]
+        return [self._estimate(first, p_lidar), *self._advance(rest)]
 
     def _process(self, frame: Frame) -> Estimate:
         """One scan, line by line as in SPEC.md 9.11."""
-        clock = _Stopwatch()
+        clock = Stopwatch()
         if begins_blind(frame, self.config.max_imu_gap):
             frame = self._see_motion(frame)
         p_lidar = self._propagate(frame)
@@ -324,7 +339,7 @@ class LidarInertialOdometry:
             state=NavState.unpack(self._x),
             covariance=self._cov.copy(),
             pose_covariance=self._datum.pose_covariance(self._x),
-            status=outcome.status if outcome else "ok",
+            status=outcome.status if outcome else "ok" if self._gap is None else "lost",
             weak_directions=outcome.weak_directions if outcome else (),
             lidar_share=outcome.lidar_share(self._cov) if outcome else np.zeros(6),
             points_raw=len(frame.scan) + sum(frame.scan.rejected.values()),
@@ -379,16 +394,3 @@ class _Outcome:
             return np.zeros(6)
         share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / self.cov_prior.diagonal()[:6], 0.0, 1.0)
         return share
-
-
-class _Stopwatch:
-    """Seconds spent by stage."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.laps[stage] = now - self._last
-        self._last = now
