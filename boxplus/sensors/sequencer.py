@@ -64,6 +64,8 @@ class Sequencer:
         self._newest_scan_end_ns: int | None = None
         self._imu_jumps = 0
         self._scan_jumps = 0
+        self._imu_taken = 0
+        self._scans_taken = 0
         self._imu_steps, self._scan_steps = TimeSteps("IMU"), TimeSteps("LiDAR")
 
     @property
@@ -80,6 +82,7 @@ class Sequencer:
             self._imu_steps.went_on()
             self._last_imu_ns = int(samples.time_ns[-1])
             self._imu.append(samples)
+            self._imu_taken += len(samples)
         else:
             self._add_one_by_one(samples)
 
@@ -88,8 +91,8 @@ class Sequencer:
         last, time = self._last_imu_ns, samples.time_ns
         if not (np.abs(samples.gyro).max() <= _GYRO_LIMIT and np.abs(samples.accel).max() <= _ACCEL_LIMIT):
             return False
-        steps = np.diff(time, prepend=int(time[0]) - 1 if last is None else last)
-        return bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
+        steps = np.diff(time if last is None else np.concatenate([[last], time]))
+        return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
 
     def _add_one_by_one(self, samples: ImuSamples) -> None:
         finite = np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
@@ -106,6 +109,12 @@ class Sequencer:
             if last is not None and now == last:
                 self.rejected["IMU sample with a repeated time"] += 1
                 continue
+            if last is not None and last - now > self._max_jump_ns and self._imu_taken + keep.sum() == 1:
+                # The first sample of all was the one that is wrong: nothing else is near it.
+                self.rejected["IMU sample far ahead of all that follow"] += 1
+                self._imu.clear()
+                keep[:] = False
+                self._imu_taken, last = 0, None
             if last is not None and now < last:
                 self.rejected["IMU sample going back in time"] += 1
                 self._imu_steps.went_back(now, last)
@@ -118,6 +127,7 @@ class Sequencer:
             self._imu_steps.went_on()
             self._last_imu_ns = now
             keep[i] = True
+        self._imu_taken += int(keep.sum())
         if keep.any():
             self._imu.append(ImuSamples(time[keep], samples.gyro[keep], samples.accel[keep]))
 
@@ -129,6 +139,11 @@ class Sequencer:
         if scan.end_ns - scan.start_ns > _LONGEST_SCAN_NS:
             scan = self._without_strays(scan)
         newest = self._newest_scan_end_ns
+        if newest is not None and self._scans_taken == len(self._scans) == 1 and newest - scan.end_ns > self._max_jump_ns:
+            # The first scan of all was the one that is wrong: nothing else is near it.
+            self.rejected["scan far ahead of all that follow"] += 1
+            self._scans.clear()
+            self._scans_taken, newest = 0, None
         if newest is not None:
             if scan.end_ns == newest:
                 self.rejected["scan with a repeated time"] += 1
@@ -144,6 +159,7 @@ class Sequencer:
                 self.rejected["scan jumping ahead in time"] += 1
                 return
         self._scan_jumps = 0
+        self._scans_taken += 1
         self._scan_steps.went_on()
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)

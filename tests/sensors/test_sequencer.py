@@ -254,3 +254,42 @@ def test_single_samples_out_of_order_are_only_counted() -> None:
         sequencer.add_scan(_scan(10.0 * k - 50.0, 10.0 * k - 41.0))
     assert sequencer.rejected["IMU sample going back in time"] == sequencer.rejected["scan going back in time"] == 200
     assert sequencer.time_steps == []
+
+
+@pytest.mark.parametrize("extreme", [2**63 - 1, -(2**63), T0 + 3_600_000_000_000])
+@pytest.mark.parametrize("together", [True, False])
+def test_a_first_time_that_is_nonsense_does_not_shut_out_all_that_follow(extreme: int, together: bool) -> None:
+    sequencer = Sequencer()
+    good = _imu(*range(0, 400, 5))
+    wrong = ImuSamples(np.array([extreme]), np.zeros((1, 3)), np.array([[0.0, 0.0, 9.81]]))
+    if together:
+        joined = ImuSamples(
+            np.concatenate([wrong.time_ns, good.time_ns]),
+            np.vstack([wrong.gyro, good.gyro]),
+            np.vstack([wrong.accel, good.accel]),
+        )
+        sequencer.add_imu(joined)
+    else:
+        sequencer.add_imu(wrong)
+        sequencer.add_imu(good)
+    frames = []
+    for k in range(3):
+        sequencer.add_scan(_scan(100.0 * k, 100.0 * k + 99.0))
+        frames += sequencer.frames()
+    assert len(frames) >= 2
+    for frame in frames[1:]:
+        _check(frame)
+    assert sum(sequencer.rejected.values()) <= 10
+
+
+def test_a_first_scan_far_ahead_does_not_shut_out_all_that_follow() -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(*range(0, 400, 5)))
+    time = np.full(3, 2**63 - 1)
+    sequencer.add_scan(Scan(np.ones((3, 3), np.float32), time, None, int(time[0]), int(time[0]), {}))
+    frames = []
+    for k in range(3):
+        sequencer.add_scan(_scan(100.0 * k, 100.0 * k + 99.0))
+        frames += sequencer.frames()
+    assert len(frames) == 3
+    assert sequencer.rejected == {"scan far ahead of all that follow": 1}
