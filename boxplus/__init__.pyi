@@ -37,11 +37,11 @@ from .optimization.marginalization import marginalize as marginalize
 from .optimization.problem import Problem as Problem
 from .optimization.solution import Solution as Solution
 from .optimization.solver_options import SolverOptions as SolverOptions
-from .recordings.doctor import Diagnosis as Diagnosis
-from .recordings.doctor import diagnose as diagnose
 from .recordings.open import open_recording as open_recording
 from .recordings.options import RecordingOptions as RecordingOptions
 from .recordings.recording import Recording as Recording
+from .runs.inspection.diagnosis import Diagnosis as Diagnosis
+from .runs.inspection.diagnosis import diagnose as diagnose
 from .sensors.image import Image as Image
 from .sensors.imu import ImuSamples as ImuSamples
 from .sensors.scan import Scan as Scan

@@ -11,7 +11,7 @@ from boxplus.cli.options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.recordings.doctor import Diagnosis
+    from boxplus.runs.inspection.diagnosis import Diagnosis
 
 _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
@@ -19,6 +19,13 @@ _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
 @takes_recording_options
 def inspect(
     recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    T_imu_lidar: Annotated[
+        str | None,
+        typer.Option(
+            "--T-imu-lidar",
+            help="A mounting to check: pose of the LiDAR in the IMU frame, in the forms that 'boxplus lio' takes.",
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the findings as JSON to this file too.")] = None,
     *,
@@ -28,11 +35,15 @@ def inspect(
     from rich.console import Console
     from rich.progress import Progress
 
-    from boxplus.recordings.doctor import diagnose
+    from boxplus.runs.inspection.diagnosis import diagnose
+    from boxplus.runs.transform import parse_transform
 
+    T_given = None if T_imu_lidar is None else parse_transform(T_imu_lidar)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)
-        diagnosis = diagnose(recording, options, on_progress=lambda done: progress.update(task, completed=done))
+        diagnosis = diagnose(
+            recording, options, on_progress=lambda done: progress.update(task, completed=done), T_imu_lidar=T_given
+        )
     if output is not None:
         _write(output, diagnosis)
     if json:

@@ -111,7 +111,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         evidence.append(Evidence("point_time_field", "none", "warning", text))
     gyro, accel = np.array(imu_probe.gyro), np.array(imu_probe.accel)
     accel_unit, accel_evidence = read_accel_unit(accel, options)
-    gyro_unit, gyro_evidence = read_gyro_unit(np.array(imu_probe.time_ns, np.int64), gyro, accel, options)
+    gyro_unit, gyro_evidence = read_gyro_unit(gyro, options)
     evidence += [gyro_evidence, accel_evidence]
     T_imu_lidar, source, found_extrinsic = _extrinsic(container, transforms, imu_probe.frame, probe.frame)
     evidence.append(found_extrinsic)

@@ -26,7 +26,13 @@ def open_recording(path: str | Path, options: RecordingOptions | None = None) ->
         AmbiguityError: two readings fit; the message names the option that decides.
     """
     options = options or RecordingOptions()
-    path = Path(path)
+    recording = _open(Path(path), options)
+    if options.lidar_time_offset_s:
+        recording.shift_lidar(options.lidar_time_offset_s)
+    return recording
+
+
+def _open(path: Path, options: RecordingOptions) -> Recording:
     if not path.exists():
         raise RecordingError("a recording", f"no file or folder {path}", "check the path")
     if path.is_dir() and (path / "velodyne_points").is_dir():

@@ -38,6 +38,12 @@ class RecordingOptions(BaseModel):
     )
     gyro_unit: GyroUnit | None = Field(default=None, description="unit of the angular velocity in the recording")
     accel_unit: AccelUnit | None = Field(default=None, description="unit of the acceleration in the recording")
+    lidar_time_offset_s: float = Field(
+        default=0.0,
+        ge=-10.0,
+        le=10.0,
+        description="added to all times of the LiDAR to bring them to the IMU's clock ('boxplus calibrate' finds it) [s]",
+    )
     min_range: float = Field(default=0.5, ge=0.0, description="points nearer than this are dropped: the robot itself [m]")
     max_range: float = Field(default=1000.0, gt=0.0, description="points farther than this are dropped [m]")
     start_s: float = Field(default=0.0, ge=0.0, description="skip this much at the beginning of the recording [s]")

@@ -54,6 +54,13 @@ class Recording:
         self._close = close
         self._tally = Tally()
         self._finished = False
+        self._lidar_shift_ns = 0
+
+    def shift_lidar(self, offset_s: float) -> None:
+        """Add this to all times of the LiDAR from the next iteration on [s]; `info.evidence` says so."""
+        self._lidar_shift_ns = round(offset_s * 1e9)
+        text = "given; added to all times of the LiDAR, to bring them to the IMU's clock"
+        self.info.evidence.append(Evidence("lidar_time_offset", f"{offset_s * 1e3:+.1f} ms", "ok", text))
 
     def events(self) -> Iterator[Event]:
         """Scans and blocks of IMU samples in file order. What cannot be read is counted in `rejected` and logged.
@@ -68,6 +75,8 @@ class Recording:
             seen += 1
             if isinstance(event, Scan):
                 tally.count_scan(event)
+                if self._lidar_shift_ns:
+                    event = event.shifted(self._lidar_shift_ns)
             yield event
         self._finished = True
         self._report_damage(tally)

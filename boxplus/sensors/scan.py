@@ -100,5 +100,10 @@ class Scan:
             strength = None if strength is None else strength[keep]
         return cls(np.ascontiguousarray(xyz), np.ascontiguousarray(time), strength, start, end, rejected)
 
+    def shifted(self, offset_ns: int) -> Scan:
+        """The same scan, this much later [ns]."""
+        start_ns, end_ns = self.start_ns + offset_ns, self.end_ns + offset_ns
+        return Scan(self.p_lidar, self.time_ns + offset_ns, self.intensity, start_ns, end_ns, self.rejected)
+
     def __len__(self) -> int:
         return int(self.time_ns.size)

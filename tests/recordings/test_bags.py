@@ -168,8 +168,11 @@ def test_gravity_missing_from_the_accelerometer(tmp_path: Path) -> None:
 
 
 def test_gyro_too_fast_for_radians(tmp_path: Path) -> None:
-    with pytest.raises(AmbiguityError, match=r"below 35 rad/s.*got 100.0.*--gyro-unit"):
-        open_recording(write_bag(tmp_path, "ros1", Content(gyro=(0.0, 0.0, 100.0))))
+    path = write_bag(tmp_path, "ros1", Content(gyro=(0.0, 0.0, 100.0)))
+    with open_recording(path) as recording:
+        assert recording.info.gyro_unit == "deg/s"
+        block = next(event for event in recording if isinstance(event, ImuSamples))
+        np.testing.assert_allclose(block.gyro[:, 2], np.radians(100.0))
 
 
 @pytest.mark.parametrize("name", ["missing.bag", "notes.txt"])
@@ -220,3 +223,20 @@ def test_values_beyond_any_sensor_are_dropped_and_nan_is_passed_on(tmp_path: Pat
         gyro = np.concatenate([e.gyro for e in recording if isinstance(e, ImuSamples)])
         assert recording.rejected == {"messages: IMU values beyond any sensor": 1}
     assert len(gyro) == 60 and np.isnan(gyro).any(axis=1).sum() == 1
+
+
+def test_the_lidar_can_be_shifted_to_the_clock_of_the_imu(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "ros1")
+    with open_recording(path) as recording:
+        before = list(recording)
+    with open_recording(path, RecordingOptions(lidar_time_offset_s=-0.05)) as recording:
+        for _ in range(2):
+            after = list(recording)
+        assert ("lidar_time_offset", "-50.0 ms") in [(e.key, e.value) for e in recording.info.evidence]
+    assert len(before) == len(after)
+    for one, other in zip(before, after, strict=True):
+        shift = -50_000_000 if isinstance(one, Scan) else 0
+        np.testing.assert_array_equal(one.time_ns + shift, other.time_ns)
+        if isinstance(one, Scan) and isinstance(other, Scan):
+            assert (one.start_ns + shift, one.end_ns + shift) == (other.start_ns, other.end_ns)
+            np.testing.assert_array_equal(one.p_lidar, other.p_lidar)

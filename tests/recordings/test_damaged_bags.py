@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from boxplus.cli import app
 from boxplus.errors import RecordingError
 from boxplus.recordings import Recording, open_recording, sequential
-from boxplus.recordings.doctor import diagnose
+from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.scan import Scan
 
 CONTENT = Content(scans=12, points=60, imu_rate=50)

@@ -30,6 +30,8 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
 _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
+_SLOPE_DOUBTFUL = 0.05
+_SCAN_NS = 100_000_000
 ROTATION_KNOWN_RAD = 0.05
 _DECLARED_ARM_STD = 0.02  # m
 
@@ -44,7 +46,8 @@ class Agreement:
         translation: None where the path is too short or the mounting not known.
         R_imu_lidar: (3, 3) the mounting that the accelerations were compared under.
         imu_rate_hz: of the samples.
-        gyro_power: mean square of the gyroscope's rates about their mean [(rad/s)²], in its own unit.
+        gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
+            unit.
     """
 
     path: LidarPath
@@ -106,9 +109,25 @@ def compare_sensors(
             mean[6:9], std[6:9] = T_declared[:3, 3], _DECLARED_ARM_STD
         scaled = ImuSamples(imu.time_ns, imu.gyro / scale, imu.accel)
         translation = compare_accelerations(path, scaled, R, bias / scale, offset, (mean, std))
+        doubtful = translation is not None and translation.slope > 0.0 and abs(translation.slope - 1.0) > _SLOPE_DOUBTFUL
+        if doubtful and not refine:
+            # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
+            return compare_sensors(
+                scans, imu, config, T_expected=T_expected, T_declared=T_declared, refine=True, expected=expected
+            )
     rate = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
-    power = float(((imu.gyro - imu.gyro.mean(axis=0)) ** 2).sum(axis=1).mean()) if len(imu) else 0.0
-    return Agreement(path, rotation, translation, R, rate, power)
+    return Agreement(path, rotation, translation, R, rate, _power(imu))
+
+
+def _power(imu: ImuSamples) -> float:
+    """Mean square of the rates about their mean, noise and vibration averaged out as between two scans."""
+    if not len(imu):
+        return 0.0
+    _, begin = np.unique((imu.time_ns - imu.time_ns[0]) // _SCAN_NS, return_index=True)
+    count = np.diff(np.append(begin, len(imu)))[:, None]
+    rate = np.add.reduceat(imu.gyro, begin) / count
+    mean = (count * rate).sum(axis=0) / len(imu)
+    return float((count * (rate - mean) ** 2).sum() / len(imu))
 
 
 def gyro_guesses(imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> list[Turning]:

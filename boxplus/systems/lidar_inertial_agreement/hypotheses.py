@@ -43,8 +43,10 @@ _OFFSET_STD_S = 0.012
 _LEVER_OFF = 0.07
 _SLOPE_FLOOR = 0.02
 _MISFIT_M = 0.03
+_SLOPE_KNOWN = 0.3
 _FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
+_DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,15 @@ def judges_clocks(rotation: RotationFit) -> bool:
     return _turning(rotation) and rotation.explained > _CLOSELY and rotation.offset_std_s < _OFFSET_STD_S
 
 
+def judges_lengths(agreement: Agreement) -> bool:
+    """Whether the motion shows sign and scale of the accelerations."""
+    translation = agreement.translation
+    if translation is None or not _path_counts(agreement.path):
+        return False
+    fits = translation.explained > _FITS and translation.sigma < _MISFIT_M
+    return fits and float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < _SLOPE_KNOWN
+
+
 def _turning(rotation: RotationFit) -> bool:
     return bool(np.linalg.norm(rotation.excitation) > max(_TURNING_RAD_S, 2.0 * rotation.sigma))
 
@@ -130,7 +141,9 @@ def _of_sign(rotation: RotationFit) -> Finding | None:
 
 
 def _of_belonging(agreement: Agreement, rotation: RotationFit) -> Finding | None:
-    strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(agreement.gyro_power)) / unit_of(rotation.scale))
+    # A scale found without a common motion is no unit: it must not make a gyroscope at rest turn.
+    turning = float(np.sqrt(agreement.gyro_power)) / max(unit_of(rotation.scale), 1.0)
+    strong = max(float(np.linalg.norm(rotation.excitation)), turning)
     if strong < max(_BELONGING_RAD_S, 4.0 * rotation.sigma_registration) or rotation.together > _TOGETHER:
         return None
     return Finding(
@@ -190,7 +203,8 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:
     off = abs(rotation.scale - 1.0)
-    if not _turning(rotation) or rotation.explained < _FITS or off < max(_SCALE_OFF, 4.0 * rotation.scale_std):
+    # The noise of the LiDAR's rates makes a slope too small: where it counts, nothing is said.
+    if not _turning(rotation) or rotation.explained < _CLOSELY or off < max(_SCALE_OFF, 4.0 * rotation.scale_std):
         return None
     return Finding(
         "gyro_scale",
@@ -223,7 +237,7 @@ def _of_lengths(translation: TranslationFit) -> Finding | None:
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
         return Finding("force_sign", text)
-    if abs(slope - 1.0) > max(_LEVER_OFF, 3.0 * std) and std < 0.3 and slope > 0.0:
+    if abs(slope - 1.0) > max(_LEVER_OFF, 3.0 * std) and std < _SLOPE_KNOWN and slope > 0.0:
         name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
         return Finding(
             "length_scale",
@@ -236,3 +250,19 @@ def _of_lengths(translation: TranslationFit) -> Finding | None:
 def matrix_text(R: NDArray[np.float64]) -> str:
     """A (3, 3) matrix on one line."""
     return "[" + "; ".join(", ".join(f"{value:.4f}" for value in row) for row in R) + "]"
+
+
+def clock_drift(earlier: Agreement, later: Agreement) -> Finding | None:
+    """Clocks that run at different speeds, or one that steps: both comparisons show the offset, and it differs."""
+    before, after = earlier.rotation, later.rotation
+    if before is None or after is None or not judges_clocks(before) or not judges_clocks(after):
+        return None
+    change, known = after.offset_s - before.offset_s, float(np.hypot(before.offset_std_s, after.offset_std_s))
+    if abs(change) < max(_DRIFT_S, _DRIFT_DEVIATIONS * known):
+        return None
+    seconds = float(later.path.time_ns[-1] - earlier.path.time_ns[-1]) * 1e-9
+    return Finding(
+        "clock_drift",
+        f"within {seconds:.0f} s the offset of the LiDAR's clock to the IMU's changed by {change * 1e3:+.0f} ± "
+        f"{known * 1e3:.0f} ms: the clocks drift apart or one of them steps; synchronise them",
+    )

@@ -39,6 +39,7 @@ _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
 _GOOD = 0.06  # m, misfit that needs no second start
 _LEAST_SHARE = 0.25  # of the points lie on the map, or the scan is not registered
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
+_FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
@@ -165,15 +166,11 @@ class LidarMotion:
             self._restart()
             self._begin(scan, middle_ns)
             return
-        fit = self._best(scan, middle_ns, step_s, expected)
-        if fit is not None and self._first is not None:
-            # The first scan was taken as it came; now that its motion is known, it makes the map anew.
-            self._tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
-            first_ns = (self._first.start_ns + self._first.end_ns) // 2
-            still = undistorted(self._first, self._nodes(self._first, first_ns, fit.rate, fit.velocity), first_ns)
-            self._tree.insert(self._map_filter(still)[1].astype(np.float64), downsample=True)
-            self._rate, self._velocity, self._first = fit.rate, fit.velocity, None
+        if self._first is None:
             fit = self._best(scan, middle_ns, step_s, expected)
+        else:
+            fit = self._second(self._first, scan, middle_ns, step_s, expected)
+            self._first = None
         if fit is None:
             self._failed += 1
             self._restart()
@@ -184,6 +181,38 @@ class LidarMotion:
         self._keep(middle_ns, fit.information, fit.weak, fit.misfit)
         self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
         self._previous_ns = middle_ns
+
+    def _second(self, first: Scan, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
+        """The fit of a second scan; the map is made anew from the first one, undistorted with the motion that is found.
+
+        The first was taken as it came. At 8 m/s it and the next are distorted alike, and fit each other where they are: where
+        rest does not fit well, both are tried at speed.
+        """
+        speeds = [speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])]
+        best: _Fit | None = None
+        kept = self._tree, self._rate, self._velocity
+        for velocity in [np.zeros(3), *speeds]:
+            if best is not None and best.misfit < _GOOD:
+                break
+            if velocity.any():
+                self._tree, self._rate, self._velocity = self._map_of(first, np.zeros(3), velocity), np.zeros(3), velocity
+            fit = self._best(scan, middle_ns, step_s, expected)
+            if fit is None:
+                continue
+            self._tree, self._rate, self._velocity = self._map_of(first, fit.rate, fit.velocity), fit.rate, fit.velocity
+            fit = self._best(scan, middle_ns, step_s, expected)
+            if fit is not None and (best is None or fit.cost < best.cost):
+                best, kept = fit, (self._tree, self._rate, self._velocity)
+        self._tree, self._rate, self._velocity = kept
+        return best
+
+    def _map_of(self, first: Scan, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> IkdTree:
+        """The map that a first scan makes for a LiDAR that moves like this."""
+        tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
+        first_ns = (first.start_ns + first.end_ns) // 2
+        still = undistorted(first, self._nodes(first, first_ns, rate, velocity), first_ns)
+        tree.insert(self._map_filter(still)[1].astype(np.float64), downsample=True)
+        return tree
 
     def _begin(self, scan: Scan, middle_ns: int) -> None:
         self._previous_ns = middle_ns

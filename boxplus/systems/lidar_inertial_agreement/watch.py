@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
-from boxplus.systems.lidar_inertial_agreement.hypotheses import Finding, contradictions, judges_clocks, judges_rotation
+from boxplus.systems.lidar_inertial_agreement.hypotheses import (
+    Finding,
+    clock_drift,
+    contradictions,
+    judges_clocks,
+    judges_rotation,
+)
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist, thinned
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
@@ -28,7 +34,6 @@ _TAKEN_UP_AFTER = 40  # scans
 _UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
 _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
-_DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 
 
 class Watch:
@@ -55,7 +60,7 @@ class Watch:
         self._due_ns: int | None = None
         self._suspected_ns: int | None = None
         self._decided = 0
-        self._first_offset: tuple[int, float, float] | None = None
+        self._first_with_clocks: Agreement | None = None
 
     def add(
         self, scan: Scan, imu: ImuSamples, T_imu_lidar: NDArray[np.float64], expected: Twist, *, suspicious: bool = False
@@ -131,20 +136,9 @@ class Watch:
 
     def _drift(self, agreement: Agreement) -> Finding | None:
         """Clocks that run at different speeds: the offset of two comparisons differs."""
-        rotation = agreement.rotation
-        if rotation is None or not judges_clocks(rotation):
+        if agreement.rotation is None or not judges_clocks(agreement.rotation):
             return None
-        now = int(agreement.path.time_ns[-1])
-        if self._first_offset is None:
-            self._first_offset = (now, rotation.offset_s, rotation.offset_std_s)
+        if self._first_with_clocks is None:
+            self._first_with_clocks = agreement
             return None
-        then, offset, std = self._first_offset
-        change, known = rotation.offset_s - offset, float(np.hypot(std, rotation.offset_std_s))
-        if abs(change) < max(_DRIFT_S, _DRIFT_DEVIATIONS * known):
-            return None
-        seconds = (now - then) * 1e-9
-        return Finding(
-            "clock_drift",
-            f"within {seconds:.0f} s the offset of the LiDAR's clock to the IMU's changed by {change * 1e3:+.0f} ± "
-            f"{known * 1e3:.0f} ms: the clocks drift apart or one of them steps; synchronise them",
-        )
+        return clock_drift(self._first_with_clocks, agreement)

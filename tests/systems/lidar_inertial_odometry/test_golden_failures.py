@@ -9,8 +9,8 @@ import pytest
 from simulated_runs import SPARSE, Run, run
 
 from boxplus.errors import InputError
-from boxplus.recordings.doctor import diagnose
 from boxplus.recordings.open import open_recording
+from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, trajectories, worlds, write_recording
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
@@ -205,14 +205,10 @@ def test_wrong_unit_of_the_point_times() -> None:
     )
 
 
-@pytest.mark.parametrize(("fault", "gyro_unit", "accel_unit"), [
-    (faults.imu_in_g(), "rad/s", "g"),
-    (faults.gyro_in_deg(), "deg/s", "m/s2"),
-], ids=["g", "deg"])  # fmt: skip
-def test_readers_recognise_units(tmp_path: Path, fault: Fault, gyro_unit: str, accel_unit: str) -> None:
-    path = write_recording(simulate("walk", duration_s=8.0, lidar=SPARSE), tmp_path / "wrong_unit", fault=fault)
+def test_readers_recognise_g(tmp_path: Path) -> None:
+    path = write_recording(simulate("walk", duration_s=8.0, lidar=SPARSE), tmp_path / "wrong_unit", fault=faults.imu_in_g())
     with open_recording(path) as recording:
-        assert (recording.info.gyro_unit, recording.info.accel_unit) == (gyro_unit, accel_unit)
+        assert (recording.info.gyro_unit, recording.info.accel_unit) == ("rad/s", "g")
         accel = np.vstack([event.accel for event in recording if not isinstance(event, Scan)])
     assert np.linalg.norm(accel.mean(axis=0)) == pytest.approx(9.81, abs=0.3)
 

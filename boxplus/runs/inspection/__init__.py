@@ -1,0 +1,1 @@
+"""The data doctor: examines a recording before an estimator believes it."""

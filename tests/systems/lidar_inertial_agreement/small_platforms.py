@@ -1,0 +1,46 @@
+"""Small fast simulated platforms to compare LiDAR and IMU of."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, manoeuvres, worlds
+from boxplus.simulation.scenarios import mounting
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+CONFIG = LioConfig()  # type: ignore[call-arg]
+LIDAR = SpinningLidar(channels=12, azimuth_steps=150)
+LOW, HIGH = (-3.0, -2.0, 1.0), (3.0, 2.0, 2.5)
+
+Data = tuple[list[Scan], ImuSamples]
+
+
+@lru_cache(maxsize=8)
+def handheld(seed: int, seconds: float = 6.0, speed: float = 1.0, rate: float = 1.5) -> Simulation:
+    """A hand that swings and carries a LiDAR with 1800 rays a scan through a room of 12 x 9 x 4 m, mounted anyhow."""
+    random = np.random.default_rng(seed)
+    T = mounting(*random.uniform(-180.0, 180.0, 3), tuple(random.uniform(-0.2, 0.2, 3)))
+    motion = manoeuvres.handheld(seconds, LOW, HIGH, speed, rate, standstill_s=0.0, seed=seed)
+    return Simulation(Scenario("handheld", worlds.room(seed=seed), motion, LIDAR, ImuModel(), T), seed, seconds)
+
+
+def data(simulation: Simulation, fault: Fault | None = None) -> Data:
+    """Scans and samples, spoilt by a fault."""
+    events = list(simulation.events() if fault is None else fault.events(simulation.events()))
+    blocks = [event for event in events if isinstance(event, ImuSamples)]
+    joined = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time_ns", "gyro", "accel"))
+    return [event for event in events if isinstance(event, Scan)], ImuSamples(*joined)
+
+
+def turned(T: NDArray[np.float64], degrees: float, seed: int) -> NDArray[np.float64]:
+    """A mounting (4, 4) that is off by an angle about a random axis."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    wrong = T.copy()
+    wrong[:3, :3] = so3.exp(np.deg2rad(degrees) * axis / np.linalg.norm(axis)) @ T[:3, :3]
+    return wrong

@@ -1,0 +1,130 @@
+"""Every known mistake is named for what it is, and nothing is named where nothing is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_platforms import CONFIG, data, handheld, turned
+
+from boxplus.simulation import Fault, faults
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
+from boxplus.systems.lidar_inertial_agreement.hypotheses import (
+    clock_drift,
+    contradictions,
+    judges_clocks,
+    judges_lengths,
+    judges_rotation,
+)
+
+FEET = 3.28084
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 6])
+def test_sound_sensors_are_not_contradicted(seed: int) -> None:
+    simulation = handheld(seed)
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)
+    assert contradictions(agreement, simulation.T_imu_lidar) == []
+    assert agreement.rotation is not None
+    assert judges_rotation(agreement) and judges_clocks(agreement.rotation)
+    assert judges_lengths(agreement)
+
+
+@pytest.mark.parametrize(("fault", "cause", "words"), [
+    (faults.gyro_in_deg(), "gyro_unit", "reports deg/s"),
+    (faults.gyro_in_rad_as_deg(), "gyro_unit", "were taken for deg/s and are rad/s"),
+    (faults.flip_gyro(), "gyro_sign", "negate its rates"),
+    (faults.flip_accel(), "force_sign", "its sign is flipped"),
+    (faults.mirror_points(), "mirrored", "the points are mirrored"),
+    (faults.scale_points(1.1), "length_scale", "not in metres"),
+    (faults.scale_points(FEET), "length_scale", "feet"),
+], ids=lambda value: value.name if isinstance(value, Fault) else None)  # fmt: skip
+def test_mistakes_are_named(fault: Fault, cause: str, words: str) -> None:
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    found = contradictions(compare_sensors(*data(simulation, fault), CONFIG, T_declared=T), T)
+    assert [finding.cause for finding in found] == [cause]
+    assert words in found[0].text
+
+
+@pytest.mark.parametrize("offset_ms", [-500, -100, -20, 20, 50, 300])
+def test_clock_offsets_are_measured(offset_ms: int) -> None:
+    simulation = handheld(2)
+    agreement = compare_sensors(
+        *data(simulation, faults.clock_offset(offset_ms * 1e-3)), CONFIG, T_declared=simulation.T_imu_lidar
+    )
+    found = contradictions(agreement, simulation.T_imu_lidar)
+    assert [finding.cause for finding in found] == ["time_offset"]
+    assert agreement.rotation is not None
+    # The IMU's stamps are late by the offset: so much has to be added to the LiDAR's times.
+    assert abs(agreement.rotation.offset_s - offset_ms * 1e-3) < 0.01
+    assert f"--lidar-time-offset {agreement.rotation.offset_s:.3f}" in found[0].text
+
+
+def test_a_given_offset_makes_the_clocks_agree() -> None:
+    simulation = handheld(2)
+    scans, imu = data(simulation, faults.clock_offset(0.08))
+    shifted = [scan.shifted(80_000_000) for scan in scans]
+    agreement = compare_sensors(shifted, imu, CONFIG, T_declared=simulation.T_imu_lidar)
+    assert contradictions(agreement, simulation.T_imu_lidar) == []
+    assert agreement.rotation is not None and abs(agreement.rotation.offset_s) < 0.01
+
+
+@pytest.mark.parametrize("degrees", [5.0, 10.0, 20.0])
+def test_wrong_mountings_are_named(degrees: float) -> None:
+    simulation = handheld(3)
+    wrong = turned(simulation.T_imu_lidar, degrees, round(degrees))
+    found = contradictions(compare_sensors(*data(simulation), CONFIG, T_declared=wrong), wrong)
+    assert "extrinsic" in [finding.cause for finding in found]
+    named = float(found[0].text.split(" deg apart")[0].split()[-1])
+    assert abs(named - degrees) < 2.0
+
+
+def test_an_inverted_mounting_is_named() -> None:
+    simulation = handheld(4)
+    inverse = np.linalg.inv(simulation.T_imu_lidar)
+    found = contradictions(compare_sensors(*data(simulation), CONFIG, T_declared=inverse), inverse)
+    assert found[0].cause == "extrinsic" and "its inverse fits" in found[0].text
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_the_imu_of_another_platform_is_named(seed: int) -> None:
+    simulation, other = handheld(seed), handheld(seed + 5)
+    found = contradictions(
+        compare_sensors(*data(simulation, faults.other_imu(other.imu_samples)), CONFIG, T_declared=simulation.T_imu_lidar),
+        simulation.T_imu_lidar,
+    )
+    assert [finding.cause for finding in found] == ["not_together"]
+
+
+def test_drifting_clocks_are_named() -> None:
+    simulation = handheld(5, seconds=12.0)
+    T = simulation.T_imu_lidar
+    for fault, drifts in ((None, False), (faults.clock_drift(0.005), True)):
+        scans, imu = data(simulation, fault)
+        middle = len(scans) // 2
+        early, late = (compare_sensors(part, imu, CONFIG, T_declared=T) for part in (scans[:middle], scans[middle:]))
+        finding = clock_drift(early, late)
+        assert (finding is not None) == drifts
+        if finding is not None:
+            assert finding.cause == "clock_drift" and "changed by +" in finding.text
+
+
+def test_without_motion_nothing_is_claimed() -> None:
+    simulation = handheld(0, speed=0.001, rate=1e-3)
+    T = turned(simulation.T_imu_lidar, 40.0, 0)
+    for fault in (None, faults.gyro_in_deg(), faults.flip_gyro(), faults.clock_offset(0.1)):
+        agreement = compare_sensors(*data(simulation, fault), CONFIG, T_declared=T)
+        assert contradictions(agreement, T) == []
+        assert not judges_rotation(agreement)
+
+
+def test_too_few_scans_or_samples_are_no_verdict() -> None:
+    simulation = handheld(0)
+    scans, imu = data(simulation)
+    few = type(imu)(imu.time_ns[:1], imu.gyro[:1], imu.accel[:1])
+    for agreement in (
+        compare_sensors(scans[:4], imu, CONFIG),
+        compare_sensors([], imu, CONFIG),
+        compare_sensors(scans[:12], few, CONFIG),
+    ):
+        assert agreement.rotation is None and contradictions(agreement, np.eye(4)) == []

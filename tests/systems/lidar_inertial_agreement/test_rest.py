@@ -1,0 +1,50 @@
+"""At rest means at rest: no steady motion passes for it, no shaking hides it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_platforms import CONFIG, LIDAR, data
+
+from boxplus.simulation import ImuModel, Scenario, Simulation, manoeuvres, trajectories, worlds
+from boxplus.simulation.spline import Trajectory
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+
+ROOM = (24.0, 20.0, 5.0)
+START = (-5.0, -2.0, 1.5)
+
+
+def rest_of(motion: Trajectory, seed: int = 0, imu: ImuModel | None = None) -> Rest:
+    simulation = Simulation(Scenario("rest", worlds.room(ROOM, seed=seed), motion, LIDAR, imu or ImuModel()), seed, 1.5)
+    scans, _ = data(simulation)
+    return judge_rest(lidar_path(scans, CONFIG), scans, CONFIG)
+
+
+@pytest.mark.parametrize("speed", [1.2, 2.0, 3.0, 8.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_constant_velocity_is_no_rest(speed: float, seed: int) -> None:
+    rest = rest_of(manoeuvres.constant_velocity(1.5, START, (speed, 0.0, 0.0), np.eye(3)), seed)
+    assert not rest.at_rest and abs(rest.speed / speed - 1.0) < 0.1
+
+
+def test_a_circle_at_a_constant_rate_is_no_rest() -> None:
+    rest = rest_of(manoeuvres.constant_turn(1.5, (0.0, 0.0, 1.5), 3.0, 0.5))
+    assert not rest.at_rest and abs(rest.turn_rate - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_shaken_platform_rests(seed: int) -> None:
+    rest = rest_of(trajectories.at_rest(2.0, START), seed, ImuModel(accel_vibration=1.0, gyro_vibration=0.1))
+    assert rest.at_rest and rest.determined and rest.speed < 0.05
+
+
+def test_a_creep_is_seen() -> None:
+    assert not rest_of(manoeuvres.constant_velocity(1.5, START, (0.0, 0.2, 0.0), np.eye(3))).at_rest
+
+
+def test_a_single_scan_says_nothing() -> None:
+    simulation = Simulation(Scenario("rest", worlds.room(ROOM), trajectories.at_rest(2.0, START), LIDAR), 0, 1.0)
+    scans, _ = data(simulation)
+    rest = judge_rest(lidar_path(scans[:1], CONFIG), scans[:1], CONFIG)
+    assert not rest.at_rest and not rest.determined and len(rest.open_axes) == 3
