@@ -18,6 +18,7 @@ _COMMANDS = {
     "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),
     "pgo": ("boxplus.cli.pgo:pgo", "Optimise the poses of a g2o or TORO pose graph."),
     "inspect": ("boxplus.cli.inspect:inspect", "Examine a recording: topics, rates, gaps, times, units, extrinsic."),
+    "calibrate": ("boxplus.cli.calibrate:app", "Find mounting, clock offset and scales of sensors from a recording."),
     "eval": ("boxplus.cli.eval:evaluate_command", "Compare a trajectory with the ground truth: ATE, RPE."),
     "map": ("boxplus.cli.map:map_app", "Look into a map folder, or merge its tiles into one file."),
     "report": ("boxplus.cli.report:report", "Draw the report of a run again, also of an interrupted one."),

@@ -1,0 +1,201 @@
+"""A calibration from a recording: of LiDAR and IMU, from what their comparison shows over several stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.recording import Recording
+from boxplus.recordings.stream_checks import StreamLog
+from boxplus.runs.inspection.stretches import gather_scans, lively_stretches
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
+from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, Calibration, calibrate
+from boxplus.systems.lidar_inertial_agreement.hypotheses import Cause, contradictions, judges_rotation
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_STRETCH_S, _STRETCHES = 8.0, 5
+_FEWEST_SAMPLES = 100
+_REFUSED: frozenset[Cause] = frozenset({"gyro_unit", "gyro_sign", "not_together", "mirrored", "force_sign"})
+"""With these there is no mounting to be found."""
+_ROTATION_DEG, _TRANSLATION_M, _OFFSET_S, _SCALE, _GYRO_BIAS = 0.6, 0.03, 5e-3, 0.03, 5e-3
+"""Standard deviations up to which something counts as determined."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One row of a calibration: its name, value and standard deviation as text, and what to do if the motion left it open.
+
+    `advice` is empty where it is determined.
+    """
+
+    name: str
+    value: str
+    std: str
+    advice: str
+
+    @property
+    def determined(self) -> bool:
+        return not self.advice
+
+
+@dataclass(frozen=True, slots=True)
+class LidarImuCalibration:
+    """What a recording shows about LiDAR and IMU.
+
+    Attributes:
+        estimate: the numbers with their covariance.
+        lidar_time_offset_s: to add to the LiDAR's times as they are in the recording [s].
+        quantities: the rows of the table.
+        stretches: how many were used.
+    """
+
+    estimate: Calibration
+    lidar_time_offset_s: float
+    quantities: list[Quantity]
+    stretches: int
+
+    def determined(self, name: str) -> bool:
+        """Whether the motion showed the quantity of this name."""
+        return next(quantity.determined for quantity in self.quantities if quantity.name == name)
+
+    @property
+    def has_mounting(self) -> bool:
+        """Whether T_imu_lidar is known completely."""
+        return self.determined("R_imu_lidar") and self.determined("p_imu_lidar")
+
+
+def calibrate_lidar_imu(
+    recording: Recording, options: RecordingOptions | None = None, on_progress: Callable[[float], None] | None = None
+) -> LidarImuCalibration:
+    """Estimate mounting, clock offset, scales and gyroscope bias over the liveliest stretches of a recording.
+
+    Args:
+        recording: opened.
+        options: it was opened with; its `lidar_time_offset_s` is added to the one found.
+        on_progress: called with the fraction done, in [0, 1].
+
+    Raises:
+        RecordingError: nothing at all could be read.
+        InputError: too few samples, too little rotation, or sensors that contradict each other in unit, sign or belonging.
+    """
+    report = on_progress or (lambda _: None)
+    log = StreamLog()
+    for event in recording:
+        log.add(event)
+        report(0.3 * recording.progress)
+    imu = usable(log.all_imu())
+    if len(imu) < _FEWEST_SAMPLES:
+        raise InputError(
+            f"at least {_FEWEST_SAMPLES} usable IMU samples", f"{len(imu)}", "record the IMU too: a calibration compares both"
+        )
+    stretches = lively_stretches(imu, _STRETCH_S, _STRETCHES)
+    gather_scans(recording, stretches, lambda done: report(0.3 + 0.1 * done))
+    config = LioConfig()  # type: ignore[call-arg]
+    used = []
+    for number, stretch in enumerate(stretches):
+        agreement = compare_sensors(stretch.scans, stretch.imu, config, refine=True)
+        for finding in contradictions(agreement, None):
+            if finding.cause in _REFUSED:
+                raise InputError("a LiDAR and an IMU that agree up to mounting and clocks", finding.text, "correct that first")
+        if judges_rotation(agreement):
+            used.append((agreement, stretch.imu))
+        report(0.4 + 0.6 * (number + 1) / len(stretches))
+    estimate = calibrate(used) if used else None
+    if estimate is None:
+        raise InputError(
+            "a motion that turns LiDAR and IMU about two axes, in surroundings that determine how the LiDAR turns",
+            f"none in the {len(stretches)} liveliest stretches of {recording.info.path.name}",
+            "hold the platform in a room with walls and furniture, and turn it by 30 deg and more about all axes for 30 s",
+        )
+    given_s = 0.0 if options is None else options.lidar_time_offset_s
+    return LidarImuCalibration(estimate, given_s + estimate.offset_s, _quantities(estimate, given_s), len(used))
+
+
+def _quantities(found: Calibration, given_s: float) -> list[Quantity]:
+    std = found.std
+    R, p = found.T_imu_lidar[:3, :3], found.T_imu_lidar[:3, 3]
+    turn = _open_axes(found.covariance[THETA, THETA], np.deg2rad(_ROTATION_DEG))
+    move = _open_axes(found.covariance[ARM, ARM], _TRANSLATION_M)
+    rows = [
+        Quantity(
+            "R_imu_lidar",
+            "[" + "; ".join(", ".join(f"{value:.5f}" for value in row) for row in R) + "]",
+            f"{_numbers(np.degrees(std[THETA]), 2)} deg about the IMU's axes",
+            f"open about {turn} (IMU axes): turn the platform quickly about axes across it" if turn else "",
+        ),
+        Quantity(
+            "p_imu_lidar",
+            f"({_numbers(p, 4)}) m",
+            f"{_numbers(std[ARM], 3)} m along the IMU's axes",
+            f"open along {move} (IMU axes): turn the platform to and fro, quickly, about axes across it" if move else "",
+        ),
+        Quantity(
+            "lidar_time_offset",
+            f"{(given_s + found.offset_s) * 1e3:+.2f} ms",
+            f"{std[OFFSET] * 1e3:.2f} ms",
+            "turn to and fro: a steady turn shows no time" if std[OFFSET] > _OFFSET_S else "",
+        ),
+        Quantity(
+            "gyro_scale", f"{found.gyro_scale:.4f}", f"{std[SCALE]:.4f}", "turn farther and faster" if std[SCALE] > _SCALE else ""
+        ),
+        Quantity(
+            "length_ratio",
+            f"{found.slope:.4f}",
+            f"{std[SLOPE]:.4f}",
+            "accelerate: move to and fro by half a metre" if std[SLOPE] > _SCALE else "",
+        ),
+        Quantity(
+            "gyro_bias",
+            f"({_numbers(found.gyro_bias, 5)}) rad/s",
+            f"{_numbers(found.gyro_bias_std, 5)} rad/s",
+            "record longer, or include a rest" if found.gyro_bias_std.max() > _GYRO_BIAS else "",
+        ),
+    ]
+    return rows
+
+
+def _open_axes(covariance: NDArray[np.float64], limit: float) -> str:
+    """The principal axes with a standard deviation above the limit, as text."""
+    variance, axes = np.linalg.eigh(covariance)
+    wide = np.flatnonzero(np.sqrt(variance) > limit)
+    return " and ".join(f"({_numbers(axes[:, k] * np.sign(axes[np.argmax(np.abs(axes[:, k])), k]), 2)})" for k in wide)
+
+
+def _numbers(values: NDArray[np.float64], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+def calibration_yaml(calibration: LidarImuCalibration, options: RecordingOptions, name: str) -> str:
+    """The text of a file for `boxplus lio --config`; what is not determined is left out and says why.
+
+    Args:
+        calibration: of a recording.
+        options: the recording was read with; kept, but for the part of the recording they choose.
+        name: of the recording, for the first line.
+    """
+    found = calibration.estimate
+    reading = options.model_dump(exclude_defaults=True, exclude={"start_s", "duration_s", "lidar_time_offset_s"})
+    lines = [f"# Calibration of LiDAR and IMU from {name}: 'boxplus lio RECORDING --config FILE' uses it.", "recording:"]
+    lines += [f"  {key}: {value}" for key, value in reading.items()]
+    if calibration.determined("lidar_time_offset"):
+        lines.append(f"  lidar_time_offset_s: {calibration.lidar_time_offset_s:.5f}  # ± {found.std[OFFSET]:.5f}")
+    lines.append("odometry:")
+    if calibration.has_mounting:
+        rotation = float(np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[THETA, THETA])[-1])))
+        translation = float(np.sqrt(np.linalg.eigvalsh(found.covariance[ARM, ARM])[-1]))
+        rows = ",\n    ".join("[" + ", ".join(f"{value:.8f}" for value in row) + "]" for row in found.T_imu_lidar)
+        lines += [
+            f"  T_imu_lidar: [\n    {rows}]",
+            f"  extrinsic_rotation_sigma_deg: {rotation:.3f}",
+            f"  extrinsic_translation_sigma: {translation:.4f}",
+        ]
+    lines.append("# found with, and not settings:")
+    for quantity in calibration.quantities:
+        kept = "" if quantity.determined else f"; NOT DETERMINED: {quantity.advice}"
+        lines.append(f"#   {quantity.name}: {quantity.value}, std {quantity.std}{kept}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,75 @@
+"""`boxplus calibrate lidar-imu`: what it writes is what `boxplus lio --config` takes, and no more than the motion shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from boxplus.cli import app
+from boxplus.errors import InputError
+from boxplus.manifolds import so3
+from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
+from boxplus.runs.config import load_run_config
+from boxplus.simulation import Scenario, Simulation, SpinningLidar, faults, manoeuvres, trajectories, worlds, write_recording
+from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.scenarios import mounting
+from boxplus.simulation.spline import SplineTrajectory
+from boxplus.simulation.trajectories import START_NS
+
+T_IMU_LIDAR = mounting(20.0, -35.0, 110.0, (0.12, -0.08, 0.15))
+LIDAR = SpinningLidar(channels=12, azimuth_steps=150)
+
+
+def swung() -> Simulation:
+    motion = manoeuvres.handheld(8.0, (-3.0, -2.0, 1.0), (3.0, 2.0, 2.5), 1.0, 1.5, standstill_s=0.0, seed=4)
+    return Simulation(Scenario("swung", worlds.room(seed=4), motion, LIDAR, T_imu_lidar=T_IMU_LIDAR), 4, 8.0)
+
+
+def carried() -> Simulation:
+    """Upright, as on wheels: it only ever turns about the vertical."""
+    time = trajectories.control_times(8.0, 0.05)
+    level = np.zeros_like(time)
+    R = trajectories.from_angles(level, level, 0.8 * np.sin(1.5 * time))
+    motion = SplineTrajectory(START_NS, 0.05, R, np.stack([0.5 * time, np.sin(time), level + 1.5], axis=1))
+    return Simulation(Scenario("carried", worlds.room(seed=4), motion, LIDAR, T_imu_lidar=T_IMU_LIDAR), 4, 8.0)
+
+
+def test_the_file_is_a_configuration(tmp_path: Path) -> None:
+    path = write_recording(swung(), tmp_path / "swung", fault=faults.clock_offset(0.04))
+    file = tmp_path / "new" / "calibration.yaml"
+    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "-o", str(file), "--min-range", "0.4"])
+    assert result.exit_code == 0, result.output
+    config = load_run_config(file)
+    T = np.array(config.odometry.T_imu_lidar)
+    assert np.degrees(np.linalg.norm(so3.log(T[:3, :3] @ T_IMU_LIDAR[:3, :3].T))) < 0.3
+    assert np.linalg.norm(T[:3, 3] - T_IMU_LIDAR[:3, 3]) < 0.02
+    assert abs(config.recording.lidar_time_offset_s - 0.04) < 2e-3
+    assert config.recording.min_range == 0.4
+    assert 0.05 < config.odometry.extrinsic_rotation_sigma_deg < 0.6
+    assert 0.003 < config.odometry.extrinsic_translation_sigma < 0.03
+    # What was found makes the clocks agree.
+    with open_recording(path, config.recording) as recording:
+        again = calibrate_lidar_imu(recording, config.recording)
+    assert abs(again.estimate.offset_s) < 2e-3 and abs(again.lidar_time_offset_s - 0.04) < 2e-3
+    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "-o", str(file)])
+    assert result.exit_code == 2 and "exists" in result.output
+
+
+def test_what_the_motion_does_not_show_is_not_written() -> None:
+    found = calibrate_lidar_imu(as_recording(carried()))
+    assert not found.has_mounting
+    text = calibration_yaml(found, RecordingOptions(), "carried")
+    assert "T_imu_lidar:" not in text.split("# found with")[0]
+    assert "NOT DETERMINED: open" in text and "turn the platform" in text
+
+
+def test_contradictions_are_refused() -> None:
+    with pytest.raises(InputError, match=r"reports deg/s.*correct that first"):
+        calibrate_lidar_imu(as_recording(swung(), faults.gyro_in_deg()))
+    with pytest.raises(InputError, match="a motion that turns LiDAR and IMU"):
+        motion = manoeuvres.constant_velocity(4.0, (-3.0, 0.0, 1.5), (0.5, 0.0, 0.0), np.eye(3))
+        calibrate_lidar_imu(as_recording(Simulation(Scenario("straight", worlds.room(), motion, LIDAR), 0, 4.0)))
