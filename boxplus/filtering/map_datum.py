@@ -11,6 +11,9 @@ w is the IMU's noise over the scan (prior minus last posterior covariance of the
 P A P), and n that of the map points: f N points, if N are compared in a scan, place what they bring as badly as a scan
 of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has the covariance of the filter.
 
+Points that lie on one surface share what is wrong with it, and say less than as many independent ones would: v and n can be
+counted several times for that.
+
 The local map is what has been taken in within about one lever arm of the points: what lies farther back is not compared any more.
 """
 
@@ -33,9 +36,11 @@ class MapDatum:
 
     Args:
         x: (36,) first state; cov: (24, 24) its covariance. The first scan makes the map at this pose.
+        shared_errors: how many times the covariance of a scan counts, since its points are not independent.
     """
 
-    def __init__(self, x: NDArray[np.float64], cov: NDArray[np.float64]) -> None:
+    def __init__(self, x: NDArray[np.float64], cov: NDArray[np.float64], shared_errors: float = 1.0) -> None:
+        self._shared = shared_errors
         self._filter = _along_world(cov[_POSE, _POSE], x)
         self._joint = np.zeros((12, 12))
         self._joint[_POSE, _POSE] = self._filter
@@ -66,7 +71,7 @@ class MapDatum:
         prior = _along_world(cov_prior[_POSE, _POSE], x)
         joint[_POSE, _POSE] += _positive(prior - move @ self._filter @ move.T)
         if A is not None and directions is not None:
-            joint[_MAP, _MAP] += self._new_share * _along_world(strong_covariance(A, directions), x)
+            joint[_MAP, _MAP] += self._shared * self._new_share * _along_world(strong_covariance(A, directions), x)
             self._new_share = 0.0
             self._local_points *= math.exp(-float(np.linalg.norm(shift)) / directions.lever_arm)
             gain = cov[_POSE][:, MEASURED] @ A
@@ -74,7 +79,7 @@ class MapDatum:
             step[_POSE, _MAP] = _along_world(gain[:, _POSE], x)
             step[_POSE, _POSE] -= step[_POSE, _MAP]
             joint = step @ joint @ step.T
-            joint[_POSE, _POSE] += _along_world(gain @ cov[MEASURED][:, _POSE], x)
+            joint[_POSE, _POSE] += self._shared * _along_world(gain @ cov[MEASURED][:, _POSE], x)
         self._joint, self._filter, self._p_world_imu = joint, _along_world(cov[_POSE, _POSE], x), x[P : P + 3].copy()
 
     def insert(self, points: int) -> None:

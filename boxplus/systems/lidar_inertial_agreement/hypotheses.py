@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart, apart_allowed, unit_of
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
-from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
+from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
 
 Cause = Literal[
     "gyro_unit",
@@ -37,6 +37,7 @@ _BELONGING_RAD_S = np.deg2rad(8.0)  # rms of one sensor that the other must show
 _TOGETHER = 0.5
 _FITS = 0.8
 _CLOSELY = 0.95
+_REVERSED = 0.6  # a sign is told from its opposite by less than a scale from another
 _SCALE_OFF = 0.12
 _OFFSET_OK_S = 0.014
 _OFFSET_STD_S = 0.012
@@ -47,6 +48,7 @@ _SLOPE_KNOWN = 0.3
 _FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
+_TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     findings = [_of_mounting(rotation, T_declared), _of_scale(rotation), _of_clocks(rotation, agreement.imu_rate_hz)]
     if translation is not None:
         findings.append(_of_lengths(translation))
+        findings.append(_of_turn(rotation, translation, T_declared))
     return [finding for finding in findings if finding is not None]
 
 
@@ -173,9 +176,10 @@ def _of_mirror(
 
 
 def _reversed(translation: TranslationFit) -> bool:
-    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
+    if translation.explained < _REVERSED or translation.sigma > _MISFIT_M:
         return False
-    return translation.slope < -0.4 and translation.slope + 3.0 * float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < 0.0
+    std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
+    return translation.slope < -0.4 and translation.slope + 5.0 * std < 0.0
 
 
 def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
@@ -199,6 +203,24 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
             f"{matrix_text(rotation.R_imu_lidar)}"
         )
     return Finding("extrinsic", f"{text}; {advice}")
+
+
+def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
+    """Where the platform hardly turns, accelerations show the mounting: coarsely, since gravity leaks with attitude."""
+    if T_declared is None or (rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() > 1:
+        return None
+    if translation.explained < _FITS or translation.sigma > _MISFIT_M or translation.slope < 0.0:
+        return None
+    variance, axes = np.linalg.eigh(translation.covariance[TURN, TURN])
+    seen = np.sqrt(variance) < _TURN_KNOWN_RAD
+    angle = float(np.linalg.norm((axes.T @ translation.turn)[seen]))
+    if not seen.any() or angle < _TURN_OFF_RAD + 3.0 * float(np.sqrt(variance[seen].sum())):
+        return None
+    return Finding(
+        "extrinsic",
+        f"accelerometer and LiDAR accelerate in directions {np.degrees(angle):.0f} deg apart under the given T_imu_lidar: check "
+        "it, and that the topics are those of this mounting",
+    )
 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:
@@ -227,8 +249,6 @@ def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
 
 
 def _of_lengths(translation: TranslationFit) -> Finding | None:
-    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
-        return None
     slope = translation.slope
     std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
     if _reversed(translation):
@@ -237,6 +257,8 @@ def _of_lengths(translation: TranslationFit) -> Finding | None:
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
         return Finding("force_sign", text)
+    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
+        return None
     if abs(slope - 1.0) > max(_LEVER_OFF, 3.0 * std) and std < _SLOPE_KNOWN and slope > 0.0:
         name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
         return Finding(

@@ -14,35 +14,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, strong_step
-from boxplus.filtering.nav_state import TANGENT, NavState, P, R, boxplus_into
+from boxplus.filtering.degeneracy import PoseDirections
+from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.registration import (
+    GOOD_MISFIT_M,
+    align,
+    honest_information,
+    thinned,
+    undistorted,
+)
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.plane_measurement import REASONS, PlaneMeasurement
 
 _MOST_POINTS = 1500  # that a scan is registered with
 _MOST_MAP_POINTS = 5000  # that it leaves in the map
 _MOST_RAW = 12_000  # that it is undistorted and filtered from
-_STEPS = 12
-_SETTLED = 2e-4  # rad and m
 _PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
 _NODES = 21  # within a scan, of a known turning
 _SAME_MOTION = 2e-3  # rad and m between passes
 _FEWEST_USED = 60
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
-_GOOD = 0.06  # m, misfit that needs no second start
 _LEAST_SHARE = 0.25  # of the points lie on the map, or the scan is not registered
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
-_SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class LidarPath:
         weak: (K,) bool, whether the scene left a direction undetermined.
         misfit: (K,) float64, rms distance of the points from their planes [m].
         failed: scans that could not be registered.
+        cost: (K,) float64, mean squared distance with points that match nothing counted as far off [m²]; 0 for first poses.
     """
 
     time_ns: NDArray[np.int64]
@@ -68,6 +71,7 @@ class LidarPath:
     weak: NDArray[np.bool_]
     misfit: NDArray[np.float64]
     failed: int
+    cost: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -83,6 +87,7 @@ class LidarPath:
             self.weak[chosen],
             self.misfit[chosen],
             self.failed,
+            self.cost[chosen],
         )
 
 
@@ -100,6 +105,7 @@ def lidar_path(
     *,
     undistort: bool = False,
     expected: Sequence[Twist] | None = None,
+    velocity: NDArray[np.float64] | None = None,
 ) -> LidarPath:
     """The path of the LiDAR through `scans`, in order of time; streamed.
 
@@ -109,8 +115,9 @@ def lidar_path(
         guesses: how the LiDAR may have turned, further starts for every registration; the one that fits best is kept.
         undistort: whether to undistort with the first guess, where it has been found to be right, instead of a constant rate.
         expected: of every scan, how an estimator believes that the LiDAR moved: one more start.
+        velocity: (3,) with which the first registration begins [m/s], LiDAR frame; zero when not given.
     """
-    motion = LidarMotion(config, guesses, undistort=undistort)
+    motion = LidarMotion(config, guesses, undistort=undistort, velocity=velocity)
     for number, scan in enumerate(scans):
         motion.add(scan, None if expected is None else expected[number])
     return motion.path()
@@ -119,7 +126,14 @@ def lidar_path(
 class LidarMotion:
     """Registers scans one after the other; arguments as for `lidar_path`."""
 
-    def __init__(self, config: LioConfig, guesses: Sequence[Turning] = (), *, undistort: bool = False) -> None:
+    def __init__(
+        self,
+        config: LioConfig,
+        guesses: Sequence[Turning] = (),
+        *,
+        undistort: bool = False,
+        velocity: NDArray[np.float64] | None = None,
+    ) -> None:
         self._config = config
         self._guesses = tuple(guesses)
         self._undistort = undistort and bool(guesses)
@@ -130,6 +144,8 @@ class LidarMotion:
         self._segment = -1
         self._usual = 0.0
         self._restart()
+        if velocity is not None:
+            self._velocity = velocity.copy()
 
     def _restart(self) -> None:
         self._tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
@@ -151,6 +167,7 @@ class LidarMotion:
             np.array([pose.weak for pose in poses], bool),
             np.array([pose.misfit for pose in poses], np.float64),
             self._failed,
+            np.array([pose.cost for pose in poses], np.float64),
         )
 
     def add(self, scan: Scan, expected: Twist | None = None) -> None:
@@ -161,7 +178,10 @@ class LidarMotion:
             return
         scan = thinned(scan, _MOST_RAW)
         middle_ns = (scan.start_ns + scan.end_ns) // 2
-        step_s = 0.0 if self._previous_ns is None else (middle_ns - self._previous_ns) * 1e-9
+        if self._previous_ns is None:
+            self._begin(scan, middle_ns)
+            return
+        step_s = (middle_ns - self._previous_ns) * 1e-9
         if not 0.0 < step_s < _LONGEST_STEP_S:
             self._restart()
             self._begin(scan, middle_ns)
@@ -178,7 +198,7 @@ class LidarMotion:
             return
         self._usual = fit.misfit if self._usual == 0.0 else 0.9 * self._usual + 0.1 * fit.misfit
         self._x, self._rate, self._velocity = fit.x, fit.rate, fit.velocity
-        self._keep(middle_ns, fit.information, fit.weak, fit.misfit)
+        self._keep(middle_ns, fit.information, fit.weak, fit.misfit, fit.cost)
         self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
         self._previous_ns = middle_ns
 
@@ -192,7 +212,7 @@ class LidarMotion:
         best: _Fit | None = None
         kept = self._tree, self._rate, self._velocity
         for velocity in [np.zeros(3), *speeds]:
-            if best is not None and best.misfit < _GOOD:
+            if best is not None and best.misfit < GOOD_MISFIT_M:
                 break
             if velocity.any():
                 self._tree, self._rate, self._velocity = self._map_of(first, np.zeros(3), velocity), np.zeros(3), velocity
@@ -217,12 +237,16 @@ class LidarMotion:
     def _begin(self, scan: Scan, middle_ns: int) -> None:
         self._previous_ns = middle_ns
         self._first = scan
-        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 6)), 0.0)
+        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 0)), 0.0, 0.0)
         self._tree.insert(self._map_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
 
-    def _keep(self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float) -> None:
+    def _keep(
+        self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float, cost: float
+    ) -> None:
         R_path_lidar, p_path_lidar = self._x[R : R + 9].reshape(3, 3).copy(), self._x[P : P + 3].copy()
-        self._poses.append(_Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.any()), misfit))
+        self._poses.append(
+            _Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.size), misfit, cost)
+        )
 
     def _best(self, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
         """The registration that fits best, from constant velocity, from the guesses and, if need be, from other speeds."""
@@ -248,7 +272,7 @@ class LidarMotion:
         starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
         best: _Fit | None = None
         for number, (rate, velocity) in enumerate(starts):
-            if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, _GOOD):
+            if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, GOOD_MISFIT_M):
                 break
             found = self._register(scan, middle_ns, step_s, rate, velocity)
             if found is not None and (best is None or found.cost < best.cost):
@@ -312,7 +336,7 @@ class LidarMotion:
             x,
             rate,
             velocity,
-            _honest(information.A[:6, :6], directions, information.residual_rms),
+            honest_information(information.A[:6, :6], directions, information.residual_rms),
             directions.vectors[:, directions.weak],
             information.residual_rms,
             cost,
@@ -329,6 +353,7 @@ class _Pose:
     segment: int
     weak: bool
     misfit: float
+    cost: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,51 +366,3 @@ class _Fit:
     misfit: float
     cost: float
     map_points: NDArray[np.float32]
-
-
-def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConfig) -> PoseDirections | None:
-    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
-    delta = np.zeros(TANGENT)
-    directions: PoseDirections | None = None
-    for step in range(_STEPS):
-        information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
-        if information.used < config.min_points:
-            return None
-        directions = information.directions
-        delta[:6] = strong_step(information.A, information.b, directions)
-        boxplus_into(x, delta, x)
-        if np.abs(delta).max() < _SETTLED:
-            break
-    return directions
-
-
-def _honest(A: NDArray[np.float64], directions: PoseDirections, misfit: float) -> NDArray[np.float64]:
-    """The information (6, 6) of a registration, nothing along weak directions, and nowhere more than floor and misfit allow."""
-    scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
-    # Orthonormal, in units of the lever arm, and across all that is weak.
-    strong = np.linalg.qr(directions.vectors[:, directions.weak], mode="complete")[0][:, directions.weak.sum() :]
-    covariance = np.linalg.inv(strong.T @ (A * np.outer(scale, scale)) @ strong)
-    # The floor is a variance of its own, added in the coordinates of the strong directions.
-    floor = strong.T @ np.diag((max(misfit / _GOOD, 1.0) * _SIGMA_FLOOR / scale) ** 2) @ strong
-    reduced = np.linalg.inv(covariance + floor)
-    back = strong / scale[:, None]
-    honest: NDArray[np.float64] = back @ reduced @ back.T
-    return honest
-
-
-def thinned(scan: Scan, most: int) -> Scan:
-    """Every n-th point, so that at most `most` stay."""
-    stride = -(-len(scan) // most)
-    if stride <= 1:
-        return scan
-    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns)
-
-
-def undistorted(scan: Scan, nodes: NDArray[np.float64], at_ns: int) -> NDArray[np.float32]:
-    """The points (N, 3) as seen at `at_ns` by a LiDAR that moves through `nodes`."""
-    out = np.empty_like(scan.p_lidar)
-    deskew_into(scan.p_lidar, scan.time_ns, at_ns, nodes, len(nodes), _AT_REST, out)
-    return out
-
-
-_AT_REST = NavState.identity().pack()

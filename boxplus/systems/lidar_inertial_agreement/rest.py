@@ -29,6 +29,10 @@ _POSE_SIGMA_M = 0.004
 _CREEP_M_S = 0.15
 _AS_WELL = 1.1  # times the cost
 _COMPARED, _POINTS = 3, 3000
+_MANY, _MOST_MAP_POINTS = 15, 5000
+_THICKEST_M, _FLAT = 0.06, 0.05
+_ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
+_ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and share of all
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,31 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> Res
     ).all()
     speed = float(np.linalg.norm(speeds))
     at_rest = rate < _SLOW_RAD_S and bool(slow or (speed < _CREEP_M_S and _fits_unmoved(path, scans, config)))
-    return Rest(at_rest, bool(seen.all()), axes[:, ~seen].T, speed, rate)
+    open_axes = axes[:, ~seen].T
+    if at_rest and seen.all() and not _faces(path, scans, config, axes[:, 0]):
+        open_axes = axes[:, :1].T
+    return Rest(at_rest, len(open_axes) == 0, open_axes, speed, rate)
+
+
+def _faces(path: LidarPath, scans: Sequence[Scan], config: LioConfig, axis: NDArray[np.float64]) -> bool:
+    """Whether there are surfaces across an axis (3,) that would show a motion along it.
+
+    Where a ring passes from a wall to a ceiling its points span a plane that faces the sensor, goes along with it and ties it to
+    its own pattern. A surface that is one still is a plane with three times as many of its neighbours.
+    """
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    voxel_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+    for k, scan in enumerate(scans):
+        placed = voxel_filter(scan.p_lidar)[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k]
+        tree.insert(placed, downsample=True)
+    points = voxel_filter(scans[-1].p_lidar)[0].astype(np.float64) @ path.R_path_lidar[-1].T + path.p_path_lidar[-1]
+    neighbours = tree.nearest(points, _MANY).points
+    full = np.isfinite(neighbours).all(axis=(1, 2))
+    near = neighbours[full] - neighbours[full].mean(axis=1, keepdims=True)
+    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / _MANY)
+    plane = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
+    across = (vectors[plane, :, 0] @ axis) ** 2
+    return float(across[across > _ACROSS].sum()) > max(_ENOUGH_ACROSS, _SHARE_ACROSS * len(points))
 
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> bool:

@@ -5,10 +5,10 @@ and
 
     p_L(t) = q₀ + v₀ t + ½ g t² + ∬ R (s a − b) + R(t) p_imu_lidar ,
 
-linear in all that is unknown: over short stretches q₀, v₀, and over all of them gravity g, bias b, lever arm and the slope s. A
-slope of 1 says that metres and seconds of both sensors agree; −1, that one of them is mirrored or reports gravity with the
-other sign; 3.28, that the LiDAR measures feet. Along directions that the scene does not determine the LiDAR says nothing, and
-is not asked.
+linear in all that is unknown, to first order also in an error of the mounting's rotation, which turns R a: over short stretches
+q₀, v₀, and over all of them gravity g, bias b, lever arm and the slope s. A slope of 1 says that metres and seconds of both
+sensors agree; −1, that one of them is mirrored or reports gravity with the other sign; 3.28, that the LiDAR measures feet.
+Along directions that the scene does not determine the LiDAR says nothing, and is not asked.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ _FEWEST_POSES = 6  # of a stretch
 _SIGMA_M = 0.004  # of a pose by registration
 _LACKING_M = 0.1
 _ATTITUDE_RAD = 0.02
-_SHARED = 10
+_SHARED = 13
 _TIE_STD = 0.05  # m/s²
-GRAVITY, BIAS, ARM, SLOPE = slice(0, 3), slice(3, 6), slice(6, 9), 9
-_PRIOR_STD = np.array([100.0] * 3 + [0.2] * 3 + [0.5] * 3 + [5.0])
+_ANYWHERE_M, _ANY_SPEED_M_S = 1e3, 15.0  # where the LiDAR says nothing
+GRAVITY, BIAS, ARM, SLOPE, TURN = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+_PRIOR_STD = np.array([100.0] * 3 + [0.2] * 3 + [0.5] * 3 + [5.0] + [0.5] * 3)
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Where a stretch began: [q₀, v₀] of the IMU (6,) in the path's frame, and their (16, 16) covariance with the shared ones."""
+    """Where a stretch began: [q₀, v₀] of the IMU (6,) in the path's frame, and their (19, 19) covariance with the shared ones."""
 
     time_ns: int
     state: NDArray[np.float64]
@@ -49,7 +50,8 @@ class TranslationFit:
 
     Attributes:
         gravity: (3,) [m/s²]; bias: (3,) of the accelerometer [m/s²]; p_imu_lidar: (3,) [m]; slope: see the module.
-        covariance: (10, 10) of these, in this order.
+        turn: (3,) rotation vector by which the accelerations would turn the mounting, R_imu_lidar ← Exp(turn) R_imu_lidar [rad].
+        covariance: (13, 13) of these, in this order.
         stretches: positions and velocities of the IMU at the beginnings of the stretches.
         sigma: rms of what is left of the positions [m].
         chi2: of it, per degree of freedom, before the covariance was scaled by it.
@@ -61,6 +63,7 @@ class TranslationFit:
     bias: NDArray[np.float64]
     p_imu_lidar: NDArray[np.float64]
     slope: float
+    turn: NDArray[np.float64]
     covariance: NDArray[np.float64]
     stretches: list[Stretch]
     sigma: float
@@ -97,7 +100,7 @@ class BodyAttitude:
 
 
 def wide_prior() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean (10,) and standard deviations (10,) of what is known of any IMU and any mounting."""
+    """Mean (13,) and standard deviations (13,) of what is known of any IMU and any mounting."""
     mean = np.zeros(_SHARED)
     mean[SLOPE] = 1.0
     return mean, _PRIOR_STD.copy()
@@ -118,7 +121,7 @@ def compare_accelerations(
         path: from `lidar_path`; its last segment is used.
         imu: finite samples in order of time; gyroscope in rad/s.
         R_imu_lidar, bias_gyro, offset_s: as found by `compare_rotations`.
-        prior: (10,) mean and (10,) standard deviations of gravity, bias, lever arm and slope, e.g. `wide_prior()`.
+        prior: (13,) mean and (13,) standard deviations of gravity, bias, lever arm, slope and turn, e.g. `wide_prior()`.
         stretch_s: time over which velocity and position are free once: errors of attitude grow with its square [s].
     """
     newest = path.segment == path.segment[-1]
@@ -145,7 +148,7 @@ def compare_accelerations(
         rows, shared, values, weight = _stretch(part, time_ns, imu, attitude, index)
         # q₀ and v₀ leave by a Schur complement.
         A, B, y = (np.einsum("nij,njk->nik", weight, M).reshape(-1, M.shape[-1]) for M in (rows, shared, values[:, :, None]))
-        AtA = A.T @ A + 1e-6 * np.eye(6)
+        AtA = A.T @ A + np.diag(1.0 / np.repeat([_ANYWHERE_M, _ANY_SPEED_M_S], 3) ** 2)
         AtB, Aty = A.T @ B, A.T @ y[:, 0]
         solved = np.linalg.solve(AtA, np.column_stack([AtB, Aty]))
         N += B.T @ B - AtB.T @ solved[:, :-1]
@@ -185,14 +188,24 @@ def compare_accelerations(
     without = x[SLOPE] ** 2 / np.linalg.inv(measured + known)[SLOPE, SLOPE]
     explained = float(without / max(without + rest, 1e-12))
     return TranslationFit(
-        x[GRAVITY], x[BIAS], x[ARM], float(x[SLOPE]), scaled, stretches, _SIGMA_M * np.sqrt(chi2), chi2, explained, samples
+        x[GRAVITY],
+        x[BIAS],
+        x[ARM],
+        float(x[SLOPE]),
+        x[TURN],
+        scaled,
+        stretches,
+        _SIGMA_M * np.sqrt(chi2),
+        chi2,
+        explained,
+        samples,
     )
 
 
 def _stretch(
     path: LidarPath, time_ns: NDArray[np.int64], imu: ImuSamples, attitude: BodyAttitude, index: NDArray[np.intp]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Equations of a stretch: q₀, v₀ (n, 3, 6), the shared unknowns (n, 3, 10), values (n, 3), root weights (n, 3, 3)."""
+    """Equations of a stretch: q₀, v₀ (n, 3, 6), the shared unknowns (n, 3, 13), values (n, 3), root weights (n, 3, 3)."""
     t0, t1 = int(time_ns[index[0]]), int(time_ns[index[-1]])
     low, high = np.searchsorted(imu.time_ns, [t0, t1], side="right")
     grid = np.concatenate([[t0], imu.time_ns[low:high], [t1]])
@@ -202,10 +215,11 @@ def _stretch(
     seconds = (grid - t0) * 1e-9
     dt = np.diff(seconds)[:, None]
     # ∬ R a and ∬ R, both twice integrated with the integrand linear between grid points.
-    integrand = np.concatenate([np.einsum("nij,nj->ni", R, a), R.reshape(-1, 9)], axis=1)
-    velocity = np.vstack([np.zeros(12), np.cumsum(0.5 * (integrand[1:] + integrand[:-1]) * dt, axis=0)])
+    turned = R @ so3.hat(a)  # R Exp(−θ) a ≈ R a + R [a]× θ
+    integrand = np.concatenate([np.einsum("nij,nj->ni", R, a), R.reshape(-1, 9), turned.reshape(-1, 9)], axis=1)
+    velocity = np.vstack([np.zeros(21), np.cumsum(0.5 * (integrand[1:] + integrand[:-1]) * dt, axis=0)])
     swept = velocity[:-1] * dt + (2.0 * integrand[:-1] + integrand[1:]) / 6.0 * dt**2
-    position = np.vstack([np.zeros(12), np.cumsum(swept, axis=0)])
+    position = np.vstack([np.zeros(21), np.cumsum(swept, axis=0)])
     at = np.searchsorted(grid, time_ns[index])
     n, t = len(index), seconds[at]
     rows = np.zeros((n, 3, 6))
@@ -213,9 +227,10 @@ def _stretch(
     rows[:, :, 3:] = t[:, None, None] * np.eye(3)
     shared = np.zeros((n, 3, _SHARED))
     shared[:, :, GRAVITY] = 0.5 * (t**2)[:, None, None] * np.eye(3)
-    shared[:, :, BIAS] = -position[at, 3:].reshape(n, 3, 3)
+    shared[:, :, BIAS] = -position[at, 3:12].reshape(n, 3, 3)
     shared[:, :, ARM] = R[at]
     shared[:, :, SLOPE] = position[at, :3]
+    shared[:, :, TURN] = position[at, 12:].reshape(n, 3, 3)
     return rows, shared, path.p_path_lidar[index], _root_weights(path, index)
 
 

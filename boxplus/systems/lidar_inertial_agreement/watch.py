@@ -24,7 +24,8 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges_clocks,
     judges_rotation,
 )
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist, thinned
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.registration import thinned
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _WINDOW_S = 4.0

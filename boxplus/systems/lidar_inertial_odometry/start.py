@@ -34,6 +34,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import (
     BIAS,
     GRAVITY,
     SLOPE,
+    TURN,
     BodyAttitude,
     TranslationFit,
     compare_accelerations,
@@ -47,9 +48,13 @@ _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
 _MIN_MOVING_SCANS = 8
+_UPRIGHT = 0.9  # cosine
+_LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _SLOPE_STD = 0.01  # of the scale of an accelerometer in order
 _ACCEL_BIAS_STD = 0.15  # m/s²
+_MOUNTING_STD = 0.01  # rad
+_MEAN_ACCEL_STD = 2.0  # m/s²
 _GYRO_BIAS_STD = 5e-3  # rad/s, of the difference to the LiDAR over a second
 _TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
 
@@ -110,18 +115,25 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
         return f"the first scans do not overlap enough to see whether they move ({evidence}); waiting for more data"
     rest = judge_rest(path, scans, config)
     evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
+    bias = float(np.linalg.norm(_gyro_bias(path, imu, extrinsic)))
+    if bias > _LARGEST_BIAS:
+        return (
+            f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: its unit, its "
+            "sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little; waiting for more data"
+        )
     quiet = gyro_std < _QUIET_GYRO and accel_std < _QUIET_ACCEL and len(imu) > 10
     if rest.at_rest and (quiet or rest.determined):
         low, high = _REST_ACCEL_NORM
         if not low <= norm <= high:
             return f"at rest, but the accelerometer shows {norm:.2f} m/s², not one gravity: check its unit and scale"
         state, covariance = _static_state(imu, extrinsic, config)
-        return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}", _undecided(rest))
+        up = extrinsic.R_imu_lidar.T @ imu.accel.mean(axis=0) / norm
+        return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}", _undecided(rest, up))
     if len(frames) < _MIN_MOVING_SCANS:
         return f"not at rest ({evidence}), and {len(frames)} scans are not enough for a moving start; waiting for more data"
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
     steady = ImuSamples(imu.time_ns, imu.gyro - _gyro_bias(path, imu, extrinsic), imu.accel)
-    path = lidar_path(scans, config, gyro_guesses(steady, extrinsic.R_imu_lidar), undistort=True)
+    path = lidar_path(scans, config, gyro_guesses(steady, extrinsic.R_imu_lidar), undistort=True, velocity=_first_velocity(path))
     if path.failed or path.segment[-1] != path.segment[0]:
         return f"not at rest ({evidence}), and the first scans do not overlap enough for a moving start; waiting for more data"
     fit = _moving_fit(frames, path, imu, extrinsic)
@@ -138,12 +150,14 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
 
 
-def _undecided(rest: Rest) -> str:
-    if rest.determined:
+def _undecided(rest: Rest, up_lidar: NDArray[np.float64]) -> str:
+    """A sentence about the axes along which nothing shows rest; up and down, hardly anything begins at a constant speed."""
+    axes = [axis for axis in rest.open_axes if abs(axis @ up_lidar) < _UPRIGHT]
+    if not axes:
         return ""
     return (
         "the surroundings do not show whether the platform moves along "
-        f"{' and '.join(_axis_text(axis) for axis in rest.open_axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
+        f"{' and '.join(_axis_text(axis) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
         "at a constant speed it would be as quiet"
     )
 
@@ -217,10 +231,22 @@ def _moving_fit(frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, extri
     """Velocity, gravity and bias from the LiDAR's path and the accelerometer, with the mounting and metres as given."""
     mean, std = wide_prior()
     mean[ARM], std[ARM] = extrinsic.p_imu_lidar, 0.01
-    std[SLOPE], std[BIAS] = _SLOPE_STD, _ACCEL_BIAS_STD
+    # Over a second the mean specific force is gravity but for the mean acceleration.
+    R_path_imu = path.R_path_lidar[len(path) // 2] @ extrinsic.R_imu_lidar.T
+    mean[GRAVITY], std[GRAVITY] = -R_path_imu @ imu.accel.mean(axis=0), _MEAN_ACCEL_STD
+    std[SLOPE], std[BIAS], std[TURN] = _SLOPE_STD, _ACCEL_BIAS_STD, _MOUNTING_STD
     bias_gyro = _gyro_bias(path, imu, extrinsic)
     seconds = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
     return compare_accelerations(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0.0, (mean, std), stretch_s=seconds + 1.0)
+
+
+def _first_velocity(path: LidarPath) -> NDArray[np.float64]:
+    """(3,) over the first scans [m/s]."""
+    last = min(3, len(path) - 1)
+    velocity: NDArray[np.float64] = (path.p_path_lidar[last] - path.p_path_lidar[0]) / (
+        (path.time_ns[last] - path.time_ns[0]) * 1e-9
+    )
+    return velocity
 
 
 def _gyro_bias(path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> NDArray[np.float64]:

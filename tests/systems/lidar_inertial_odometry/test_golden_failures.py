@@ -13,7 +13,9 @@ from boxplus.recordings.open import open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, trajectories, worlds, write_recording
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 
 AT_S, WALK_S = 5.0, 8.0
 
@@ -159,7 +161,8 @@ def test_accelerometer_in_g_is_refused_at_the_start() -> None:
 
 
 def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
-    failed = walk(faults.gyro_in_deg())
+    unbiased = ImuModel(gyro_bias=(0.0, 0.0, 0.0))  # a bias in degrees alone refuses the start
+    failed = run("walk", WALK_S, faults.gyro_in_deg(), SPARSE, imu=unbiased)
     named = [text for text in failed.warnings if "times as far as the LiDAR: it reports deg/s; convert it to rad/s" in text]
     assert named
     assert failed.estimates[-1].status == "lost"
@@ -168,6 +171,16 @@ def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
     first_warning = next(e.time_ns for e in failed.estimates if e.warnings)
     wrong_by_a_metre = failed.estimates[int(np.argmax(failed.distance > 1.0))].time_ns
     assert first_warning <= wrong_by_a_metre + 300_000_000
+
+
+def test_a_bias_that_no_gyroscope_has_refuses_the_start() -> None:
+    simulation = simulate("walk", 0, duration_s=4.0, lidar=SPARSE)
+    odometry = LidarInertialOdometry(LioConfig(T_imu_lidar=simulation.T_imu_lidar.tolist()))
+    for event in faults.gyro_in_deg().events(simulation.events()):
+        assert not (odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event))
+    assert not odometry.flush()
+    assert odometry.start is None
+    assert "deg/s more than the LiDAR, which no bias explains: its unit, its sign" in str(odometry.start_problem)
 
 
 def test_inverted_extrinsic_is_named() -> None:

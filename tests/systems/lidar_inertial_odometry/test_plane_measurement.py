@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import align
+from boxplus.systems.lidar_inertial_agreement.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 

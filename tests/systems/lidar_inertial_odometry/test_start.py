@@ -62,8 +62,8 @@ def test_moving() -> None:
 
 
 def _shaken(frame: Frame, seed: int) -> Frame:
-    noise = 3.0 * np.random.default_rng(seed).normal(size=frame.imu.accel.shape)
-    return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + noise, frame.imu.accel + noise))
+    noise = np.random.default_rng(seed).normal(size=frame.imu.accel.shape)
+    return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + 0.3 * noise, frame.imu.accel + 3.0 * noise))
 
 
 def test_too_few_scans_in_motion_are_refused_with_the_evidence() -> None:

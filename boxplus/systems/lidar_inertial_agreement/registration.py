@@ -1,0 +1,66 @@
+"""One registration: a scan against a map of those before it, point to plane."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.degeneracy import PoseDirections, strong_step
+from boxplus.filtering.nav_state import TANGENT, NavState, boxplus_into
+from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
+
+GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
+_STEPS = 12
+_SETTLED = 2e-4  # rad and m
+_SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
+
+
+def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConfig) -> PoseDirections | None:
+    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
+    delta = np.zeros(TANGENT)
+    directions: PoseDirections | None = None
+    for step in range(_STEPS):
+        information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
+        if information.used < config.min_points:
+            return None
+        directions = information.directions
+        delta[:6] = strong_step(information.A, information.b, directions)
+        boxplus_into(x, delta, x)
+        if np.abs(delta).max() < _SETTLED:
+            break
+    return directions
+
+
+def honest_information(A: NDArray[np.float64], directions: PoseDirections, misfit: float) -> NDArray[np.float64]:
+    """The information (6, 6) of a registration, nothing along weak directions, and nowhere more than floor and misfit allow."""
+    scale = np.array([1.0 / directions.lever_arm] * 3 + [1.0] * 3)
+    # Orthonormal, in units of the lever arm, and across all that is weak.
+    strong = np.linalg.qr(directions.vectors[:, directions.weak], mode="complete")[0][:, directions.weak.sum() :]
+    covariance = np.linalg.inv(strong.T @ (A * np.outer(scale, scale)) @ strong)
+    # The floor is a variance of its own, added in the coordinates of the strong directions.
+    floor = strong.T @ np.diag((max(misfit / GOOD_MISFIT_M, 1.0) * _SIGMA_FLOOR / scale) ** 2) @ strong
+    reduced = np.linalg.inv(covariance + floor)
+    back = strong / scale[:, None]
+    honest: NDArray[np.float64] = back @ reduced @ back.T
+    return honest
+
+
+def thinned(scan: Scan, most: int) -> Scan:
+    """Every n-th point, so that at most `most` stay."""
+    stride = -(-len(scan) // most)
+    if stride <= 1:
+        return scan
+    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns)
+
+
+def undistorted(scan: Scan, nodes: NDArray[np.float64], at_ns: int) -> NDArray[np.float32]:
+    """The points (N, 3) as seen at `at_ns` by a LiDAR that moves through `nodes`."""
+    out = np.empty_like(scan.p_lidar)
+    deskew_into(scan.p_lidar, scan.time_ns, at_ns, nodes, len(nodes), _AT_REST, out)
+    return out
+
+
+_AT_REST = NavState.identity().pack()
