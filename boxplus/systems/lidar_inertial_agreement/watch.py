@@ -2,7 +2,7 @@
 
 Every few seconds the last scans are registered without the IMU and compared with it (`compare_sensors`), on a thread beside the
 estimator; the verdict is taken up a fixed number of scans later, so that the run does not depend on the machine. Where the
-estimator itself has a suspicion the comparison is made at once.
+estimator itself has a suspicion the comparison comes at once, and its verdict sooner.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 _WINDOW_S = 4.0
 _FEWEST_SCANS = 20
 _MOST_POINTS = 6000
-_TAKEN_UP_AFTER = 40  # scans
+_TAKEN_UP_AFTER, _TAKEN_UP_EARLY = 40, 10  # scans, and when the estimator suspects something
 _UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
 _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
-_SUSPECTED_EVERY_S = 2.0
+_SUSPECTED_EVERY_S = 4.0
 
 
 class Watch:
@@ -59,7 +59,8 @@ class Watch:
         self._pending: Future[Agreement] | None = None
         self._scans_since = 0
         self._due_ns: int | None = None
-        self._suspected_ns: int | None = None
+        self._suspected_ns = 0
+        self._take_up_after = _TAKEN_UP_AFTER
         self._decided = 0
         self._first_with_clocks: Agreement | None = None
 
@@ -72,7 +73,7 @@ class Watch:
             scan, imu: in order of time.
             T_imu_lidar: (4, 4) in use now.
             expected: how the estimator believes that the LiDAR moved within the scan.
-            suspicious: whether to compare at once.
+            suspicious: whether to compare now, whenever the next comparison is due.
         """
         self._scans.append(thinned(scan, _MOST_POINTS))
         self._imu.append(imu)
@@ -85,15 +86,16 @@ class Watch:
             self._due_ns = scan.start_ns + round(_WINDOW_S * 1e9)
         self._scans_since += 1
         news = None
-        if self._pending is not None and self._scans_since >= _TAKEN_UP_AFTER:
+        if self._pending is not None and self._scans_since >= self._take_up_after:
             news = self._take_up(self._pending.result())
             self._pending = None
         if len(self._scans) < _FEWEST_SCANS:
             return news
-        if suspicious and self._pending is None and (self._suspected_ns is None or scan.end_ns > self._suspected_ns):
+        # What has been named need not be looked for again at once.
+        early = suspicious and self.contradiction is None and scan.end_ns >= self._suspected_ns
+        if self._pending is None and (scan.end_ns >= self._due_ns or early):
             self._suspected_ns = scan.end_ns + round(_SUSPECTED_EVERY_S * 1e9)
-            return self._take_up(self._comparison(T_imu_lidar)()) or news
-        if self._pending is None and scan.end_ns >= self._due_ns:
+            self._take_up_after = _TAKEN_UP_EARLY if early else _TAKEN_UP_AFTER
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(1, thread_name_prefix="boxplus-watch")
             self._pending = self._pool.submit(self._comparison(T_imu_lidar))

@@ -35,6 +35,7 @@ from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, f
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 
 _LONGEST_START_SCANS = 30
+_SCANS_BETWEEN_TRIES = 5
 _BLIND_PASSES = 3
 # Over random recordings, rooms to streets and 16 to 128 channels, this brings the errors of the pose to their covariance;
 # where scans are dense and surfaces smooth it is cautious.
@@ -62,6 +63,7 @@ class LidarInertialOdometry:
         self.start_problem: str | None = None
         self._sequencer = Sequencer()
         self._waiting: list[Frame] = []
+        self._next_try = 0  # scans that wait
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
@@ -157,12 +159,13 @@ class LidarInertialOdometry:
                 continue
             self._waiting.append(frame)
             seconds = (frame.scan.end_ns - self._waiting[0].scan.start_ns) * 1e-9
-            if seconds >= self.config.start_duration:
+            if seconds >= self.config.start_duration and len(self._waiting) >= self._next_try:
                 estimates += self._try_start()
         return estimates
 
     def _interrupt(self, frame: Frame) -> Frame:
         """Nothing says how the platform moved since the last scan: back to the search for a start, with a new map."""
+        self._next_try = 0
         self._gap = " ".join(filter(None, [self._consistency.contradiction, gap_text(frame.duration_s)]))
         self._consistency = Consistency(self.config, self._declared())
         self.start, self._standstill = None, None
@@ -181,6 +184,7 @@ class LidarInertialOdometry:
             forgotten = max(len(self._waiting) - keep, 0)
             self._sequencer.rejected["scan before a start could be found"] += forgotten
             del self._waiting[:forgotten]
+            self._next_try = min(len(self._waiting) + _SCANS_BETWEEN_TRIES, _LONGEST_START_SCANS + _SCANS_BETWEEN_TRIES)
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
