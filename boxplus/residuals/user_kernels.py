@@ -130,7 +130,7 @@ def _with_checked_helpers(function: Any, outer: tuple[Any, ...] = ()) -> Any:
         name: kernel(_with_checked_helpers(value.py_func, (*outer, function)), inline=True, cached=False, checked=True)
         for name, value in {**scope.globals, **scope.nonlocals}.items()
         if isinstance(value, Dispatcher)
-        and not value.__module__.startswith("boxplus.")
+        and not (value.__module__ or "").startswith("boxplus.")
         and value.py_func not in (*outer, function)
     }
     if not found:

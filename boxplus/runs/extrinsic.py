@@ -43,6 +43,7 @@ class Extrinsic:
         refine: it is a guess, to be refined while running wherever the motion allows.
         warning: what the user should do about it; empty when it is given and nothing contradicts it.
         sigma: standard deviations of rotation [deg] and translation [m]; None leaves those of the configuration.
+        contradiction: what the sensors contradict over the first seconds of rotation, whatever the mounting; sentences.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -51,6 +52,7 @@ class Extrinsic:
     refine: bool
     warning: str
     sigma: tuple[float, float] | None = None
+    contradiction: str = ""
 
     def applied_to(self, config: LioConfig) -> LioConfig:
         """The configuration with this extrinsic; a guess is refined online unless the configuration decides."""
@@ -80,14 +82,16 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
     if stretch is not None:
         declared = None if known is None else known.T_imu_lidar
         agreement = compare_sensors(*stretch, config, T_declared=declared, refine=known is None)
-        for finding in contradictions(agreement, declared):
+        found = contradictions(agreement, declared)
+        for finding in found:
             if finding.cause == "gyro_unit":
                 raise InputError(
                     f"angular velocities in {recording.info.gyro_unit}, as they are read", finding.text, _UNIT_ADVICE
                 )
-            if known is not None:
-                known = replace(known, warning=finding.text)
-    return known if known is not None else _estimated(agreement)
+        text = "; ".join(finding.text for finding in found)
+        chosen = _estimated(agreement) if known is None else known
+        return replace(chosen, warning="; ".join(filter(None, [text, chosen.warning])), contradiction=text)
+    return known if known is not None else _estimated(None)
 
 
 def _known_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic | None:

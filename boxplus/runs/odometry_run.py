@@ -331,7 +331,7 @@ class _Run:
             path_length_m=statistics.path_length_m,
             scans_read=statistics.scans_read,
             imu_samples_read=statistics.imu_samples_read,
-            contradiction=self._odometry.contradiction,
+            contradiction=self._odometry.contradiction or self._extrinsic.contradiction or None,
             rejected={
                 "recording": self._recording.rejected,
                 "odometry": dict(self._odometry.counters),

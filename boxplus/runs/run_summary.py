@@ -128,7 +128,9 @@ class RunSummary(_Part):
     last_time_ns: int | None = None
     duration_s: float = Field(0.0, description="between the first and the last estimate [s]")
     path_length_m: float = Field(0.0, description="sum of the distances between successive estimates")
-    contradiction: str | None = Field(None, description="how gyroscope and LiDAR contradict each other, whatever the status")
+    contradiction: str | None = Field(
+        None, description="why the run is not to be trusted, whatever the status: how LiDAR and IMU contradict each other"
+    )
     scans_read: int = 0
     imu_samples_read: int = 0
     rejected: dict[str, dict[str, int]] = Field(

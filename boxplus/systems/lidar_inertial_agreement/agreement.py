@@ -100,7 +100,8 @@ def compare_sensors(
     if rotation is not None and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
         R = rotation.R_imu_lidar
     translation = None
-    if (rotation is not None and rotation.explained > _EXPLAINED) or T_declared is not None:
+    enough = len(path) > 0 and len(imu) > 1
+    if enough and ((rotation is not None and rotation.explained > _EXPLAINED) or T_declared is not None):
         bias = np.zeros(3) if rotation is None or rotation.explained < _EXPLAINED else rotation.bias
         scale = 1.0 if rotation is None else unit_of(rotation.scale)
         offset = 0.0 if rotation is None or rotation.offset_std_s > _OFFSET_KNOWN_S else rotation.offset_s

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart, apart_allowed, unit_of
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
 
@@ -30,7 +29,7 @@ Cause = Literal[
     "length_scale",
 ]
 
-_MOST_WEAK = 0.5
+_LEAST_SEEN = 0.5  # of the pairs of scans, all three rotations
 _GOOD_PATH_M = 0.15  # median misfit of registrations that can be believed
 _TURNING_RAD_S = np.deg2rad(1.0)  # rms below which rotations say nothing about unit and sign
 _BELONGING_RAD_S = np.deg2rad(8.0)  # rms of one sensor that the other must show
@@ -41,7 +40,7 @@ _REVERSED = 0.6  # a sign is told from its opposite by less than a scale from an
 _SCALE_OFF = 0.12
 _OFFSET_OK_S = 0.014
 _OFFSET_STD_S = 0.012
-_LEVER_OFF = 0.07
+_SLOPE_OFF = 0.07
 _SLOPE_FLOOR = 0.02
 _MISFIT_M = 0.03
 _SLOPE_KNOWN = 0.3
@@ -66,8 +65,8 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
         agreement: from `compare_sensors`.
         T_declared: (4, 4) T_imu_lidar in use; None where it is an estimate of the same data.
     """
-    path, rotation, translation = agreement.path, agreement.rotation, agreement.translation
-    if rotation is None or not _path_counts(path):
+    rotation, translation = agreement.rotation, agreement.translation
+    if rotation is None or not _path_counts(agreement):
         return []
     found = (
         _of_unit(rotation)
@@ -84,15 +83,18 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     return [finding for finding in findings if finding is not None]
 
 
-def _path_counts(path: LidarPath) -> bool:
-    """Whether a path can contradict anything: its scans fit one another, and the scene determines most of them."""
-    return len(path) > 0 and float(np.median(path.misfit)) < _GOOD_PATH_M and float(path.weak.mean()) < _MOST_WEAK
+def _path_counts(agreement: Agreement) -> bool:
+    """Whether a path can contradict anything: its scans fit one another, and the scene shows most of its rotations."""
+    path, rotation = agreement.path, agreement.rotation
+    if rotation is None or float(np.median(path.misfit)) > _GOOD_PATH_M:
+        return False
+    return rotation.intervals > _LEAST_SEEN * (len(path) - 1)
 
 
 def judges_rotation(agreement: Agreement) -> bool:
     """Whether the motion was enough for unit, sign and mounting to show, had they been wrong."""
     rotation = agreement.rotation
-    if rotation is None or not _path_counts(agreement.path) or rotation.explained < _FITS:
+    if rotation is None or not _path_counts(agreement) or rotation.explained < _FITS:
         return False
     return _turning(rotation) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() >= 2)
 
@@ -105,10 +107,24 @@ def judges_clocks(rotation: RotationFit) -> bool:
 def judges_lengths(agreement: Agreement) -> bool:
     """Whether the motion shows sign and scale of the accelerations."""
     translation = agreement.translation
-    if translation is None or not _path_counts(agreement.path):
+    if translation is None or not _path_counts(agreement):
         return False
     fits = translation.explained > _FITS and translation.sigma < _MISFIT_M
     return fits and float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < _SLOPE_KNOWN
+
+
+def judges(cause: Cause, agreement: Agreement) -> bool:
+    """Whether a comparison could have shown this mistake, so that saying nothing of it clears it."""
+    rotation = agreement.rotation
+    if rotation is None:
+        return False
+    if cause in ("time_offset", "clock_drift"):
+        return _path_counts(agreement) and judges_clocks(rotation)
+    if cause in ("force_sign", "length_scale"):
+        return judges_lengths(agreement)
+    if cause in ("extrinsic", "mirrored"):
+        return judges_rotation(agreement) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).all())
+    return judges_rotation(agreement)
 
 
 def _turning(rotation: RotationFit) -> bool:
@@ -153,7 +169,7 @@ def _of_belonging(agreement: Agreement, rotation: RotationFit) -> Finding | None
         "not_together",
         f"the LiDAR turns with {np.degrees(np.linalg.norm(rotation.excitation)):.1f} deg/s (rms) and the gyroscope with "
         f"{np.degrees(np.sqrt(agreement.gyro_power)):.1f} deg/s, and only {rotation.together:.0%} of it agrees, under "
-        "any mounting and any clock offset up to half a second: the IMU is not the one of this LiDAR (--imu-topic, "
+        "any mounting and any clock offset up to 0.6 s: the IMU is not the one of this LiDAR (--imu-topic, "
         "--lidar-topic), or their clocks are farther apart",
     )
 
@@ -259,7 +275,7 @@ def _of_lengths(translation: TranslationFit) -> Finding | None:
         return Finding("force_sign", text)
     if translation.explained < _FITS or translation.sigma > _MISFIT_M:
         return None
-    if abs(slope - 1.0) > max(_LEVER_OFF, 3.0 * std) and std < _SLOPE_KNOWN and slope > 0.0:
+    if abs(slope - 1.0) > max(_SLOPE_OFF, 3.0 * std) and std < _SLOPE_KNOWN and slope > 0.0:
         name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
         return Finding(
             "length_scale",

@@ -114,7 +114,7 @@ def lidar_path(
         config: the noise of the points and the sizes of map cells and voxels; nothing of the IMU is used.
         guesses: how the LiDAR may have turned, further starts for every registration; the one that fits best is kept.
         undistort: whether to undistort with the first guess, where it has been found to be right, instead of a constant rate.
-        expected: of every scan, how an estimator believes that the LiDAR moved: one more start.
+        expected: of every scan, how an estimator believes that the LiDAR moved: one more start, and no further search.
         velocity: (3,) with which the first registration begins [m/s], LiDAR frame; zero when not given.
     """
     motion = LidarMotion(config, guesses, undistort=undistort, velocity=velocity)
@@ -208,7 +208,8 @@ class LidarMotion:
         The first was taken as it came. At 8 m/s it and the next are distorted alike, and fit each other where they are: where
         rest does not fit well, both are tried at speed.
         """
-        speeds = [speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])]
+        axes = np.vstack([np.eye(3), -np.eye(3)])
+        speeds = [speed * axis for speed in _FIRST_SPEEDS for axis in axes] if expected is None else []
         best: _Fit | None = None
         kept = self._tree, self._rate, self._velocity
         for velocity in [np.zeros(3), *speeds]:
@@ -269,7 +270,8 @@ class LidarMotion:
             )
         ]
         needed = len(starts)
-        starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
+        if expected is None:  # who has an estimate needs no search
+            starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
         best: _Fit | None = None
         for number, (rate, velocity) in enumerate(starts):
             if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, GOOD_MISFIT_M):

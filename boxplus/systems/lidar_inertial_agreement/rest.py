@@ -114,7 +114,7 @@ def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> 
     for scan in scans[:_COMPARED]:
         tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
     unmoved, moved = 0.0, 0.0
-    for k in range(1, _COMPARED + 1):
+    for k in range(1, min(_COMPARED, len(scans) - 1) + 1):
         points = voxel_filter(scans[-k].p_lidar)[0]
         for found in (False, True):
             x = NavState.identity().pack()

@@ -23,6 +23,7 @@ LARGEST_OFFSET_S = 0.6
 _OFFSET_STEP_S = 0.02
 FEWEST_INTERVALS = 8
 _ROUNDS = 8
+_LONGEST_GAP_NS = 200_000_000
 _NO_BETTER = 0.5
 _SEEN_RAD = 0.01  # of a registration, about its least known axis
 _DEGREES = 180.0 / np.pi
@@ -39,7 +40,7 @@ class RotationFit:
         R_imu_lidar: (3, 3). Where the motion leaves it open, the closest to what was expected.
         offset_s: add this to the LiDAR's times to bring them to the IMU's clock [s].
         scale: the gyroscope's rotation over the LiDAR's: 1, or 57.3 for a gyroscope in deg/s.
-        bias: (3,) of the gyroscope, in its own unit divided by `scale`'s.
+        bias: (3,) of the gyroscope, in its own unit.
         covariance: (8, 8) of [θ about the IMU's axes, bias, log scale, offset].
         sigma: rms of what is left of the rates [rad/s].
         explained: share of the LiDAR's rotation rates (squared) that the gyroscope shows, 0 to 1.
@@ -96,8 +97,7 @@ def compare_rotations(
     pairs = np.flatnonzero((path.segment[1:] == path.segment[:-1]) & seen[1:])
     attitude = GyroAttitude(imu.time_ns, imu.gyro)
     begin_ns, end_ns = path.time_ns[pairs], path.time_ns[pairs + 1]
-    # Times without samples within the offsets that are searched cannot be compared at each of them.
-    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0)
+    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0) & ~_across_gap(imu.time_ns, begin_ns, end_ns)
     pairs, begin_ns, end_ns = pairs[inside], begin_ns[inside], end_ns[inside]
     if len(pairs) < FEWEST_INTERVALS:
         return None
@@ -160,6 +160,15 @@ def compare_rotations(
         np.sqrt(power),
         len(pairs),
     )
+
+
+def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the intervals [begin, end] (K,) lie, in part, between samples that are too far apart to be integrated over."""
+    gap = np.flatnonzero(np.diff(time_ns) > _LONGEST_GAP_NS)
+    across: NDArray[np.bool_] = np.zeros(len(begin_ns), dtype=np.bool_)
+    for left, right in zip(time_ns[gap], time_ns[gap + 1], strict=True):
+        across |= (begin_ns < right) & (end_ns > left)
+    return across
 
 
 class _Refined:

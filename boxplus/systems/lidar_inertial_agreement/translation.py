@@ -154,7 +154,7 @@ def compare_accelerations(
         N += B.T @ B - AtB.T @ solved[:, :-1]
         rhs += B.T @ y[:, 0] - AtB.T @ solved[:, -1]
         rest += float(y[:, 0] @ y[:, 0] - Aty @ solved[:, -1])
-        freedom += A.shape[0] - 6
+        freedom += int(np.count_nonzero(np.abs(weight).sum(axis=2))) - 6
         samples += len(index)
         eliminated.append((int(time_ns[index[0]]), solved, np.linalg.inv(AtA)))
     if not samples:

@@ -21,6 +21,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     Finding,
     clock_drift,
     contradictions,
+    judges,
     judges_clocks,
     judges_rotation,
 )
@@ -34,7 +35,7 @@ _MOST_POINTS = 6000
 _TAKEN_UP_AFTER, _TAKEN_UP_EARLY = 40, 10  # scans, and when the estimator suspects something
 _UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
 _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
-_SUSPECTED_EVERY_S = 4.0
+_SUSPECTED_EVERY_S = 2.0
 
 
 class Watch:
@@ -62,10 +63,20 @@ class Watch:
         self._suspected_ns = 0
         self._take_up_after = _TAKEN_UP_AFTER
         self._decided = 0
+        self._doubted = False
+        self._blind_scans = 0
+        self._T_last: NDArray[np.float64] | None = None
         self._first_with_clocks: Agreement | None = None
 
     def add(
-        self, scan: Scan, imu: ImuSamples, T_imu_lidar: NDArray[np.float64], expected: Twist, *, suspicious: bool = False
+        self,
+        scan: Scan,
+        imu: ImuSamples,
+        T_imu_lidar: NDArray[np.float64],
+        expected: Twist,
+        *,
+        suspicious: bool = False,
+        blind: bool = False,
     ) -> str | None:
         """Take a scan and its samples in; returns a new contradiction, a sentence, or None.
 
@@ -74,7 +85,9 @@ class Watch:
             T_imu_lidar: (4, 4) in use now.
             expected: how the estimator believes that the LiDAR moved within the scan.
             suspicious: whether to compare now, whenever the next comparison is due.
+            blind: samples are missing within the scan: as long as it is among the last ones nothing is compared.
         """
+        self._T_last = T_imu_lidar
         self._scans.append(thinned(scan, _MOST_POINTS))
         self._imu.append(imu)
         self._expected.append(expected)
@@ -89,7 +102,8 @@ class Watch:
         if self._pending is not None and self._scans_since >= self._take_up_after:
             news = self._take_up(self._pending.result())
             self._pending = None
-        if len(self._scans) < _FEWEST_SCANS:
+        self._blind_scans = len(self._scans) if blind else max(self._blind_scans - 1, 0)
+        if len(self._scans) < _FEWEST_SCANS or self._blind_scans:
             return news
         # What has been named need not be looked for again at once.
         early = suspicious and self.contradiction is None and scan.end_ns >= self._suspected_ns
@@ -108,6 +122,8 @@ class Watch:
         if self._pending is not None:
             news = self._take_up(self._pending.result())
             self._pending = None
+        if not self._decided and len(self._scans) >= _FEWEST_SCANS and not self._blind_scans and self._T_last is not None:
+            news = self._take_up(self._comparison(self._T_last)()) or news
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
@@ -122,18 +138,24 @@ class Watch:
 
     def _take_up(self, agreement: Agreement) -> str | None:
         findings = contradictions(agreement, self._T_declared)
-        decisive = bool(findings) or judges_rotation(agreement)
+        # Registrations that went astray turn like nothing else either: once is not enough to part two sensors.
+        doubted, self._doubted = self._doubted, bool(findings) and findings[0].cause == "not_together"
+        if self._doubted and not doubted:
+            findings = []
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
+        decisive = bool(findings) or judges_rotation(agreement)
         end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
         wait, news = _UNDECIDED_EVERY_S, None
         if decisive:
             wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
             self._decided += 1
-            before, found = self.contradiction, findings[0] if findings else None
-            if found is None or before is None or found.cause != before.cause:
-                self.contradiction, news = found, found
+            before = self.contradiction
+            if findings and (before is None or findings[0].cause != before.cause):
+                self.contradiction = news = findings[0]
+            elif not findings and before is not None and judges(before.cause, agreement):
+                self.contradiction = None
         self._due_ns = end_ns + round(wait * 1e9)
         return None if news is None else news.text
 

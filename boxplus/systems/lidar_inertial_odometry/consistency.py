@@ -25,6 +25,7 @@ _SUSPICIOUS_SHARE = 0.01  # of the squared rotation, corrected
 _INNOVATION_KEEP = 0.8
 _SUSPICIOUS_INNOVATION, _CONTRADICTED_INNOVATION = 2.0, 25.0  # mean square of the innovation, in variances a direction
 _CONTRADICTED_STREAK_S = 1.0
+_ONE_SCAN = 100.0  # no single scan counts for more: it takes several to contradict
 _LOST_STREAK = 3
 _SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
 _FASTEST_M_S = 120.0
@@ -41,6 +42,7 @@ class Consistency:
 
     def __init__(self, config: LioConfig, T_declared: NDArray[np.float64] | None) -> None:
         self._min_matched_share = config.min_matched_share
+        self._max_imu_gap = config.max_imu_gap
         self._watch = Watch(config, T_declared)
         self._turned = 0.0
         self._corrected = 0.0
@@ -97,7 +99,12 @@ class Consistency:
             or self._unmatched > 1
         )
         news = self._watch.add(
-            frame.scan, frame.imu, _extrinsic(x), _lidar_twist(x_before, x, frame.duration_s), suspicious=suspicious
+            frame.scan,
+            frame.imu,
+            _extrinsic(x),
+            _lidar_twist(x_before, x, frame.duration_s),
+            suspicious=suspicious,
+            blind=frame.largest_gap_s > self._max_imu_gap,
         )
         if news is not None:
             warnings.append(news)
@@ -126,6 +133,7 @@ class Consistency:
             self._innovation_text = f"the estimate moves at {speed:.0f} m/s, which no platform with a LiDAR does"
             return [self._innovation_text] if self._once("speed") else []
         if directions is None or directions.weak.all():
+            self._contradicted_since_ns = None
             return []
         delta = np.zeros(TANGENT)
         boxminus_into(x, x_prior, delta)
@@ -134,7 +142,7 @@ class Consistency:
         off = strong @ delta[:6]
         variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
         now = float(np.max(off**2 / variance))
-        self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, 1e4)
+        self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, _ONE_SCAN)
         if self._innovation < _CONTRADICTED_INNOVATION:
             self._contradicted_since_ns = None
             return []

@@ -34,12 +34,8 @@ from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 
-_LONGEST_START_SCANS = 30
-_SCANS_BETWEEN_TRIES = 5
-_BLIND_PASSES = 3
-# Over random recordings, rooms to streets and 16 to 128 channels, this brings the errors of the pose to their covariance;
-# where scans are dense and surfaces smooth it is cautious.
-_SHARED_ERRORS = 3.0
+_LONGEST_START_SCANS, _SCANS_BETWEEN_TRIES = 30, 5
+_BLIND_PASSES, _BLIND_STRIDE, _SHARED_ERRORS = 3, 4, 3.0  # shared: see `MapDatum`, what random recordings need
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
@@ -88,7 +84,7 @@ class LidarInertialOdometry:
 
     @property
     def contradiction(self) -> str | None:
-        """What makes the estimate not to be trusted, whatever its status: gyroscope and LiDAR turn differently; a sentence."""
+        """What makes the estimate not to be trusted, whatever its status: sensors that contradict each other, a gap."""
         return self._consistency.contradiction or self._gap
 
     @property
@@ -130,10 +126,10 @@ class LidarInertialOdometry:
         return Prediction(newest, NavState.unpack(x), cov)
 
     def _declared(self) -> NDArray[np.float64] | None:
-        """T_imu_lidar (4, 4) that the sensors can contradict; None where the configuration calls it a guess."""
-        if self.config.extrinsic_estimation != "off" or self.config.T_imu_lidar is None:
+        """T_imu_lidar (4, 4) that the sensors can contradict, the identity if nobody gave one; None where it is estimated."""
+        if self.config.extrinsic_estimation != "off":
             return None
-        return np.array(self.config.T_imu_lidar)
+        return np.eye(4) if self.config.T_imu_lidar is None else np.array(self.config.T_imu_lidar)
 
     def snapshot(self) -> dict[str, object]:
         """Everything the next estimates depend on, but for the settings: to be written at once, as it goes on changing."""
@@ -166,7 +162,8 @@ class LidarInertialOdometry:
     def _interrupt(self, frame: Frame) -> Frame:
         """Nothing says how the platform moved since the last scan: back to the search for a start, with a new map."""
         self._next_try = 0
-        self._gap = " ".join(filter(None, [self._consistency.contradiction, gap_text(frame.duration_s)]))
+        self._consistency.finish()
+        self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
         self._consistency = Consistency(self.config, self._declared())
         self.start, self._standstill = None, None
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
@@ -184,7 +181,7 @@ class LidarInertialOdometry:
             forgotten = max(len(self._waiting) - keep, 0)
             self._sequencer.rejected["scan before a start could be found"] += forgotten
             del self._waiting[:forgotten]
-            self._next_try = min(len(self._waiting) + _SCANS_BETWEEN_TRIES, _LONGEST_START_SCANS + _SCANS_BETWEEN_TRIES)
+            self._next_try = len(self._waiting) + _SCANS_BETWEEN_TRIES
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
@@ -242,7 +239,7 @@ class LidarInertialOdometry:
         x, cov = self._x.copy(), self._cov.copy()
         seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
         for _ in range(_BLIND_PASSES):
-            points = self._voxel_filter(self._deskew(frame, self._density)[0])[0]
+            points = self._voxel_filter(self._deskew(frame, self._density)[0])[0][::_BLIND_STRIDE].copy()
             measurement = PlaneMeasurement(
                 points, self.map, self.config, voxel=self._voxel_filter.voxel_size, with_extrinsic=False
             )

@@ -48,6 +48,7 @@ _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
 _MIN_MOVING_SCANS = 8
+_FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
@@ -113,6 +114,9 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     path = lidar_path(scans, config, gyro_guesses(imu, extrinsic.R_imu_lidar))
     if path.failed or len(path) < min(len(frames), 3) or path.segment[-1] != path.segment[0]:
         return f"the first scans do not overlap enough to see whether they move ({evidence}); waiting for more data"
+    within = int(np.count_nonzero((imu.time_ns >= path.time_ns[0]) & (imu.time_ns <= path.time_ns[-1])))
+    if len(path) < 2 or within < _FEWEST_SAMPLES:
+        return f"{len(path)} scans and {within} IMU samples between them are not enough for a start; waiting for more data"
     rest = judge_rest(path, scans, config)
     evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
     bias = float(np.linalg.norm(_gyro_bias(path, imu, extrinsic)))
