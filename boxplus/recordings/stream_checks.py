@@ -44,13 +44,7 @@ class StreamLog:
 
     def all_imu(self) -> ImuSamples:
         """All IMU samples, in order of arrival."""
-        if not self.imu:
-            return ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
-        return ImuSamples(
-            np.concatenate([block.time_ns for block in self.imu]),
-            np.concatenate([block.gyro for block in self.imu]),
-            np.concatenate([block.accel for block in self.imu]),
-        )
+        return ImuSamples.joined(self.imu)
 
 
 def check_rate(key: str, time_ns: NDArray[np.int64], gap_factor: float, slow_hz: float = 0.0) -> list[Evidence]:

@@ -159,5 +159,4 @@ def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) 
             blocks = [block for block in blocks if block.time_ns[-1] > now_ns - length_s * 0.5e9]
     if not blocks or not scans:
         return None
-    joined = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time_ns", "gyro", "accel"))
-    return scans, ImuSamples(*joined)
+    return scans, ImuSamples.joined(blocks)

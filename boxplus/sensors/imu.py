@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +56,18 @@ class ImuSamples:
                 )
             vectors.append(np.ascontiguousarray(array, dtype=np.float64))
         return cls(time.astype(np.int64), vectors[0], vectors[1])
+
+    @classmethod
+    def joined(cls, blocks: Iterable[ImuSamples]) -> ImuSamples:
+        """Blocks one after the other, as they are; no block gives no samples."""
+        blocks = list(blocks)
+        if not blocks:
+            return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        return cls(
+            np.concatenate([block.time_ns for block in blocks]),
+            np.concatenate([block.gyro for block in blocks]),
+            np.concatenate([block.accel for block in blocks]),
+        )
 
     def __len__(self) -> int:
         return int(self.time_ns.size)

@@ -217,13 +217,6 @@ class Sequencer:
 
     def _joined(self) -> ImuSamples:
         """All samples kept, as one block."""
-        if not self._imu:
-            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-        if len(self._imu) > 1:
-            joined = ImuSamples(
-                np.concatenate([b.time_ns for b in self._imu]),
-                np.concatenate([b.gyro for b in self._imu]),
-                np.concatenate([b.accel for b in self._imu]),
-            )
-            self._imu = deque([joined])
+        if len(self._imu) != 1:
+            self._imu = deque([ImuSamples.joined(self._imu)])
         return self._imu[0]

@@ -131,7 +131,7 @@ class Watch:
 
     def _comparison(self, T_imu_lidar: NDArray[np.float64]) -> Callable[[], Agreement]:
         scans, expected, config = list(self._scans), list(self._expected), self._config
-        imu = ImuSamples(*(np.concatenate([getattr(part, name) for part in self._imu]) for name in ("time_ns", "gyro", "accel")))
+        imu = ImuSamples.joined(self._imu)
         T_declared = self._T_declared
         T_expected = T_imu_lidar.copy()
         return lambda: compare_sensors(scans, imu, config, T_expected=T_expected, T_declared=T_declared, expected=expected)

@@ -172,11 +172,9 @@ def _axis_text(axis: NDArray[np.float64]) -> str:
 
 def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
     """The IMU samples of several frames, each once."""
-    time = np.concatenate([f.imu.time_ns for f in frames])
-    time, first = np.unique(time, return_index=True)
-    return ImuSamples(
-        time, np.concatenate([f.imu.gyro for f in frames])[first], np.concatenate([f.imu.accel for f in frames])[first]
-    )
+    imu = ImuSamples.joined(frame.imu for frame in frames)
+    time, first = np.unique(imu.time_ns, return_index=True)
+    return ImuSamples(time, imu.gyro[first], imu.accel[first])
 
 
 def _gravity_rotation(up_imu: NDArray[np.float64]) -> NDArray[np.float64]:
