@@ -60,7 +60,6 @@ class LidarPath:
         weak: (K,) bool, whether the scene left a direction undetermined.
         misfit: (K,) float64, rms distance of the points from their planes [m].
         failed: scans that could not be registered.
-        cost: (K,) float64, mean squared distance with points that match nothing counted as far off [m²]; 0 for first poses.
     """
 
     time_ns: NDArray[np.int64]
@@ -71,7 +70,6 @@ class LidarPath:
     weak: NDArray[np.bool_]
     misfit: NDArray[np.float64]
     failed: int
-    cost: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -87,7 +85,6 @@ class LidarPath:
             self.weak[chosen],
             self.misfit[chosen],
             self.failed,
-            self.cost[chosen],
         )
 
 
@@ -167,7 +164,6 @@ class LidarMotion:
             np.array([pose.weak for pose in poses], bool),
             np.array([pose.misfit for pose in poses], np.float64),
             self._failed,
-            np.array([pose.cost for pose in poses], np.float64),
         )
 
     def add(self, scan: Scan, expected: Twist | None = None) -> None:
@@ -198,7 +194,7 @@ class LidarMotion:
             return
         self._usual = fit.misfit if self._usual == 0.0 else 0.9 * self._usual + 0.1 * fit.misfit
         self._x, self._rate, self._velocity = fit.x, fit.rate, fit.velocity
-        self._keep(middle_ns, fit.information, fit.weak, fit.misfit, fit.cost)
+        self._keep(middle_ns, fit.information, fit.weak, fit.misfit)
         self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
         self._previous_ns = middle_ns
 
@@ -238,16 +234,12 @@ class LidarMotion:
     def _begin(self, scan: Scan, middle_ns: int) -> None:
         self._previous_ns = middle_ns
         self._first = scan
-        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 0)), 0.0, 0.0)
+        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 0)), 0.0)
         self._tree.insert(self._map_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
 
-    def _keep(
-        self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float, cost: float
-    ) -> None:
+    def _keep(self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float) -> None:
         R_path_lidar, p_path_lidar = self._x[R : R + 9].reshape(3, 3).copy(), self._x[P : P + 3].copy()
-        self._poses.append(
-            _Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.size), misfit, cost)
-        )
+        self._poses.append(_Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.size), misfit))
 
     def _best(self, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
         """The registration that fits best, from constant velocity, from the guesses and, if need be, from other speeds."""
@@ -355,7 +347,6 @@ class _Pose:
     segment: int
     weak: bool
     misfit: float
-    cost: float
 
 
 @dataclass(frozen=True, slots=True)

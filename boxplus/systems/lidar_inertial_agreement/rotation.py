@@ -19,7 +19,7 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 
-LARGEST_OFFSET_S = 0.6
+_LARGEST_OFFSET_S = 0.6
 _OFFSET_STEP_S = 0.02
 FEWEST_INTERVALS = 8
 _ROUNDS = 8
@@ -80,16 +80,13 @@ class RotationFit:
         return float(np.sqrt(self.covariance[6, 6]))
 
 
-def compare_rotations(
-    path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.float64] | None = None, *, largest_offset_s: float = LARGEST_OFFSET_S
-) -> RotationFit | None:
+def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.float64] | None = None) -> RotationFit | None:
     """Compare the rotations of a LiDAR's path with a gyroscope's; None with fewer than eight scan pairs within its samples.
 
     Args:
         path: from `lidar_path`.
         imu: finite samples in order of time.
         R_expected: (3, 3) R_imu_lidar to stay close to where the motion does not tell; the identity when None.
-        largest_offset_s: of the clocks that is searched [s].
     """
     # A first pose defines the frame of its segment; of every other one all three rotations must have been seen.
     seen = np.linalg.eigvalsh(path.information[:, :3, :3])[:, 0] > 1.0 / _SEEN_RAD**2
@@ -111,7 +108,7 @@ def compare_rotations(
         return (attitude.integral(end_ns + shift) - attitude.integral(begin_ns + shift)) / step_s
 
     # First unit and offset, with plain integrals: a gyroscope in deg/s turns several times around between two scans.
-    room_s = min(largest_offset_s, 0.5 * float(path.time_ns[-1] - path.time_ns[0]) * 1e-9)
+    room_s = min(_LARGEST_OFFSET_S, 0.5 * float(path.time_ns[-1] - path.time_ns[0]) * 1e-9)
     steps = max(round(room_s / _OFFSET_STEP_S), 1)
     offsets = np.arange(-steps, steps + 1) * _OFFSET_STEP_S
     fits = [_Kabsch(plain(offset), rate_lidar, expected) for offset in offsets]
