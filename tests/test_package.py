@@ -165,16 +165,37 @@ def test_rooms_import_downwards_only(room: str) -> None:
                     assert room != "sparse" or used == "sparse", f"{path.relative_to(ROOT)} imports {node.module}"
 
 
-def test_no_files_import_one_another_in_a_circle() -> None:
-    """Imports inside functions count; those for type checkers alone do not."""
+def imports_of_files() -> dict[str, set[str]]:
+    """The modules that each module imports. Imports inside functions count; those for type checkers alone do not."""
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in SOURCES}
-    imported = graphlib.TopologicalSorter[str]()
+    imported: dict[str, set[str]] = {}
     for module, path in modules.items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
         guards = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
         typed = {node for guard in guards for node in ast.walk(guard)}
+        imported[module] = set()
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node not in typed and node.module is not None:
                 submodules = {f"{node.module}.{alias.name}" for alias in node.names} & modules.keys()
-                imported.add(module, *(submodules or {node.module} & modules.keys()))
-    imported.prepare()  # raises CycleError, which names the files
+                imported[module] |= submodules or {node.module} & modules.keys()
+    return imported
+
+
+def test_no_files_import_one_another_in_a_circle() -> None:
+    graphlib.TopologicalSorter(imports_of_files()).prepare()  # raises CycleError, which names the files
+
+
+def test_no_folders_import_one_another_in_a_circle() -> None:
+    """Of two folders in one room; a folder and the one it lies in are one concept."""
+    folders = {".".join(path.parent.relative_to(ROOT).parts) for path in SOURCES}
+    used: dict[str, set[str]] = {folder: set() for folder in folders}
+
+    def home(module: str) -> str:
+        return module if module in folders else module.rpartition(".")[0]
+
+    for module, others in imports_of_files().items():
+        own = home(module)
+        for other in map(home, others):
+            if not f"{own}.".startswith(f"{other}.") and not f"{other}.".startswith(f"{own}."):
+                used[own].add(other)
+    graphlib.TopologicalSorter(used).prepare()  # raises CycleError, which names the folders

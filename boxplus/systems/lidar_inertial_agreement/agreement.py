@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
 _OFFSET_KNOWN_S = 0.01
@@ -61,7 +61,7 @@ class Agreement:
 def compare_sensors(
     scans: Sequence[Scan],
     imu: ImuSamples,
-    config: LioConfig,
+    config: RegistrationConfig,
     *,
     T_expected: NDArray[np.float64] | None = None,
     T_declared: NDArray[np.float64] | None = None,

@@ -20,6 +20,8 @@ from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import REASONS, PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.registration import (
@@ -29,8 +31,6 @@ from boxplus.systems.lidar_inertial_agreement.registration import (
     thinned,
     undistorted,
 )
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import REASONS, PlaneMeasurement
 
 _MOST_POINTS = 1500  # that a scan is registered with
 _MOST_MAP_POINTS = 5000  # that it leaves in the map
@@ -97,7 +97,7 @@ Turning = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 def lidar_path(
     scans: Iterable[Scan],
-    config: LioConfig,
+    config: RegistrationConfig,
     guesses: Sequence[Turning] = (),
     *,
     undistort: bool = False,
@@ -125,7 +125,7 @@ class LidarMotion:
 
     def __init__(
         self,
-        config: LioConfig,
+        config: RegistrationConfig,
         guesses: Sequence[Turning] = (),
         *,
         undistort: bool = False,

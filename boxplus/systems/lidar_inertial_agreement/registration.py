@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import PoseDirections, strong_step
 from boxplus.filtering.nav_state import TANGENT, NavState, boxplus_into
+from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 
 GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
 _STEPS = 12
@@ -18,7 +18,7 @@ _SETTLED = 2e-4  # rad and m
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
 
 
-def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: LioConfig) -> PoseDirections | None:
+def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: RegistrationConfig) -> PoseDirections | None:
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None

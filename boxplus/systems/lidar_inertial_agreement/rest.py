@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
@@ -54,7 +54,7 @@ class Rest:
     turn_rate: float
 
 
-def judge_rest(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> Rest:
+def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> Rest:
     """Test a path and the scans it was found from; a path of a single pose is undetermined along every axis."""
     last = np.flatnonzero(path.segment == path.segment[-1])
     seconds = (path.time_ns[last] - path.time_ns[last[0]]) * 1e-9
@@ -86,7 +86,7 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> Res
     return Rest(at_rest, len(open_axes) == 0, open_axes, speed, rate)
 
 
-def _faces(path: LidarPath, scans: Sequence[Scan], config: LioConfig, axis: NDArray[np.float64]) -> bool:
+def _faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:
     """Whether there are surfaces across an axis (3,) that would show a motion along it.
 
     Where a ring passes from a wall to a ceiling its points span a plane that faces the sensor, goes along with it and ties it to
@@ -107,7 +107,7 @@ def _faces(path: LidarPath, scans: Sequence[Scan], config: LioConfig, axis: NDAr
     return float(across[across > _ACROSS].sum()) > max(_ENOUGH_ACROSS, _SHARE_ACROSS * len(points))
 
 
-def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> bool:
+def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:
     """Whether the last scans fit the first ones without any motion as well as with the one that was found."""
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)

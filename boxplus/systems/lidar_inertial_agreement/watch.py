@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
@@ -27,7 +28,6 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.registration import thinned
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _WINDOW_S = 4.0
 _FEWEST_SCANS = 20
@@ -49,7 +49,7 @@ class Watch:
         contradiction: what the newest comparison that could decide found wrong; None while the sensors agree.
     """
 
-    def __init__(self, config: LioConfig, T_declared: NDArray[np.float64] | None) -> None:
+    def __init__(self, config: RegistrationConfig, T_declared: NDArray[np.float64] | None) -> None:
         self.contradiction: Finding | None = None
         self._config = config.model_copy(update={"threads": 1})
         self._T_declared = T_declared

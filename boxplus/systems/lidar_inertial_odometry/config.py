@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from boxplus.errors import InputError
 from boxplus.filtering.nav_state import check_transform
+from boxplus.maps.registration_config import RegistrationConfig
 
 
-class LioConfig(BaseModel):
+class LioConfig(RegistrationConfig):
     """Settings of `LidarInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
 
     T_imu_lidar: tuple[tuple[float, ...], ...] | None = Field(
         None, description="pose of the LiDAR in the IMU frame, 4×4 row-major: p_imu = T_imu_lidar p_lidar; None is the identity"
@@ -28,18 +27,10 @@ class LioConfig(BaseModel):
     extrinsic_estimation: Literal["off", "on", "gated"] = Field(
         "off", description="refine T_imu_lidar while running: never, always, or only while the motion makes it observable"
     )
-    scan_voxel: float = Field(0.15, gt=0, description="side of the voxels that thin a scan before the update, at least [m]")
     max_points: int = Field(
         3000, ge=100, description="about how many points of a scan the update takes; the voxels grow until it is so"
     )
-    map_cell: float = Field(0.25, gt=0, description="side of the map's cells, each keeps one point [m]")
     max_iterations: int = Field(4, ge=1, le=50, description="most Gauss-Newton steps after the first, per scan")
-    max_neighbour_distance: float = Field(2.236, gt=0, description="the fifth neighbour of a point lies within this [m]")
-    plane_threshold: float = Field(0.1, gt=0, description="a plane's five points lie within this of it [m]")
-    range_sigma: float = Field(
-        0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal, for voxels of 0.5 m and more [m]"
-    )
-    map_sigma: float = Field(0.02, ge=0, description="standard deviation of a map point along a plane's normal [m]")
     gyro_noise: float = Field(2e-3, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included")
     accel_noise: float = Field(2e-2, gt=0, description="accelerometer noise [m/s²/√Hz], vibration included")
     gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
@@ -49,16 +40,9 @@ class LioConfig(BaseModel):
     start_duration: float = Field(1.0, gt=0, description="time over which the start is observed, at rest or moving [s]")
     box_side: float = Field(1000.0, gt=0, description="side of the box around the sensor within which the map is kept [m]")
     detection_range: float = Field(100.0, gt=0, description="range of the LiDAR, for moving the map box [m]")
-    min_points: int = Field(20, ge=6, description="fewest used points for an update; with fewer the scan is lost")
     min_matched_share: float = Field(
         0.1, ge=0, lt=1, description="with less than this share of a scan's points on the map, three scans in a row, it is lost"
     )
-    weak_threshold: float = Field(
-        2.5,
-        ge=0,
-        description="a direction is only predicted when the points say less about it than so many times what noise would",
-    )
-    threads: int = Field(1, ge=1, description="threads that share the work of a scan; the result does not depend on it")
 
     @field_validator("T_imu_lidar")
     @classmethod

@@ -15,6 +15,7 @@ from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.sliding_box import SlidingBox
 from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
@@ -28,7 +29,6 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Predictio
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu

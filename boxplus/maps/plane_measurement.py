@@ -23,7 +23,7 @@ from boxplus.filtering.plane_information import (
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 512
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
@@ -52,7 +52,7 @@ class PlaneMeasurement:
         self,
         p_lidar: NDArray[np.float32],
         tree: IkdTree,
-        config: LioConfig,
+        config: RegistrationConfig,
         *,
         voxel: float,
         with_extrinsic: bool,

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.systems.lidar_inertial_agreement.registration import align
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.plane_measurement import PlaneMeasurement
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -40,7 +40,7 @@ def _pose(random: np.random.Generator, scale: float = 1.0) -> NavState:
 
 
 def _measure(points: np.ndarray, tree: IkdTree, *, threads: int = 1, with_extrinsic: bool = False) -> PlaneMeasurement:
-    return PlaneMeasurement(points, tree, LioConfig(threads=threads), voxel=0.5, with_extrinsic=with_extrinsic)
+    return PlaneMeasurement(points, tree, RegistrationConfig(threads=threads), voxel=0.5, with_extrinsic=with_extrinsic)
 
 
 @settings(max_examples=10)
@@ -89,16 +89,16 @@ def test_aligning_finds_the_pose(seed: int) -> None:
     off = np.zeros(24)
     off[:6] = 0.03 * random.normal(size=6)
     packed = truth.boxplus(off).pack()
-    measurement = PlaneMeasurement(points, tree, LioConfig(), voxel=0.5, with_extrinsic=False)
-    assert align(packed, measurement, LioConfig()) is not None
+    measurement = PlaneMeasurement(points, tree, RegistrationConfig(), voxel=0.5, with_extrinsic=False)
+    assert align(packed, measurement, RegistrationConfig()) is not None
     found = NavState.unpack(packed).boxminus(truth)
     assert np.abs(found[:6]).max() < 2e-3
     assert not found[6:18].any()
 
 
 def test_aligning_to_nothing_is_refused() -> None:
-    nothing = PlaneMeasurement(np.ones((50, 3), np.float32), IkdTree(), LioConfig(), voxel=0.5, with_extrinsic=False)
-    assert align(NavState.identity().pack(), nothing, LioConfig()) is None
+    nothing = PlaneMeasurement(np.ones((50, 3), np.float32), IkdTree(), RegistrationConfig(), voxel=0.5, with_extrinsic=False)
+    assert align(NavState.identity().pack(), nothing, RegistrationConfig()) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
