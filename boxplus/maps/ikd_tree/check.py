@@ -36,8 +36,8 @@ class Subtree(NamedTuple):
 _EMPTY = Subtree(0, np.empty((0, 3), np.float32), np.empty(0, np.bool_))
 
 
-def check_tree(pool: Pool, live: int, *, balance: float, smallest: int) -> Subtree:
-    """Check I1 size, I2 deleted points, I3 boxes, I4 splits, I5 deleted subtrees and I6 balance (above `smallest` points).
+def check_tree(pool: Pool, live: int, *, balance: float | None, smallest: int) -> Subtree:
+    """Check I1 size, I2 deleted points, I3 boxes, I4 splits, I5 deleted subtrees and I6 balance (above `smallest` points; None: not asked for).
 
     Also that `live` is the number of live points, and that no record is used twice or both used and free.
 
@@ -52,7 +52,7 @@ def check_tree(pool: Pool, live: int, *, balance: float, smallest: int) -> Subtr
     return tree
 
 
-def _check_slot(pool: Pool, node: int, side: int, above: int, used: set[int], balance: float, smallest: int) -> Subtree:
+def _check_slot(pool: Pool, node: int, side: int, above: int, used: set[int], balance: float | None, smallest: int) -> Subtree:
     """Check what hangs in a slot; `above` is the label that already holds over it."""
     record = pool.inner[node]
     ref = int(record["child"][side])
@@ -85,9 +85,10 @@ def _check_slot(pool: Pool, node: int, side: int, above: int, used: set[int], ba
         axis, split = int(pool.inner[ref]["axis"]), pool.inner[ref]["split"]
         ordered = (left.points[:, axis] <= split).all() and (right.points[:, axis] >= split).all()
         _require(bool(ordered), f"I4: node {ref} has points on the wrong side of its split")
-        larger = max(len(left.points), len(right.points))
-        allowed = np.float32(balance) * np.float32(size - 1)
-        _require(bool(size <= smallest or larger <= allowed), f"I6: node {ref} has {larger} of {size} points on one side")
+        if balance is not None and size > smallest:
+            larger = max(len(left.points), len(right.points))
+            allowed = np.float32(balance) * np.float32(size - 1)
+            _require(bool(larger <= allowed), f"I6: node {ref} has {larger} of {size} points on one side")
     inside = (tree.points >= box[:3]).all() and (tree.points <= box[3:]).all()
     _require(bool(inside), f"I3: the box of {ref:#x} does not cover its points")
     _require(label != LABEL_DEAD or not tree.live.any(), f"I5: {ref:#x} is labelled deleted and holds live points")

@@ -93,8 +93,11 @@ def may_rebuild(pool: Pool, work: Work, node: np.uint32, side: np.uint32, inside
 
 @kernel(borrow=True)
 def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32, np.uint32, np.uint32, bool]:
-    """The topmost unbalanced subtree on a path: its slot (node NIL if there is none), its depth, and whether it lies in the
-    subtree being rebuilt. `Work.path` gets the inner nodes above it."""
+    """The topmost subtree on a path that is or was out of balance: its slot (node NIL if there is none), its depth, and whether
+    it lies in the subtree being rebuilt. `Work.path` gets the inner nodes above it.
+
+    One that was noted counts even if it has come into balance again: what fell out of balance below it meanwhile was not noted.
+    """
     job = work.job[0]
     node, side, depth = ROOT, LEFT, ZERO
     inside = False
@@ -106,9 +109,8 @@ def find_unbalanced(pool: Pool, work: Work, path: np.uint64) -> tuple[np.uint32,
         inside = inside or (job["phase"] != IDLE and node == job["node"] and side == job["side"])
         if ref >= LEAF_BIT:
             return NIL, LEFT, ZERO, inside
-        if unbalanced(pool, work, ref):
+        if pool.inner[ref]["queued"] or unbalanced(pool, work, ref):
             return node, side, depth, inside
-        pool.inner[ref]["queued"] = np.uint8(0)
         if bit == np.uint64(1):
             return NIL, LEFT, ZERO, inside
         bit >>= np.uint64(1)

@@ -281,7 +281,7 @@ class IkdTree:
         """
         self._rebuilder.wait()
         pending = self._rebuilder.running or self._job["queued"] > 0
-        balance = 1.0 if pending else float(self._job["balance"])
+        balance = None if pending else float(self._job["balance"])
         return check_tree(self._pool, len(self), balance=balance, smallest=int(self._job["check"])).height
 
     def close(self) -> None:

@@ -148,6 +148,41 @@ def test_trees_agree_with_brute_force(in_place: int, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_a_subtree_below_one_that_comes_into_balance_again_is_rebuilt(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # In the last batch the root loses its balance, then a subtree below it, then the root comes into balance again.
+    monkeypatch.setattr(ikd_tree, "IN_PLACE", 40)
+    monkeypatch.setattr(ikd_tree, "_BUDGET", 50)
+    monkeypatch.setattr(ikd_tree, "_BUDGET_PER_POINT", 2)
+    first = cloud(1, 48, "volume")
+    with IkdTree(cell_size=CELL, rebuild=mode) as tree:
+        tree.build(np.concatenate([[[0.0, 0.0, 0.0]] * 3, first[:1], first]))
+        for points in (
+            cloud(800, 103, "lattice"),
+            cloud(0, 11, "same"),
+            cloud(313, 92, "lattice"),
+            cloud(458, 150, "lattice"),
+        ):
+            tree.insert(points)
+            tree.check_invariants()
+
+
+def test_balance_is_not_asked_for_while_a_rebuild_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ikd_tree, "IN_PLACE", 40)
+    monkeypatch.setattr(ikd_tree, "_BUDGET", 1)
+    monkeypatch.setattr(ikd_tree, "_BUDGET_PER_POINT", 0)
+    rng = np.random.default_rng(2)
+    left, right = rng.uniform(0.01, 0.99, (2, 240, 3))
+    left[:, 0] *= 0.4
+    right[:, 0] = np.linspace(0.5, 50.0, 240)
+    with IkdTree(cell_size=1.0) as tree:
+        tree.build(np.concatenate([left, right]), origin=(0, 0, 0))
+        tree.insert(rng.uniform(60.0, 70.0, (400, 3)))
+        assert tree.insert([[0.5, 0.5, 0.5]], downsample=True).inserted == 1  # of a cell in which lies all that was on the left
+        tree.check_invariants()
+        assert len(tree.box_search([0, 0, 0], [1, 1, 1])) == 1
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_winners_of_cells_replace_one_another_across_leaves(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ikd_tree, "IN_PLACE", 100)
     monkeypatch.setattr(ikd_tree, "_BUDGET", 100)
