@@ -37,9 +37,10 @@ _EMPTY = Subtree(0, np.empty((0, 3), np.float32), np.empty(0, np.bool_))
 
 
 def check_tree(pool: Pool, live: int, *, balance: float | None, smallest: int) -> Subtree:
-    """Check I1 size, I2 deleted points, I3 boxes, I4 splits, I5 deleted subtrees and I6 balance (above `smallest` points; None: not asked for).
+    """Check I1 size, I2 deleted points, I3 boxes, I4 splits, I5 deleted subtrees and I6 balance (above `smallest` points).
 
-    Also that `live` is the number of live points, and that no record is used twice or both used and free.
+    Without a balance I6 is not asked for. Also that `live` is the number of live points, and that no record is used twice or
+    both used and free.
 
     Raises:
         InvariantError: which invariant is violated, and where.

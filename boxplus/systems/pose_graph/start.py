@@ -88,7 +88,7 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
         Z = quaternion.to_matrix(graph.measurements[:, :4])
         # A row of R, as a column u: u_j = Zᵀ u_i. The three rows are three right-hand sides.
         known = np.swapaxes(quaternion.to_matrix(start[roots, :4]), 1, 2)
-        rows = _relaxed(len(graph.ids), i, j, np.swapaxes(Z, 1, 2), kappa, roots, known)
+        rows = _relaxed(len(graph.ids), i, j, np.swapaxes(Z, 1, 2), None, kappa, roots, known)
         R = _nearest_rotations(np.swapaxes(rows, 1, 2))
         start[:, :4] = quaternion.from_matrix(R)
         measured, at = graph.measurements[:, 4:], slice(4, 7)
@@ -96,13 +96,14 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
         c, s = np.cos(graph.measurements[:, 0]), np.sin(graph.measurements[:, 0])
         Z = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
         known = np.stack([np.cos(start[roots, 0]), np.sin(start[roots, 0])], -1)[:, :, None]
-        u = _relaxed(len(graph.ids), i, j, Z, kappa, roots, known)[:, :, 0]
+        u = _relaxed(len(graph.ids), i, j, Z, None, kappa, roots, known)[:, :, 0]
         start[:, 0] = np.arctan2(u[:, 1], u[:, 0])
         c, s = np.cos(start[:, 0]), np.sin(start[:, 0])
         R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
         measured, at = graph.measurements[:, 1:], slice(1, 3)
     steps = np.einsum("nab,nb->na", R[i], measured)
-    start[:, at] = _translations(len(graph.ids), i, j, steps, tau, roots, start[roots, at])
+    same = np.ones((len(steps), 1, 1))  # t_j − t_i is the step, on every axis alike
+    start[:, at] = _relaxed(len(graph.ids), i, j, same, steps[:, None], tau, roots, start[roots, None, at])[:, 0]
     start[roots] = _at_held(graph, roots)[roots]  # to the last bit
     return start
 
@@ -131,11 +132,15 @@ def _relaxed(
     i: NDArray[np.int64],
     j: NDArray[np.int64],
     M: NDArray[np.float64],
+    step: NDArray[np.float64] | None,
     weight: NDArray[np.float64],
     roots: NDArray[np.int64],
     known: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(n, d, k) minimising Σ weight ‖u_j − M u_i‖² with u[roots] = known (roots, d, k); M is (m, d, d) and orthogonal."""
+    """(n, d, k) minimising Σ weight ‖u_j − M u_i − step‖² with u[roots] = known (roots, d, k).
+
+    M is (m, d, d) and orthogonal, `step` (m, d, k), or None where all are zero.
+    """
     d, k = known.shape[1:]
     u = np.zeros((n, d, k))
     u[roots] = known
@@ -145,55 +150,26 @@ def _relaxed(
     size = int(free.sum())
     if size == 0:
         return u
+    between = free[i] & free[j]
+    told = np.flatnonzero(~between) if step is None else np.arange(len(i))
+    pull = M[told] @ u[i[told]] - u[j[told]]  # the free ones are still zero
+    if step is not None:
+        pull += step
+    pull *= weight[told, None, None]
     right = np.zeros((n, d, k))
-    degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
-    to, back = free[i] & ~free[j], ~free[i] & free[j]
-    np.add.at(right, i[to], weight[to, None, None] * np.swapaxes(M[to], 1, 2) @ u[j[to]])
-    np.add.at(right, j[back], weight[back, None, None] * M[back] @ u[i[back]])
-    inner = np.flatnonzero(free[i] & free[j])
-    a, b = number[j[inner]], number[i[inner]]
-    pattern, pairs = BlockPattern.from_pairs(np.full(size, d), a, b)
+    np.add.at(right, j[told], pull)
+    np.add.at(right, i[told], -np.swapaxes(M[told], 1, 2) @ pull)
+    inner = np.flatnonzero(between)
+    pattern, pairs = BlockPattern.from_pairs(np.full(size, d), number[j[inner]], number[i[inner]])
     values = np.zeros(len(pattern.row) * d * d).reshape(-1, d, d)
     coupling = -weight[inner, None, None] * M[inner]
     np.add.at(values, pairs.block, np.where(pairs.transposed[:, None, None], np.swapaxes(coupling, 1, 2), coupling))
+    degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
     values[pattern.col_start[:-1]] += degree[free, None, None] * np.eye(d)
     cholesky = SparseCholesky(pattern)
     cholesky.factorize(values.reshape(-1))
     u[free] = cholesky.solve(right[free].reshape(size * d, k)).reshape(size, d, k)
     return u
-
-
-def _translations(
-    n: int,
-    i: NDArray[np.int64],
-    j: NDArray[np.int64],
-    steps: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    roots: NDArray[np.int64],
-    known: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """(n, d) minimising Σ weight ‖t_j − t_i − step‖² with t[roots] = known."""
-    t = np.zeros((n, steps.shape[1]))
-    t[roots] = known
-    free = np.ones(n, dtype=np.bool_)
-    free[roots] = False
-    number = np.cumsum(free) - 1
-    size = int(free.sum())
-    if size == 0:
-        return t
-    right = np.zeros_like(t)
-    pull = weight[:, None] * (steps + np.where(free[i], 0.0, 1.0)[:, None] * t[i] - np.where(free[j], 0.0, 1.0)[:, None] * t[j])
-    np.add.at(right, j, pull)
-    np.add.at(right, i, -pull)
-    inner = np.flatnonzero(free[i] & free[j])
-    pattern, pairs = BlockPattern.from_pairs(np.ones(size, dtype=np.int64), number[j[inner]], number[i[inner]])
-    values = np.zeros(len(pattern.row))
-    np.add.at(values, pairs.block, -weight[inner])
-    values[pattern.col_start[:-1]] += (np.bincount(i, weight, n) + np.bincount(j, weight, n))[free]
-    cholesky = SparseCholesky(pattern)
-    cholesky.factorize(values)
-    t[free] = cholesky.solve(right[free])
-    return t
 
 
 def _nearest_rotations(M: NDArray[np.float64]) -> NDArray[np.float64]:
