@@ -23,6 +23,7 @@ _SHORTEST_SPAN, _LONGEST_SPAN = 0.05, 1.5
 _LIKELY_PERIODS_S = (0.02, 0.5)
 _FARTHEST_FROM_STAMP_NS = 10_000_000_000
 _SAME_CLOCK_NS = 1_000_000_000
+_EARLY_NS = 10_000_000  # that an IMU message may take longer than a scan to arrive
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,10 +206,19 @@ def _confirm_scan_start(clouds: list[CloudTimes], seconds: str, last_ns: float, 
     if relative_delay >= 0.9 * last_ns:
         arrived = f"the messages arrived {relative_delay * 1e-9:.3f} s after their stamps, when the scan was over"
         return f"the values run {seconds}, and {arrived}"
+    when = "after"
+    if relative_delay < -_EARLY_NS:
+        when = "before"
+        meaning = "whichever end of the scan they are, the clocks of LiDAR and IMU lie apart"
+    else:
+        apart = (last_ns - relative_delay) * 1e-9
+        meaning = f"these are the end of the scan, or the clocks of LiDAR and IMU lie about {apart:.3f} s apart"
+    against = "" if imu_delay_ns is None else " by the clock of the IMU's stamps"
     raise AmbiguityError(
         f"scans received after their last point, {last_ns * 1e-9:.3f} s after the stamp if times count from it",
-        f"messages received {relative_delay * 1e-9:.3f} s after their stamps: these may be the end of the scan",
-        "decide with --point-time-reference scan_start (the usual case) or scan_end; 'boxplus inspect' then measures the offset",
+        f"messages received {abs(relative_delay) * 1e-9:.3f} s {when} their stamps{against}: {meaning}",
+        "decide with --point-time-reference scan_start (the usual case) or scan_end; 'boxplus inspect' then measures the offset, "
+        "which --lidar-time-offset corrects",
     )
 
 

@@ -6,6 +6,7 @@ while running ask the same question. It is answered once:
     path         how the LiDAR moved, from its scans alone
     rotation     against the gyroscope: mounting, clocks, unit, sign
     translation  against the accelerometer: gravity, velocity, bias, lever arm, sign and scale
+    planes       against gravity: how far what stands around is from upright
 
 Each with a covariance, so that what the motion does not show is left open. See docs/agreement.md.
 """
@@ -24,6 +25,7 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
 
@@ -48,6 +50,7 @@ class Agreement:
         imu_rate_hz: of the samples.
         gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
             unit.
+        planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
     """
 
     path: LidarPath
@@ -56,6 +59,7 @@ class Agreement:
     R_imu_lidar: NDArray[np.float64]
     imu_rate_hz: float
     gyro_power: float
+    planes: PlaneTilt | None = None
 
 
 def compare_sensors(
@@ -117,7 +121,8 @@ def compare_sensors(
                 scans, imu, config, T_expected=T_expected, T_declared=T_declared, refine=True, expected=expected
             )
     rate = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
-    return Agreement(path, rotation, translation, R, rate, _power(imu))
+    planes = None if T_declared is None else plane_tilt(path, scans, imu, T_declared[:3, :3], config)
+    return Agreement(path, rotation, translation, R, rate, _power(imu), planes)
 
 
 def _power(imu: ImuSamples) -> float:

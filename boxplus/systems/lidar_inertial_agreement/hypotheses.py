@@ -48,6 +48,8 @@ _FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
+_UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
+_MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     if translation is not None:
         findings.append(_of_lengths(translation))
         findings.append(_of_turn(rotation, translation, T_declared))
+    if findings[0] is None and not _mounting_seen(agreement):
+        findings.append(_of_planes(agreement))
     return [finding for finding in findings if finding is not None]
 
 
@@ -123,8 +127,14 @@ def judges(cause: Cause, agreement: Agreement) -> bool:
     if cause in ("force_sign", "length_scale"):
         return judges_lengths(agreement)
     if cause in ("extrinsic", "mirrored"):
-        return judges_rotation(agreement) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).all())
+        return _mounting_seen(agreement)
     return judges_rotation(agreement)
+
+
+def _mounting_seen(agreement: Agreement) -> bool:
+    """Whether rotations show the mounting about all axes."""
+    rotation = agreement.rotation
+    return rotation is not None and judges_rotation(agreement) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).all())
 
 
 def _turning(rotation: RotationFit) -> bool:
@@ -237,6 +247,22 @@ def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDA
         f"accelerometer and LiDAR accelerate in directions {np.degrees(angle):.0f} deg apart under the given T_imu_lidar: check "
         "it, and that the topics are those of this mounting",
     )
+
+
+def _of_planes(agreement: Agreement) -> Finding | None:
+    """Where no motion shows the mounting, gravity does, if what stands around stands upright."""
+    planes = agreement.planes
+    if planes is None or planes.tilt < _UPRIGHT_RAD + 3.0 * planes.std:
+        return None
+    text = (
+        f"{'three' if planes.directions == 3 else 'two'} directions of planes, orthogonal to each other, are "
+        f"{np.degrees(planes.tilt):.0f} deg from upright by the accelerometer under the given T_imu_lidar: "
+    )
+    axis = int(np.argmin(planes.mirrored))
+    if planes.mirrored[axis] < min(_MIRRORS_RAD, _MIRRORS_SHARE * planes.tilt):
+        text += f"with {'xyz'[axis]} of the points mirrored they are upright; else "
+    advice = "check T_imu_lidar, and that the topics are those of this mounting, unless the place itself is tilted"
+    return Finding("extrinsic", text + advice)
 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:

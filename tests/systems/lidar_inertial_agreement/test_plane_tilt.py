@@ -1,0 +1,94 @@
+"""Gravity against planes: they show a mounting that no motion shows, and nothing is claimed where they may be tilted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_platforms import CONFIG, data
+
+from boxplus.manifolds import so3
+from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting, sites, worlds
+from boxplus.simulation.world import World
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+
+LIDAR = SpinningLidar(channels=24, azimuth_steps=120)
+
+
+def straight(world: World, seed: int, speed: float = 0.5, T: NDArray[np.float64] | None = None) -> Simulation:
+    """Straight on at a constant velocity and attitude: neither gyroscope nor accelerometer shows the mounting."""
+    random = np.random.default_rng(seed)
+    if T is None:
+        T = mounting(random.uniform(-15.0, 15.0), random.uniform(-15.0, 15.0), random.uniform(-180.0, 180.0), (0.1, 0.0, 0.1))
+    attitude = manoeuvres.level(random.uniform(-np.pi, np.pi), *random.uniform(-0.1, 0.1, 2))
+    motion = manoeuvres.constant_velocity(3.0, np.array([-1.0, 0.2, 1.5]), (speed, 0.0, 0.0), attitude)
+    return Simulation(Scenario("straight", world, motion, LIDAR, ImuModel(), T), seed, 2.6)
+
+
+def tilt_of(simulation: Simulation, T: NDArray[np.float64], fault: Fault | None = None) -> PlaneTilt | None:
+    scans, imu = data(simulation, fault)
+    return plane_tilt(lidar_path(scans, CONFIG), scans, imu, T[:3, :3], CONFIG)
+
+
+def leaning(simulation: Simulation, axis: tuple[float, float, float], degrees: float) -> NDArray[np.float64]:
+    """The mounting under which the world seems turned about one of its own axes."""
+    R = simulation.ground_truth(np.array([simulation.start_ns])).R_world_imu[0]
+    T = simulation.T_imu_lidar.copy()
+    T[:3, :3] = R.T @ so3.exp(np.deg2rad(degrees) * np.array(axis)) @ R @ T[:3, :3]
+    return T
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("degrees", [0.0, 7.0, 15.0])
+def test_a_room_shows_how_far_a_mounting_is_tilted(seed: int, degrees: float) -> None:
+    simulation = straight(worlds.room(seed=seed), seed)
+    found = tilt_of(simulation, leaning(simulation, (np.cos(seed), np.sin(seed), 0.0), degrees))
+    assert found is not None and found.directions == 3
+    assert abs(np.rad2deg(found.tilt) - degrees) < 1.0 and np.rad2deg(found.std) < 1.0
+
+
+def test_a_wrong_mounting_is_named_although_no_motion_shows_it() -> None:
+    simulation = straight(worlds.room(seed=4), 4)
+    wrong = leaning(simulation, (0.6, 0.8, 0.0), 9.0)
+    for T, causes in ((simulation.T_imu_lidar, []), (wrong, ["extrinsic"])):
+        found = contradictions(compare_sensors(*data(simulation), CONFIG, T_declared=T), T)
+        assert [finding.cause for finding in found] == causes
+    assert "9 deg from upright" in found[0].text and "check T_imu_lidar" in found[0].text
+
+
+def test_a_corridor_may_climb_but_does_not_lean() -> None:
+    simulation = straight(worlds.corridor(200.0, 2.6, 2.8), 5)
+    climbing, leaning_over = (tilt_of(simulation, leaning(simulation, axis, 12.0)) for axis in ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
+    assert climbing is not None and leaning_over is not None
+    assert climbing.directions == leaning_over.directions == 2
+    assert np.rad2deg(climbing.tilt) < 1.5 and abs(np.rad2deg(leaning_over.tilt) - 12.0) < 1.5
+
+
+def test_mirrored_points_are_upright_with_their_mirror() -> None:
+    simulation = straight(worlds.room(seed=6), 6, T=mounting(10.0, 6.0, 30.0, (0.1, 0.0, 0.1)))
+    found = tilt_of(simulation, simulation.T_imu_lidar, faults.mirror_points(1))
+    assert found is not None
+    assert np.rad2deg(found.tilt) > 8.0 and np.rad2deg(found.mirrored[1]) < 1.0
+    T = simulation.T_imu_lidar
+    (finding,) = contradictions(compare_sensors(*data(simulation, faults.mirror_points(1)), CONFIG, T_declared=T), T)
+    assert "with y of the points mirrored they are upright" in finding.text
+
+
+def test_a_forest_says_nothing() -> None:
+    simulation = straight(sites.forest(seed=1), 7)
+    assert tilt_of(simulation, leaning(simulation, (1.0, 0.0, 0.0), 15.0)) is None
+
+
+def test_a_path_that_went_astray_contradicts_nothing() -> None:
+    simulation = straight(worlds.room(seed=8), 8)
+    scans, imu = data(simulation)
+    path = lidar_path(scans, CONFIG)
+    seconds = (path.time_ns - path.time_ns[0]) * 1e-9
+    slowed = path.p_path_lidar + np.outer(np.where(seconds < 1.0, 3.0 * seconds, 3.0), [1.0, 0.0, 0.0])
+    found = plane_tilt(replace(path, p_path_lidar=slowed), scans, imu, simulation.T_imu_lidar[:3, :3], CONFIG)
+    assert found is None or found.tilt < 3.0 * found.std
