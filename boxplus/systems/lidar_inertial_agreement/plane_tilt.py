@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _SCANS, _MOST_MAP_POINTS, _MOST_POINTS = 12, 5000, 4000
 _NEIGHBOURS = 15
@@ -56,7 +56,7 @@ class PlaneTilt:
 
 
 def plane_tilt(
-    path: LidarPath, scans: Sequence[Scan], imu: ImuSamples, R_imu_lidar: NDArray[np.float64], config: LioConfig
+    path: LidarPath, scans: Sequence[Scan], imu: ImuSamples, R_imu_lidar: NDArray[np.float64], config: RegistrationConfig
 ) -> PlaneTilt | None:
     """Compare planes with gravity; None where no two directions are orthogonal, or the path is too short to tell up.
 
@@ -133,7 +133,7 @@ def _up(path: LidarPath, imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> t
     return (force - acceleration) / norm, float(np.sqrt(2.0) * speed_std / between / norm)
 
 
-def _normals(path: LidarPath, scans: Sequence[Scan], config: LioConfig) -> NDArray[np.float64]:
+def _normals(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> NDArray[np.float64]:
     """(N, 3) normals where the surroundings are plane."""
     middle_ns = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans])
     chosen = np.unique(np.linspace(0, len(path) - 1, _SCANS).astype(int))
