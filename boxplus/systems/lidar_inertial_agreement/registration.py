@@ -18,11 +18,13 @@ _SETTLED = 2e-4  # rad and m
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
 
 
-def align(x: NDArray[np.float64], measurement: PlaneMeasurement, config: RegistrationConfig) -> PoseDirections | None:
+def align(
+    x: NDArray[np.float64], measurement: PlaneMeasurement, config: RegistrationConfig, *, steps: int = _STEPS
+) -> PoseDirections | None:
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None
-    for step in range(_STEPS):
+    for step in range(steps):
         information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
         if information.used < config.min_points:
             return None

@@ -35,7 +35,7 @@ from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, f
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 
 _LONGEST_START_SCANS, _SCANS_BETWEEN_TRIES = 30, 5
-_BLIND_PASSES, _BLIND_STRIDE, _SHARED_ERRORS = 3, 4, 3.0  # shared: see `MapDatum`, what random recordings need
+_BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 3.0  # shared: see `MapDatum`, what random recordings need
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
@@ -243,7 +243,7 @@ class LidarInertialOdometry:
             measurement = PlaneMeasurement(
                 points, self.map, self.config, voxel=self._voxel_filter.voxel_size, with_extrinsic=False
             )
-            fits = align(self._x, measurement, self.config) is not None
+            fits = align(self._x, measurement, self.config, steps=_BLIND_STEPS) is not None
             # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
             motion = 0.5 * (self._motion + mean_motion(x, self._x, seconds))
             self._x[:], self._cov[:] = x, cov
