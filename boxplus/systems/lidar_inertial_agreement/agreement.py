@@ -32,7 +32,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit,
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
 _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
-_SLOPE_DOUBTFUL = 0.05
+_SLOPE_DOUBTFUL = 0.03
 _SCAN_NS = 100_000_000
 ROTATION_KNOWN_RAD = 0.05
 _DECLARED_ARM_STD = 0.02  # m
@@ -101,14 +101,15 @@ def compare_sensors(
         )
         rotation = compare_rotations(path, imu, R_guess) or rotation
     R = np.eye(3) if R_guess is None else R_guess
-    if rotation is not None and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
+    # What explains little of the rotation says nothing of mounting, bias and clocks either.
+    fits = rotation is not None and rotation.explained > _EXPLAINED
+    if rotation is not None and fits and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
         R = rotation.R_imu_lidar
     translation = None
-    enough = len(path) > 0 and len(imu) > 1
-    if enough and ((rotation is not None and rotation.explained > _EXPLAINED) or T_declared is not None):
-        bias = np.zeros(3) if rotation is None or rotation.explained < _EXPLAINED else rotation.bias
+    if len(path) > 0 and len(imu) > 1 and (fits or T_declared is not None):
+        bias = rotation.bias if rotation is not None and fits else np.zeros(3)
         scale = 1.0 if rotation is None else unit_of(rotation.scale)
-        offset = 0.0 if rotation is None or rotation.offset_std_s > _OFFSET_KNOWN_S else rotation.offset_s
+        offset = rotation.offset_s if rotation is not None and fits and rotation.offset_std_s < _OFFSET_KNOWN_S else 0.0
         mean, std = wide_prior()
         if T_declared is not None:
             mean[6:9], std[6:9] = T_declared[:3, 3], _DECLARED_ARM_STD

@@ -6,6 +6,7 @@ decide, nothing is said. Every finding is a sentence for a user: what was seen, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -41,9 +42,12 @@ _SCALE_OFF = 0.12
 _OFFSET_OK_S = 0.014
 _OFFSET_STD_S = 0.012
 _SLOPE_OFF = 0.07
-_SLOPE_FLOOR = 0.02
+_SLOPE_FLOOR, _SLOPE_OF_MANY_FLOOR = 0.02, 0.03
+_FITS_OF_MANY, _FEWEST_SLOPES = 0.7, 2
+_SLOPE_WELL_KNOWN = 0.033
 _MISFIT_M = 0.03
 _SLOPE_KNOWN = 0.3
+_FARTHEST_REVERSED = 4.5  # feet, and a third of it
 _FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
@@ -80,7 +84,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
         return [found]  # what follows from it is not worth a sentence of its own
     findings = [_of_mounting(rotation, T_declared), _of_scale(rotation), _of_clocks(rotation, agreement.imu_rate_hz)]
     if translation is not None:
-        findings.append(_of_lengths(translation))
+        findings.append(_of_lengths(agreement, translation))
         findings.append(_of_turn(rotation, translation, T_declared))
     if findings[0] is None and not _mounting_seen(agreement):
         findings.append(_of_planes(agreement))
@@ -111,10 +115,19 @@ def judges_clocks(rotation: RotationFit) -> bool:
 def judges_lengths(agreement: Agreement) -> bool:
     """Whether the motion shows sign and scale of the accelerations."""
     translation = agreement.translation
-    if translation is None or not _path_counts(agreement):
+    if translation is None or not _path_counts(agreement) or _lags(agreement):
         return False
     fits = translation.explained > _FITS and translation.sigma < _MISFIT_M
     return fits and float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < _SLOPE_KNOWN
+
+
+def _lags(agreement: Agreement) -> bool:
+    """Whether the path misses a rotation that the gyroscope shows: then it misses accelerations as well."""
+    rotation = agreement.rotation
+    if rotation is None or rotation.explained > _FITS:
+        return False
+    turning = float(np.sqrt(agreement.gyro_power)) / max(unit_of(rotation.scale), 1.0)
+    return turning > float(_TURNING_RAD_S)
 
 
 def judges(cause: Cause, agreement: Agreement) -> bool:
@@ -205,7 +218,8 @@ def _reversed(translation: TranslationFit) -> bool:
     if translation.explained < _REVERSED or translation.sigma > _MISFIT_M:
         return False
     std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
-    return translation.slope < -0.4 and translation.slope + 5.0 * std < 0.0
+    # Many times as far as anything accelerates: a path that has gone astray.
+    return -_FARTHEST_REVERSED < translation.slope < -0.4 and translation.slope + 5.0 * std < 0.0
 
 
 def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
@@ -290,7 +304,7 @@ def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
     )
 
 
-def _of_lengths(translation: TranslationFit) -> Finding | None:
+def _of_lengths(agreement: Agreement, translation: TranslationFit) -> Finding | None:
     slope = translation.slope
     std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
     if _reversed(translation):
@@ -299,16 +313,50 @@ def _of_lengths(translation: TranslationFit) -> Finding | None:
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
         return Finding("force_sign", text)
-    if translation.explained < _FITS or translation.sigma > _MISFIT_M:
+    if translation.explained < _FITS or translation.sigma > _MISFIT_M or _lags(agreement):
         return None
-    if abs(slope - 1.0) > max(_SLOPE_OFF, 3.0 * std) and std < _SLOPE_KNOWN and slope > 0.0:
-        name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
-        return Finding(
-            "length_scale",
-            f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): the points "
-            f"are not in metres{name}, or the accelerometer's scale is wrong",
-        )
-    return None
+    return _of_slope(slope, std)
+
+
+def slope_of(agreement: Agreement) -> tuple[float, float] | None:
+    """Slope of the accelerations and its standard deviation, to be put together with those of other stretches."""
+    translation = agreement.translation
+    if translation is None or not _path_counts(agreement) or _lags(agreement):
+        return None
+    if translation.explained < _FITS_OF_MANY or translation.sigma > _MISFIT_M:
+        return None
+    std = float(np.hypot(translation.slope_std, _SLOPE_OF_MANY_FLOOR))
+    return (translation.slope, std) if std < _SLOPE_KNOWN else None
+
+
+def lengths_of_many(slopes: Sequence[tuple[float, float]]) -> Finding | None:
+    """What several stretches say of the lengths, each by `slope_of`, where none of them decides alone."""
+    return _of_slope(*_mean(slopes), deviations=2.7) if len(slopes) >= _FEWEST_SLOPES else None
+
+
+def lengths_known(slopes: Sequence[tuple[float, float]]) -> bool:
+    """Whether lengths that are wrong by a tenth would have shown in these stretches."""
+    return len(slopes) >= _FEWEST_SLOPES and _mean(slopes)[1] < _SLOPE_WELL_KNOWN
+
+
+def _mean(slopes: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The weighted mean and its standard deviation, widened where the stretches differ by more than theirs."""
+    slope, std = np.array(slopes).T
+    information = float((1.0 / std**2).sum())
+    mean = float((slope / std**2).sum()) / information
+    scatter = float((((slope - mean) / std) ** 2).sum()) / (len(slope) - 1)
+    return mean, float(np.hypot(np.sqrt(max(scatter, 1.0) / information), _SLOPE_FLOOR))
+
+
+def _of_slope(slope: float, std: float, deviations: float = 3.0) -> Finding | None:
+    if abs(slope - 1.0) < max(_SLOPE_OFF, deviations * std) or std > _SLOPE_KNOWN or slope < 0.0:
+        return None
+    name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
+    return Finding(
+        "length_scale",
+        f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): the points "
+        f"are not in metres{name}, or the accelerometer's scale is wrong",
+    )
 
 
 def matrix_text(R: NDArray[np.float64]) -> str:

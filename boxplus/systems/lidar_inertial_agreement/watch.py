@@ -25,6 +25,9 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges,
     judges_clocks,
     judges_rotation,
+    lengths_known,
+    lengths_of_many,
+    slope_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.registration import thinned
@@ -36,6 +39,8 @@ _TAKEN_UP_AFTER, _TAKEN_UP_EARLY = 40, 10  # scans, and when the estimator suspe
 _UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
 _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
+_MOST_SLOPES = 6  # that are asked for sooner than what is decided
+_OVERLAP_NS = 500_000_000  # of stretches that count as two
 
 
 class Watch:
@@ -67,6 +72,8 @@ class Watch:
         self._blind_scans = 0
         self._T_last: NDArray[np.float64] | None = None
         self._first_with_clocks: Agreement | None = None
+        self._slopes: list[tuple[float, float]] = []
+        self._slopes_until_ns = 0
 
     def add(
         self,
@@ -145,11 +152,15 @@ class Watch:
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
+        lengths = self._lengths(agreement) if not findings else None
+        if lengths is not None:
+            findings.append(lengths)
         decisive = bool(findings) or judges_rotation(agreement)
         end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
         wait, news = _UNDECIDED_EVERY_S, None
         if decisive:
-            wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
+            if not 0 < len(self._slopes) < _MOST_SLOPES or lengths_known(self._slopes):
+                wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
             self._decided += 1
             before = self.contradiction
             if findings and (before is None or findings[0].cause != before.cause):
@@ -167,3 +178,11 @@ class Watch:
             self._first_with_clocks = agreement
             return None
         return clock_drift(self._first_with_clocks, agreement)
+
+    def _lengths(self, agreement: Agreement) -> Finding | None:
+        """Lengths by all stretches so far: four seconds of a walk show a tenth hardly, many together do."""
+        slope = slope_of(agreement)
+        if slope is not None and int(agreement.path.time_ns[0]) > self._slopes_until_ns - _OVERLAP_NS:
+            self._slopes.append(slope)
+            self._slopes_until_ns = int(agreement.path.time_ns[-1])
+        return lengths_of_many(self._slopes)

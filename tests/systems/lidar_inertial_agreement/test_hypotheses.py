@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_platforms import CONFIG, data, handheld, turned
 
 from boxplus.simulation import Fault, faults
+from boxplus.systems.lidar_inertial_agreement import agreement as agreement_module
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     clock_drift,
@@ -14,6 +17,8 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges_clocks,
     judges_lengths,
     judges_rotation,
+    lengths_of_many,
+    slope_of,
 )
 
 FEET = 3.28084
@@ -128,3 +133,57 @@ def test_too_few_scans_or_samples_are_no_verdict() -> None:
         compare_sensors(scans[:12], few, CONFIG),
     ):
         assert agreement.rotation is None and contradictions(agreement, np.eye(4)) == []
+
+
+def test_stretches_together_show_lengths_that_none_shows_alone() -> None:
+    simulation = handheld(2, seconds=9.0, speed=2.2, rate=1.0)
+    T = simulation.T_imu_lidar
+    for fault, causes in ((None, []), (faults.scale_points(0.9), ["length_scale"])):
+        scans, imu = data(simulation, fault)
+        agreements = [compare_sensors(scans[k : k + 22], imu, CONFIG, T_declared=T) for k in range(0, 88, 22)]
+        assert all(contradictions(agreement, T) == [] for agreement in agreements)
+        slopes = [slope for slope in map(slope_of, agreements) if slope is not None]
+        found = lengths_of_many(slopes)
+        assert [finding.cause for finding in (found,) if finding is not None] == causes
+    assert found is not None and "the points are not in metres" in found.text
+
+
+def test_stretches_that_differ_among_themselves_show_no_lengths() -> None:
+    assert lengths_of_many([(0.85, 0.05)]) is None
+    assert lengths_of_many([(0.85, 0.05), (0.86, 0.05), (0.84, 0.05)]) is not None
+    assert lengths_of_many([(0.60, 0.05), (1.10, 0.05), (0.85, 0.05)]) is None
+
+
+def test_a_path_that_misses_a_rotation_shows_no_lengths() -> None:
+    """From rest a registration may lag behind: it misses the accelerations as well as the turn."""
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    agreement = compare_sensors(*data(simulation, faults.scale_points(0.9)), CONFIG, T_declared=T)
+    assert [finding.cause for finding in contradictions(agreement, T)] == ["length_scale"] and judges_lengths(agreement)
+    assert agreement.rotation is not None
+    lagging = replace(agreement, rotation=replace(agreement.rotation, explained=0.6))
+    assert contradictions(lagging, T) == []
+    assert not judges_lengths(lagging) and slope_of(lagging) is None
+
+
+def test_a_path_that_accelerates_out_of_nothing_flips_no_sign() -> None:
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    agreement = compare_sensors(*data(simulation, faults.flip_accel()), CONFIG, T_declared=T)
+    assert [finding.cause for finding in contradictions(agreement, T)] == ["force_sign"]
+    assert agreement.translation is not None
+    astray = replace(agreement, translation=replace(agreement.translation, slope=-14.6))
+    assert contradictions(astray, T) == []
+
+
+def test_a_mounting_that_explains_little_replaces_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    rotation = compare_sensors(*data(simulation), CONFIG, T_declared=T).rotation
+    assert rotation is not None
+    elsewhere = replace(rotation, R_imu_lidar=turned(T, 20.0, 0)[:3, :3])
+    for explained, kept in ((0.95, False), (0.3, True)):
+        fit = replace(elsewhere, explained=explained)
+        monkeypatch.setattr(agreement_module, "compare_rotations", lambda *_, fit=fit: fit)
+        compared = compare_sensors(*data(simulation), CONFIG, T_declared=T)
+        assert np.array_equal(compared.R_imu_lidar, T[:3, :3]) == kept
