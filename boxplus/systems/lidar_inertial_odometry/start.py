@@ -90,7 +90,7 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     accelerometer.
 
     Raises:
-        InputError: the accelerometer reports in g, or no gravity.
+        InputError: the accelerometer reports in g, was taken for one that does, or shows no gravity.
     """
     imu = joined_imu(frames)
     duration = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
@@ -106,6 +106,12 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
             "accelerations in m/s², about 9.8 on average at the start",
             f"{norm:.2f}",
             f"the accelerometer reports in g: multiply by {_STANDARD_G} (reading a recording: --accel-unit g)",
+        )
+    if _IN_G[0] < norm / _STANDARD_G**2 < _IN_G[1]:
+        raise InputError(
+            "accelerations in m/s², about 9.8 on average at the start",
+            f"{norm:.1f}",
+            "the accelerometer reports in m/s² and was taken for one in g (reading a recording: --accel-unit m/s2)",
         )
     extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
     gyro_std, accel_std = float(imu.gyro.std(axis=0).max()), float(imu.accel.std(axis=0).max())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ from simulated_runs import SPARSE, Run, run
 from boxplus.errors import InputError
 from boxplus.recordings.open import open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
+from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, trajectories, worlds, write_recording
+from boxplus.simulation.faults import Event
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
@@ -158,6 +162,15 @@ def test_accelerometer_in_g_is_refused_at_the_start() -> None:
         run("walk", 2.0, faults.imu_in_g(), SPARSE)
     assert caught.value.expected == "accelerations in m/s², about 9.8 on average at the start"
     assert "the accelerometer reports in g: multiply by 9.80665" in caught.value.advice
+
+
+def test_accelerometer_taken_for_one_in_g_is_refused_at_the_start() -> None:
+    def multiplied(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            yield replace(event, accel=event.accel * 9.80665) if isinstance(event, ImuSamples) else event
+
+    with pytest.raises(InputError, match=r"got 9\d\.\d – the accelerometer reports in m/s² and was taken for one in g"):
+        run("walk", 2.0, Fault("multiplied", "m/s² taken for g", multiplied), SPARSE)
 
 
 def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
