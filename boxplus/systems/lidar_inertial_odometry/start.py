@@ -55,6 +55,7 @@ _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _SLOPE_STD = 0.01  # of the scale of an accelerometer in order
 _ACCEL_BIAS_STD = 0.15  # m/s²
 _MOUNTING_STD = 0.01  # rad
+_UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
 _MEAN_ACCEL_STD = 2.0  # m/s²
 _GYRO_BIAS_STD = 5e-3  # rad/s, of the difference to the LiDAR over a second
 _TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
@@ -155,7 +156,14 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
         )
     state, covariance = _moving_state(frames, path, imu, fit, extrinsic, config)
     speed = float(np.linalg.norm(state.v_world_imu))
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[T_V : T_V + 3, T_V : T_V + 3])[-1]))
+    variances, axes = np.linalg.eigh(covariance[T_V : T_V + 3, T_V : T_V + 3])
+    sigma = float(np.sqrt(variances[-1]))
+    if sigma > _UNKNOWN_SPEED:
+        axis = (state.R_world_imu @ extrinsic.R_imu_lidar).T @ axes[:, -1]
+        return (
+            f"not at rest ({evidence}), and the surroundings do not show how fast the platform moves along {_axis_text(axis)} "
+            f"(LiDAR axes): {sigma:.0f} m/s more or less; waiting for more data"
+        )
     text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {evidence}; batch over {len(frames)} scans fits to {fit.sigma * 100:.1f} cm"
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
 

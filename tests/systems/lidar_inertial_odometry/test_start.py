@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.simulation import simulate
+from boxplus.simulation import Scenario, SpinningLidar, simulate, sites, trajectories
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
 
@@ -59,6 +59,20 @@ def test_moving() -> None:
     down_imu = found.state.R_world_imu.T @ found.state.gravity_world
     assert _angle_deg(down_imu, truth.R_world_imu[0].T @ np.array([0.0, 0.0, -9.81])) < 1.0
     assert np.isclose(np.linalg.norm(found.state.gravity_world), 9.81)
+
+
+@pytest.mark.parametrize("voxel", [0.15, 0.5])
+def test_a_speed_that_the_surroundings_do_not_show_is_no_start(voxel: float) -> None:
+    # At 10 m/s through a smooth tube: rings that go along with the LiDAR look like rest, along the axis only.
+    drive = trajectories.drive(((-100.0, 0.0), (60.0, 0.0)), speed=10.0, height=1.0).starting_at(8.0)
+    lidar = SpinningLidar(channels=16, azimuth_steps=720)
+    simulation = simulate(Scenario("tube", sites.tunnel(400.0), drive, lidar), duration_s=1.6)
+    refusal = find_start(frames(simulation.events()), config(simulation, scan_voxel=voxel, map_cell=max(voxel, 0.25)))
+    assert isinstance(refusal, str)
+    assert "the surroundings do not show how fast the platform moves along (" in refusal
+    named = np.array([float(value) for value in refusal.split("along (")[1].split(")")[0].split(",")])
+    axis = simulation.T_imu_lidar[:3, :3].T @ simulation.ground_truth([simulation.start_ns]).R_world_imu[0].T[:, 0]
+    assert abs(named @ axis) > 0.99
 
 
 def _shaken(frame: Frame, seed: int) -> Frame:
