@@ -14,7 +14,7 @@ Each with a covariance, so that what the motion does not show is left open. See 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,16 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.backwards import surer_path
+from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
+_HALF_EXPLAINED = 0.5
+_TURNING_RAD_S = np.deg2rad(4.0)  # rms of one sensor that the other should show
 _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
 _SLOPE_DOUBTFUL = 0.03
@@ -44,8 +48,8 @@ class Agreement:
 
     Attributes:
         path: of the LiDAR.
-        rotation: None where too few scans could be compared.
-        translation: None where the path is too short or the mounting not known.
+        rotation: None where too few scans could be compared, or the path does not explain its scans.
+        translation: None likewise, and where the path is too short or the mounting not known.
         R_imu_lidar: (3, 3) the mounting that the accelerations were compared under.
         imu_rate_hz: of the samples.
         gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
@@ -81,26 +85,51 @@ def compare_sensors(
         T_expected: (4, 4) T_imu_lidar that the registration may start from, a guess.
         T_declared: (4, 4) T_imu_lidar as somebody says it is; accelerations are compared under it unless rotations contradict it.
         refine: register once more with the gyroscope, where it agrees: twice the time, a third of the error.
-        expected: of every scan, how an estimator believes that the LiDAR moved; a start for the registration and no more.
+        expected: of every scan, how an estimator believes that the LiDAR moved; a start for the registration, and what a path
+            that disagrees with it is measured by: one that explains the scans worse is not compared with anything.
     """
     imu = usable(imu)
     T_guess = T_declared if T_declared is not None else T_expected
-    R_guess = None if T_guess is None else T_guess[:3, :3]
-    path = lidar_path(scans, config, [] if R_guess is None else gyro_guesses(imu, R_guess), expected=expected)
-    rotation = compare_rotations(path, imu, R_guess) if len(imu) > 1 else None
-    if refine and rotation is not None and rotation.explained > _EXPLAINED:
-        steady = rotation
+    guesses = [] if T_guess is None else gyro_guesses(imu, T_guess[:3, :3])
+    path = lidar_path(scans, config, guesses, expected=expected)
+    found = _compared(path, imu, T_guess, T_declared)
+    surer: LidarPath | None = path
+    if expected is not None and not explains_scans(path, scans, expected, config):
+        surer = None
+    elif _doubtful(found, T_declared):
+        surer = surer_path(path, scans, config, guesses)
+    if surer is None:
+        return replace(found, rotation=None, translation=None)
+    if surer is not path:
+        found = _compared(surer, imu, T_guess, T_declared)
+    # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
+    slope = 1.0 if found.translation is None else found.translation.slope
+    steady = found.rotation
+    if (refine or (slope > 0.0 and _off(slope))) and steady is not None and steady.explained > _EXPLAINED:
         shift_ns = round(steady.offset_s * 1e9) if steady.offset_std_s < _OFFSET_KNOWN_S else 0
         corrected = GyroAttitude(imu.time_ns, (imu.gyro - steady.bias) / unit_of(steady.scale))
-        path = lidar_path(
+        refined = lidar_path(
             scans,
             config,
             [lambda time_ns: corrected.at(time_ns + shift_ns) @ steady.R_imu_lidar],
             undistort=True,
             expected=expected,
         )
-        rotation = compare_rotations(path, imu, R_guess) or rotation
-    R = np.eye(3) if R_guess is None else R_guess
+        again = _compared(refined, imu, T_guess, T_declared)
+        # The gyroscope agreed with the first path: where it does not agree with the second, that has gone astray.
+        if again.rotation is not None and again.rotation.explained > _EXPLAINED:
+            found = again
+    if T_declared is None:
+        return found
+    return replace(found, planes=plane_tilt(found.path, scans, imu, T_declared[:3, :3], config))
+
+
+def _compared(
+    path: LidarPath, imu: ImuSamples, T_guess: NDArray[np.float64] | None, T_declared: NDArray[np.float64] | None
+) -> Agreement:
+    """Rotations and accelerations along one path."""
+    R = np.eye(3) if T_guess is None else T_guess[:3, :3]
+    rotation = compare_rotations(path, imu, None if T_guess is None else R) if len(imu) > 1 else None
     # What explains little of the rotation says nothing of mounting, bias and clocks either.
     fits = rotation is not None and rotation.explained > _EXPLAINED
     if rotation is not None and fits and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
@@ -115,15 +144,26 @@ def compare_sensors(
             mean[6:9], std[6:9] = T_declared[:3, 3], _DECLARED_ARM_STD
         scaled = ImuSamples(imu.time_ns, imu.gyro / scale, imu.accel)
         translation = compare_accelerations(path, scaled, R, bias / scale, offset, (mean, std))
-        doubtful = translation is not None and translation.slope > 0.0 and abs(translation.slope - 1.0) > _SLOPE_DOUBTFUL
-        if doubtful and not refine:
-            # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
-            return compare_sensors(
-                scans, imu, config, T_expected=T_expected, T_declared=T_declared, refine=True, expected=expected
-            )
-    rate = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
-    planes = None if T_declared is None else plane_tilt(path, scans, imu, T_declared[:3, :3], config)
-    return Agreement(path, rotation, translation, R, rate, _power(imu), planes)
+    rate_hz = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
+    return Agreement(path, rotation, translation, R, rate_hz, _power(imu))
+
+
+def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
+    """Whether a comparison says that something is wrong: if not with the sensors, then with the path."""
+    rotation, translation = found.rotation, found.translation
+    if translation is not None and translation.explained > _HALF_EXPLAINED and _off(translation.slope):
+        return True
+    if rotation is None:
+        return False
+    if rotation.explained < _EXPLAINED:
+        unit = max(unit_of(rotation.scale), 1.0)
+        strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(found.gyro_power)) / unit)
+        return strong > float(_TURNING_RAD_S)
+    return T_declared is not None and apart(rotation, T_declared[:3, :3])[0] > apart_allowed(rotation)
+
+
+def _off(slope: float) -> bool:
+    return abs(slope - 1.0) > _SLOPE_DOUBTFUL
 
 
 def _power(imu: ImuSamples) -> float:

@@ -47,6 +47,10 @@ _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
 
 
+Poses = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+"""Times (K,) [ns], attitudes (K, 3, 3) and positions (K, 3) [m] of the LiDAR, in any frame."""
+
+
 @dataclass(frozen=True, slots=True)
 class LidarPath:
     """Poses of the LiDAR at the middles of scans. Where a registration failed a new segment begins, without a tie.
@@ -73,6 +77,11 @@ class LidarPath:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    @property
+    def poses(self) -> Poses:
+        """Times, attitudes and positions."""
+        return self.time_ns, self.R_path_lidar, self.p_path_lidar
 
     def part(self, chosen: NDArray[np.bool_]) -> LidarPath:
         """The poses that are chosen (K,)."""

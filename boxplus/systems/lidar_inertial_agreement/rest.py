@@ -20,6 +20,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.surfaces import surfaces_across
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
@@ -29,10 +30,7 @@ _POSE_SIGMA_M = 0.004
 _CREEP_M_S = 0.15
 _AS_WELL = 1.1  # times the cost
 _COMPARED, _POINTS = 3, 3000
-_MANY, _MOST_MAP_POINTS = 15, 5000
-_THICKEST_M, _FLAT = 0.06, 0.05
-_ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
-_ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and share of all
+_MOST_MAP_POINTS = 5000
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,24 +85,14 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
 
 
 def _faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:
-    """Whether there are surfaces across an axis (3,) that would show a motion along it.
-
-    Where a ring passes from a wall to a ceiling its points span a plane that faces the sensor, goes along with it and ties it to
-    its own pattern. A surface that is one still is a plane with three times as many of its neighbours.
-    """
+    """Whether there are surfaces across an axis (3,) that would show a motion along it."""
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
     for k, scan in enumerate(scans):
         placed = voxel_filter(scan.p_lidar)[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k]
         tree.insert(placed, downsample=True)
     points = voxel_filter(scans[-1].p_lidar)[0].astype(np.float64) @ path.R_path_lidar[-1].T + path.p_path_lidar[-1]
-    neighbours = tree.nearest(points, _MANY).points
-    full = np.isfinite(neighbours).all(axis=(1, 2))
-    near = neighbours[full] - neighbours[full].mean(axis=1, keepdims=True)
-    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / _MANY)
-    plane = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
-    across = (vectors[plane, :, 0] @ axis) ** 2
-    return float(across[across > _ACROSS].sum()) > max(_ENOUGH_ACROSS, _SHARE_ACROSS * len(points))
+    return surfaces_across(tree, points, axis)
 
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:

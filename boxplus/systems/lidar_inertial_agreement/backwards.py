@@ -1,0 +1,77 @@
+"""The path of a LiDAR found from the last scan to the first: the same motion, unless one of both has gone astray.
+
+A platform that rests fills the map with one pattern of points, which may hold a registration back when it moves off. Backwards
+the same scans begin in motion, and end at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.explained_scans import middle_of, one_motion, other_explains_better, scans_of
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, lidar_path
+
+_ABOUT_THE_SAME = 0.1, 0.5  # rad and m: drift over some seconds
+
+
+def surer_path(
+    path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning]
+) -> LidarPath | None:
+    """Register the scans backwards as well: the path of both that explains them better; None where that does not decide.
+
+    Args:
+        path: of `scans`, found forwards.
+        scans: consecutive sweeps.
+        config, guesses: as for `lidar_path`.
+    """
+    back = lidar_path_backwards(scans, config, guesses)
+    # A whole path that is one motion either way.
+    if not (_whole(path) and _whole(back)) or not np.array_equal(path.time_ns, back.time_ns):
+        return path if len(np.unique(path.segment)) <= len(np.unique(back.segment)) else back
+    chosen = scans_of(path.time_ns, scans)
+    if one_motion(path.poses, back.poses) or other_explains_better(chosen, back.poses, path.poses, config):
+        return path
+    if other_explains_better(chosen, path.poses, back.poses, config):
+        return back
+    return path if one_motion(path.poses, back.poses, *_ABOUT_THE_SAME) else None
+
+
+def lidar_path_backwards(scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning] = ()) -> LidarPath:
+    """As `lidar_path`, found from the last scan to the first, in the frame of the first pose of each segment."""
+    turned = scans[0].start_ns + scans[-1].end_ns
+    mirrored = [
+        Scan(scan.p_lidar[::-1].copy(), turned - scan.time_ns[::-1], None, turned - scan.end_ns, turned - scan.start_ns)
+        for scan in scans[::-1]
+    ]
+    back = lidar_path(mirrored, config, [_mirrored(guess, turned) for guess in guesses])
+    R, p = back.R_path_lidar[::-1].copy(), back.p_path_lidar[::-1].copy()
+    information, weak, misfit = back.information[::-1].copy(), back.weak[::-1].copy(), back.misfit[::-1].copy()
+    segment = (back.segment.max(initial=0) - back.segment)[::-1].copy()
+    for number in np.unique(segment):
+        index = np.flatnonzero(segment == number)
+        first, last = index[0], index[-1]
+        if len(index) > 1:
+            # What defined the frame is known as well as its neighbour is, from now on against the first pose.
+            information[last], weak[last], misfit[last] = information[last - 1], weak[last - 1], misfit[last - 1]
+        R_first, p_first = R[first].copy(), p[first].copy()
+        turn = np.eye(6)
+        turn[3:, 3:] = R_first
+        R[index], p[index] = R_first.T @ R[index], (p[index] - p_first) @ R_first
+        information[index] = turn.T @ information[index] @ turn
+        information[first], weak[first], misfit[first] = 0.0, False, 0.0
+    # Half a nanosecond is rounded the other way round.
+    middle_ns = {middle_of(turned_scan): middle_of(scan) for turned_scan, scan in zip(mirrored, scans[::-1], strict=True)}
+    time_ns = np.array([middle_ns[time] for time in back.time_ns[::-1].tolist()], np.int64)
+    return LidarPath(time_ns, R, p, information, segment, weak, misfit, back.failed)
+
+
+def _mirrored(guess: Turning, turned_ns: int) -> Turning:
+    return lambda time_ns: guess(turned_ns - time_ns)
+
+
+def _whole(path: LidarPath) -> bool:
+    return len(path) > 0 and bool(path.segment[0] == path.segment[-1])

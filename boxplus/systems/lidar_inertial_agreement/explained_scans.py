@@ -1,0 +1,116 @@
+"""Does a path of the LiDAR explain the scans it was found from, as well as the motion that an estimator expected?
+
+Rings or columns of points far apart fit their own pattern: a registration may stay with it while the platform moves on,
+with small residuals, scan after scan. Seconds apart it shows. Under the right motion surfaces of the first scans are where the
+last scans see them; under a wrong one points lie beside them, or where nothing was. A path that explains its scans clearly worse
+than another motion does has gone astray, and cannot contradict that motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Poses, Twist
+from boxplus.systems.lidar_inertial_agreement.surfaces import surface_distances
+
+_WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, paths that ride with a pattern 1.6 to 6
+_FEWEST_SCANS = 9
+_FIRST, _LAST = 6, 4  # scans of the first and of the last third
+_MOST_MAP_POINTS, _POINTS, _VOXEL_M = 5000, 1500, 0.4
+_FEWEST_JUDGED = 60  # points on surfaces: with less of them nothing is explained
+
+
+def explains_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Twist], config: RegistrationConfig) -> bool:
+    """Whether every long segment of `path` explains its scans about as well as the expected motion.
+
+    Args:
+        path: of `scans`.
+        scans: consecutive sweeps.
+        expected: of every scan, how an estimator believes that the LiDAR moved since the scan before.
+        config: sizes of map cells, and how far a point may lie from its plane.
+    """
+    time_ns, R, p = _reckoned(scans, expected)
+    for segment in np.unique(path.segment):
+        part = path.part(path.segment == segment)
+        chosen = scans_of(part.time_ns, scans)
+        numbers = np.searchsorted(time_ns, [scan.end_ns for scan in chosen])
+        other = time_ns[numbers], R[numbers], p[numbers]
+        if not one_motion(part.poses, other) and other_explains_better(chosen, part.poses, other, config):
+            return False
+    return True
+
+
+def scans_of(time_ns: NDArray[np.int64], scans: Sequence[Scan]) -> list[Scan]:
+    """The scans whose middles are at `time_ns` (K,)."""
+    middles = {middle_of(scan): scan for scan in scans}
+    return [middles[time] for time in time_ns.tolist()]
+
+
+def middle_of(scan: Scan) -> int:
+    """When a path has its pose [ns]."""
+    return (scan.start_ns + scan.end_ns) // 2
+
+
+def other_explains_better(scans: Sequence[Scan], own: Poses, other: Poses, config: RegistrationConfig) -> bool:
+    """Whether other poses (K,) of the same scans explain them clearly better."""
+    if len(scans) < _FEWEST_SCANS:
+        return False
+    return _misfit(scans, own, config) > _WORSE * _misfit(scans, other, config)
+
+
+def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
+    """Poses at the ends of the scans, from the twists between them."""
+    R, p = [np.eye(3)], [np.zeros(3)]
+    for k in range(1, len(scans)):
+        seconds = (scans[k].end_ns - scans[k - 1].end_ns) * 1e-9
+        rate, velocity = expected[k]
+        R.append(R[-1] @ so3.exp(seconds * rate))
+        p.append(p[-1] + seconds * (R[-1] @ velocity))
+    return np.array([scan.end_ns for scan in scans]), np.array(R), np.array(p)
+
+
+def one_motion(own: Poses, other: Poses, angle_rad: float = 0.01, distance_m: float = 0.05) -> bool:
+    """Whether two motions end alike: then neither has gone astray on its own."""
+    (_, R, p), (_, R_other, p_other) = own, other
+    turned, turned_other = R[0].T @ R[-1], R_other[0].T @ R_other[-1]
+    moved, moved_other = R[0].T @ (p[-1] - p[0]), R_other[0].T @ (p_other[-1] - p_other[0])
+    angle = float(np.linalg.norm(so3.log(turned.T @ turned_other)))
+    return angle < angle_rad and float(np.linalg.norm(moved - moved_other)) < distance_m
+
+
+def _misfit(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig) -> float:
+    """Mean squared distance [m²] of points of the last scans from the surfaces of the first ones; far off counts in full."""
+    third = len(scans) // 3
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    thin = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+    for k in np.unique(np.linspace(0, third - 1, _FIRST).astype(int)):
+        tree.insert(thin(_placed(scans[k], poses, k))[1].astype(np.float64), downsample=True)
+    squared, judged, far = 0.0, 0, 0
+    most = config.plane_threshold**2
+    for k in np.unique(np.linspace(len(scans) - third, len(scans) - 1, _LAST).astype(int)):
+        points = VoxelFilter(_VOXEL_M, _POINTS)(_placed(scans[k], poses, k))[0].astype(np.float64)
+        near, surface, distance, _ = surface_distances(tree, points)
+        squared += float(np.minimum(distance[surface] ** 2, most).sum())
+        judged += int(surface.sum())
+        far += int((~near).sum())
+    return (squared + most * far) / (judged + far) if judged > _FEWEST_JUDGED else most
+
+
+def _placed(scan: Scan, poses: Poses, k: int) -> NDArray[np.float32]:
+    """Points (N, 3) of scan k in the frame of the poses, undistorted with the motion from the pose before to the one after."""
+    time_ns, R, p = poses
+    before, after = max(k - 1, 0), min(k + 1, len(time_ns) - 1)
+    seconds = (time_ns[after] - time_ns[before]) * 1e-9
+    rate, velocity = so3.log(R[before].T @ R[after]) / seconds, (p[after] - p[before]) / seconds
+    since = ((scan.time_ns - time_ns[k]) * 1e-9)[:, None]
+    turned = np.einsum("nij,nj->ni", R[k] @ so3.exp(since * rate), scan.p_lidar.astype(np.float64))
+    placed: NDArray[np.float64] = turned + p[k] + since * velocity
+    return placed.astype(np.float32)

@@ -1,0 +1,54 @@
+"""Surfaces among map points: planes through many neighbours, which a scan pattern alone does not span."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.maps.ikd_tree import IkdTree
+
+_MANY = 15
+_THICKEST_M, _FLAT = 0.06, 0.05
+_NEAR_M = 1.5
+_ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
+_ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and share of all
+
+
+def surface_distances(
+    tree: IkdTree, points: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Which points have map points near, and the planes through fifteen of these.
+
+    Where a ring passes from a wall to a ceiling, five of its points span a plane that faces the sensor and goes along with it. A
+    surface that is one still is a plane with three times as many of its neighbours.
+
+    Args:
+        tree: the map.
+        points: (N, 3) in its frame [m].
+
+    Returns:
+        near (N,): fifteen neighbours, the nearest of them within 1.5 m; surface (N,): these are near and lie in a plane; distance
+        (N,) [m] to it and its normal (N, 3), both only where there is one.
+    """
+    neighbours = tree.nearest(points, _MANY).points
+    full = np.asarray(np.isfinite(neighbours).all(axis=(1, 2)))
+    near = full.copy()
+    near[full] = np.linalg.norm(neighbours[full, 0] - points[full], axis=1) < _NEAR_M
+    middle = neighbours[near].mean(axis=1)
+    spread = neighbours[near] - middle[:, None]
+    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread) / _MANY)
+    flat = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
+    surface = near.copy()
+    surface[near] = flat
+    normals = np.zeros((len(points), 3))
+    normals[surface] = vectors[flat, :, 0]
+    distances = np.zeros(len(points))
+    distances[surface] = np.abs(np.einsum("ni,ni->n", vectors[flat, :, 0], points[surface] - middle[flat]))
+    return near, surface, distances, normals
+
+
+def surfaces_across(tree: IkdTree, points: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
+    """Whether `points` (N, 3) lie on surfaces of the map that face a unit `axis` (3,) and would show a motion along it."""
+    _, _, _, normals = surface_distances(tree, points)
+    across = (normals @ axis) ** 2
+    return float(across[across > _ACROSS].sum()) > max(_ENOUGH_ACROSS, _SHARE_ACROSS * len(points))
