@@ -146,6 +146,28 @@ def test_a_sound_run_that_is_right_can_be_a_false_alarm(campaign: SimpleNamespac
         assert (verdict.verdict, verdict.false_alarm) == ("right", alarm)
 
 
+def test_that_nothing_shows_the_speed_is_no_false_alarm_where_the_run_behaves_like_it(
+    campaign: SimpleNamespace, seed: int
+) -> None:
+    judge, draw = campaign.judge, campaign.draws.draw(seed)
+    simulation, featureless = draw.truth(), replace(draw, featureless=True)
+    said = summary_of(
+        "the surroundings do not show whether the platform moves along (+1.00, +0.00, +0.00) (LiDAR axes): taken as"
+    )
+    more = summary_of(said.warnings[0].text, "gyroscope x saturated")
+    sure, wide, weak = estimate_of(simulation, 3.0), estimate_of(simulation, 3.0, 2.0), estimate_of(simulation, 3.0, weak=True)
+    for place, summary, estimate, alarm in (
+        (featureless, said, wide, ""),
+        (featureless, said, weak, ""),
+        (featureless, said, estimate_of(simulation), ""),
+        (featureless, said, sure, "flagged"),
+        (featureless, more, wide, "flagged"),
+        (draw, said, wide, "flagged"),
+    ):
+        errors = judge.errors_of(estimate, simulation)
+        assert judge.judge(judge.Outcome(0, None, summary, estimate), errors, place).false_alarm == alarm
+
+
 def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: SimpleNamespace) -> None:
     draws = campaign.draws
     assert set(campaign.judge.CAUSES) == set(campaign.spoil.FAULT_KINDS) - {"option"}

@@ -12,6 +12,9 @@ right when at every scan
   probability of 5 σ of one), or are below 3 cm and 0.3 deg, which nobody minds.
 
 That scans are `weak` or `lost` counts as a flag when at least half of the error arose in such scans, and not otherwise.
+
+Where a place is featureless, nothing tells rest from a constant speed. That a run says so is no false alarm as long as it says
+nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it.
 """
 
 from __future__ import annotations
@@ -62,6 +65,7 @@ _OPTION_CAUSES = {
 }
 _UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
 _WEAK = re.compile(r"scans are weak")
+_NOT_SHOWN = re.compile(r"^the surroundings do not show whether the platform moves along")
 
 
 class Truth(Protocol):
@@ -143,8 +147,8 @@ class Verdict:
         verdict: "right", "right cause", "flagged" or "silent".
         reasons: why it is not right: "error", "covariance", "no estimate".
         flags: what warned the user, a sentence each.
-        false_alarm: of a sound run: "flagged" (or refused), "weak" when nothing but scans were called weak where the LiDAR saw
-            enough, else empty.
+        false_alarm: of a sound run: "flagged" (or refused) without the reason that nothing is to be seen, "weak" when nothing but
+            scans were called weak where the LiDAR saw enough, else empty.
     """
 
     verdict: str
@@ -234,10 +238,11 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
     else:
         reasons += ["error"] * bool(errors.too_far.any()) + ["covariance"] * bool(errors.too_sure.any())
     sound = draw.kinds.fault == "none"
-    false_alarm = "" if not sound else "flagged" if flags else "weak" if falsely_weak else ""
+    weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
+    nothing_shown = draw.featureless and all(_NOT_SHOWN.search(text) for text in flags) and (weak or "covariance" not in reasons)
+    false_alarm = "" if not sound else "flagged" if flags and not nothing_shown else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
-    weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
     guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)

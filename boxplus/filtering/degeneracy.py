@@ -17,7 +17,7 @@ good as noise for the question, and would hide how well the others measure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,13 @@ def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: f
     scaled = whitening.T @ rotated
     vectors = scaled / np.linalg.norm(scaled, axis=0)
     return PoseDirections(ratios, vectors, lever_arm, ratios < threshold, scale[:, None] * scaled)
+
+
+def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> PoseDirections:
+    """The same directions, the one closest to a shift along a unit `axis` (3,) of the position weak, whatever its ratio."""
+    weak = directions.weak.copy()
+    weak[int(np.argmax(np.abs(axis @ directions.vectors[3:])))] = True
+    return replace(directions, weak=weak)
 
 
 def project_out_weak(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_states import random_covariance, random_state
 
-from boxplus.filtering.degeneracy import pose_directions, project_out_weak, strong_step
+from boxplus.filtering.degeneracy import pose_directions, project_out_weak, strong_step, with_weak_axis
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.update_step import map_step
 
@@ -220,3 +220,23 @@ def test_the_threshold_is_a_multiple_of_the_noise(excess: float) -> None:
     end = np.zeros((12, 12))
     end[3, 3] = excess * THRESHOLD * (N[3, 3] + 1e-6 * np.trace(A[3:6, 3:6]))
     assert pose_directions((A + end)[:6, :6], N, LEVER_ARM, THRESHOLD).weak[0] == (excess < 1.0)
+
+
+@given(seeds)
+def test_an_axis_can_be_called_weak_whatever_its_ratio(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    axis = random.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    x, normals, p_imu = _tube(seed, axis)
+    noisy = _tilted(random, normals, 3.0 * TILT)
+    S = _information(x, noisy, p_imu, np.zeros(len(noisy)))[0][:6, :6]
+    directions = pose_directions(S, _noise(x, noisy, p_imu), LEVER_ARM, THRESHOLD)
+    forced = with_weak_axis(directions, axis)
+    closest = int(np.argmax(np.abs(axis @ directions.vectors[3:])))
+    assert forced.weak[closest] and abs(axis @ forced.vectors[3:, closest]) > 0.8
+    np.testing.assert_array_equal(np.delete(forced.weak, closest), np.delete(directions.weak, closest))
+    A = np.zeros((12, 12))
+    A[:6, :6] = S
+    along = np.r_[forced.basis[:, closest], np.zeros(6)]
+    kept, _ = project_out_weak(A, np.zeros(12), forced)
+    assert along @ kept @ along < 1e-9 * (along @ A @ along)

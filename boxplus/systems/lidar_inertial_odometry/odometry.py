@@ -33,6 +33,7 @@ from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
+from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 
 _LONGEST_START_SCANS, _SCANS_BETWEEN_TRIES = 30, 5
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 3.0  # shared: see `MapDatum`, what random recordings need
@@ -64,6 +65,7 @@ class LidarInertialOdometry:
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
+        self._unshown = UnshownMotion()
         self._consistency = Consistency(self.config, self._declared())
         self._saturation = Saturation()
         self._warnings: list[str] = []
@@ -123,7 +125,7 @@ class LidarInertialOdometry:
         newest = max(int(imu.time_ns[-1]), self._time_ns) if len(imu) else self._time_ns
         if newest > self._time_ns:
             self._carry(x, cov, imu, newest, self._density)
-        return Prediction(newest, NavState.unpack(x), cov)
+        return Prediction(newest, NavState.unpack(x), self._unshown.widened(cov, newest))
 
     def _declared(self) -> NDArray[np.float64] | None:
         """T_imu_lidar (4, 4) that the sensors can contradict, the identity if nobody gave one; None where it is estimated."""
@@ -189,10 +191,10 @@ class LidarInertialOdometry:
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov), _SHARED_ERRORS)
+        self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
-        first, *rest = self._waiting
-        self._waiting = []
+        (first, *rest), self._waiting = self._waiting, []
         p_lidar = deskew_first(first, found.state, self.config)
         self._insert(self._voxel_filter(p_lidar)[1])
         self._warnings = [text for text in (self._gap, found.warning) if text]
@@ -209,24 +211,21 @@ class LidarInertialOdometry:
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
-        voxel = self._voxel_filter.voxel_size
-        points, map_points = self._voxel_filter(p_lidar)
+        voxel, (points, map_points) = self._voxel_filter.voxel_size, self._voxel_filter(p_lidar)
         clock.lap("voxel filter")
         measurement = self._measurement(frame, points, voxel)
         x_prior, cov_prior = self._x.copy(), self._cov.copy()
-        posterior = iterated_update(
-            x_prior, cov_prior, measurement, max_iterations=self.config.max_iterations, min_used=self.config.min_points
-        )
+        limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
+        posterior = iterated_update(x_prior, cov_prior, self._unshown.restrict(measurement), **limits)
         on_map = measurement.on_map_share if posterior.valid else 0.0
         directions = posterior.last.directions if posterior.valid else None
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior.x, on_map, directions)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-            self._datum.follow(self._x, cov_prior, self._cov, posterior.A, posterior.last.directions)
-        else:
-            self._datum.follow(self._x, cov_prior, self._cov)
+        self._datum.follow(self._x, cov_prior, self._cov, *((posterior.A, posterior.last.directions) if taken else ()))
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
+        self._unshown.look(NavState.unpack(self._x).to_world(map_points), self._cov, self._time_ns, self.config.map_cell)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
@@ -341,8 +340,8 @@ class LidarInertialOdometry:
         return Estimate(
             time_ns=frame.scan.end_ns,
             state=NavState.unpack(self._x),
-            covariance=self._cov.copy(),
-            pose_covariance=self._datum.pose_covariance(self._x),
+            covariance=self._unshown.widened(self._cov.copy(), self._time_ns),
+            pose_covariance=self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns),
             status=outcome.status if outcome else "ok" if self._gap is None else "lost",
             weak_directions=outcome.weak_directions if outcome else (),
             lidar_share=outcome.lidar_share(self._cov) if outcome else np.zeros(6),

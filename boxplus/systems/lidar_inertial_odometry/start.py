@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -72,6 +72,7 @@ class Start:
         duration_s: how long the start was observed.
         text: one sentence with the evidence.
         warning: what could not be decided, a sentence; empty when all was.
+        unshown_axes: (K, 3) unit axes in the world along which rest was taken for granted.
     """
 
     kind: Literal["static", "moving"]
@@ -81,6 +82,7 @@ class Start:
     duration_s: float
     text: str
     warning: str = ""
+    unshown_axes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
@@ -138,8 +140,18 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
         if not low <= norm <= high:
             return f"at rest, but the accelerometer shows {norm:.2f} m/s², not one gravity: check its unit and scale"
         state, covariance = _static_state(imu, extrinsic, config)
-        up = extrinsic.R_imu_lidar.T @ imu.accel.mean(axis=0) / norm
-        return Start("static", frames[0].scan.end_ns, state, covariance, duration, f"at rest: {evidence}", _undecided(rest, up))
+        axes = _unshown(rest, extrinsic.R_imu_lidar.T @ imu.accel.mean(axis=0) / norm)
+        R_world_lidar = state.R_world_imu @ extrinsic.R_imu_lidar
+        return Start(
+            "static",
+            frames[0].scan.end_ns,
+            state,
+            covariance,
+            duration,
+            f"at rest: {evidence}",
+            _undecided(axes),
+            axes @ R_world_lidar.T,
+        )
     if len(frames) < _MIN_MOVING_SCANS:
         return f"not at rest ({evidence}), and {len(frames)} scans are not enough for a moving start; waiting for more data"
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
@@ -168,15 +180,20 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
 
 
-def _undecided(rest: Rest, up_lidar: NDArray[np.float64]) -> str:
-    """A sentence about the axes along which nothing shows rest; up and down, hardly anything begins at a constant speed."""
-    axes = [axis for axis in rest.open_axes if abs(axis @ up_lidar) < _UPRIGHT]
-    if not axes:
+def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K, 3) axes along which nothing shows rest, LiDAR frame; up and down, hardly anything begins at a constant speed."""
+    return rest.open_axes[np.abs(rest.open_axes @ up_lidar) < _UPRIGHT].reshape(-1, 3)
+
+
+def _undecided(axes: NDArray[np.float64]) -> str:
+    """A sentence about the axes along which nothing shows rest."""
+    if not len(axes):
         return ""
     return (
         "the surroundings do not show whether the platform moves along "
         f"{' and '.join(_axis_text(axis) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
-        "at a constant speed it would be as quiet"
+        "at a constant speed it would be as quiet, so the position along it is called weak and its standard deviation grows by "
+        "10 m/s until something shows the speed"
     )
 
 

@@ -1,0 +1,98 @@
+"""Where nothing tells rest from a constant speed, the covariance says so, and no scan claims to know."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from small_drives import LIDAR, config, run
+
+from boxplus.filtering.nav_state import T_P, T_V, TANGENT
+from boxplus.simulation import Scenario, Simulation, manoeuvres, worlds
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
+
+AXIS = np.array([1.0, 0.0, 0.0])
+CELL_M = 0.25
+
+
+def covariance(seed: int = 0) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(TANGENT, TANGENT)) * 0.05
+    return root @ root.T + 1e-6 * np.eye(TANGENT)
+
+
+def surface(normal: int, seed: int = 0) -> np.ndarray:
+    """1500 points on a rough square of 8 m across an axis, 3 m away."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(-4.0, 4.0, (1500, 3))
+    points[:, normal] = 3.0 + 0.01 * random.normal(size=1500)
+    return points
+
+
+def looked_at(unshown: UnshownMotion, points: np.ndarray, time_ns: int) -> np.ndarray:
+    cov = covariance()
+    for _ in range(5):
+        unshown.look(points, cov, time_ns, CELL_M)
+    return cov
+
+
+@lru_cache(maxsize=1)
+def constant_speed() -> tuple[Simulation, list[Estimate]]:
+    """Five seconds with 1.5 m/s along a smooth corridor; the LiDAR sees the same all the time."""
+    motion = manoeuvres.constant_velocity(5.5, (-5.0, 0.1, 1.4), (1.5, 0.0, 0.0), np.eye(3))
+    simulation = Simulation(Scenario("corridor", worlds.corridor(), motion, LIDAR), 0, 5.0)
+    return simulation, run(LidarInertialOdometry(config(simulation)), simulation.events())
+
+
+def test_a_constant_speed_in_a_corridor_is_never_claimed_to_be_rest() -> None:
+    simulation, estimates = constant_speed()
+    assert "do not show whether the platform moves" in estimates[0].warnings[0]
+    assert {estimate.status for estimate in estimates[1:]} == {"weak"}
+    assert all(max(abs(weak.translation_world[0]) for weak in estimate.weak_directions) > 0.9 for estimate in estimates[1:])
+    time_ns = np.array([estimate.time_ns for estimate in estimates])
+    truth = simulation.ground_truth(np.minimum(time_ns, simulation.end_ns))
+    R = estimates[0].state.R_world_imu @ truth.R_world_imu[0].T
+    for estimate, p in zip(estimates, truth.p_world_imu, strict=True):
+        error = estimate.state.p_world_imu - estimates[0].state.p_world_imu - R @ (p - truth.p_world_imu[0])
+        P = estimate.pose_covariance[3:, 3:] + 1e-6 * np.eye(3)
+        assert error @ np.linalg.solve(P, error) < 5.0**2
+        assert np.sqrt(estimate.covariance[T_V, T_V]) > 5.0
+    assert np.linalg.norm(error) > 5.0
+
+
+def test_what_is_not_known_grows_with_time_along_the_axis() -> None:
+    unshown = UnshownMotion(AXIS[None], 0)
+    cov = covariance()
+    for seconds in (0.0, 2.0, 7.0):
+        wide = unshown.widened(cov, round(seconds * 1e9))
+        added = wide - cov
+        assert np.linalg.eigvalsh(added).min() > -1e-9
+        np.testing.assert_allclose(np.sqrt(added[[T_P, T_V], [T_P, T_V]]), [10.0 * seconds, 10.0], atol=1e-9)
+        assert np.sqrt(added[T_P + 1, T_P + 1]) <= 0.06 * seconds
+        np.testing.assert_allclose(unshown.widened(cov[:6, :6], round(seconds * 1e9)), wide[:6, :6])
+    untouched = covariance()
+    assert UnshownMotion().widened(untouched, 10**9) is untouched
+
+
+def test_a_surface_across_the_axis_lets_the_filter_find_the_speed() -> None:
+    unshown = UnshownMotion(AXIS[None], 0)
+    walls = looked_at(unshown, surface(1), 10**9)
+    np.testing.assert_array_equal(walls, covariance())
+    assert len(unshown.axes) == 1
+    cov = looked_at(unshown, surface(0), 2 * 10**9)
+    assert len(unshown.axes) == 0
+    assert np.sqrt(cov[T_V, T_V]) > 9.9 and np.sqrt(cov[T_V + 1, T_V + 1]) < 1.0
+    # The way until then stays unknown, the speed is the filter's from now on.
+    later = unshown.widened(covariance(), 9 * 10**9) - covariance()
+    np.testing.assert_allclose(np.sqrt(later[T_P, T_P]), 20.0)
+    np.testing.assert_allclose(later[T_V : T_V + 3, T_V : T_V + 3], 0.0, atol=1e-12)
+
+
+def test_the_axis_is_refined_by_what_the_scans_leave_open() -> None:
+    tilted = np.array([np.cos(0.1), np.sin(0.1), 0.0])
+    unshown = UnshownMotion(tilted[None], 0)
+    for seed in range(5):
+        normals = np.random.default_rng(seed).normal(size=(500, 3)) * [0.02, 1.0, 1.0]
+        unshown.refine(normals.T @ normals)
+    assert np.arccos(unshown.axes[0] @ AXIS) < 0.005
