@@ -31,6 +31,7 @@ _LACKING_M = 0.1
 _ATTITUDE_RAD = 0.02
 _SHARED = 13
 _TIE_STD = 0.05  # m/s²
+_LEAST_CHI2 = 0.1
 _GROUP_S = 0.5  # over which errors of registrations are alike
 _ANYWHERE_M, _ANY_SPEED_M_S = 1e3, 15.0  # where the LiDAR says nothing
 GRAVITY, BIAS, ARM, SLOPE, TURN = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
@@ -142,9 +143,12 @@ def compare_accelerations(
     samples = sum(len(stretch.time_ns) for stretch in stretches)
     freedom = sum(stretch.freedom for stretch in stretches)
     chi2 = rest / max(freedom - _SHARED, 1)
+    # What neighbours share is in the jackknife: beside it poses count as well as they fit, of a state to begin with no better
+    # than usual.
+    shared = _jackknife(stretches, whole, prior)
     inflate = max(chi2, 1.0)
-    scaled: NDArray[np.float64] = np.linalg.inv(whole.measured / inflate + whole.known).astype(np.float64)
-    scaled = scaled + _jackknife(stretches, whole, prior)
+    scaled: NDArray[np.float64] = np.linalg.inv(whole.measured / inflate + whole.known).astype(np.float64) + shared
+    fitted: NDArray[np.float64] = np.linalg.inv(whole.measured / max(chi2, _LEAST_CHI2) + whole.known).astype(np.float64) + shared
     begins = []
     for stretch in stretches:
         part = stretch.reduced()
@@ -163,7 +167,7 @@ def compare_accelerations(
         x[ARM],
         float(x[SLOPE]),
         x[TURN],
-        scaled,
+        fitted,
         begins,
         _SIGMA_M * np.sqrt(chi2),
         chi2,
