@@ -39,17 +39,14 @@ def street_batch(rng: np.random.Generator, x: float, size: int = BATCH) -> NDArr
 
 
 def brute_force_contents(batches: list[NDArray[np.float64]], origin: NDArray[np.float64]) -> NDArray[np.float32]:
-    """What downsampled insertion of the batches must leave: per cell the first point nearest to the centre."""
-    best: dict[tuple[int, ...], tuple[np.float32, tuple[np.float32, ...]]] = {}
+    """What downsampled insertion of the batches must leave: the first point of each cell."""
+    first: dict[tuple[int, ...], tuple[np.float32, ...]] = {}
     for batch in batches:
         xyz = (batch - origin).astype(np.float32)
         cells = np.floor((xyz.astype(np.float64) + origin) / CELL)
-        offsets = xyz - ((cells + 0.5) * CELL - origin).astype(np.float32)
-        sq = offsets[:, 0] * offsets[:, 0] + offsets[:, 1] * offsets[:, 1] + offsets[:, 2] * offsets[:, 2]
-        for cell, distance, point in zip(map(tuple, cells.astype(int).tolist()), sq, xyz, strict=True):
-            if cell not in best or distance < best[cell][0]:
-                best[cell] = (distance, tuple(point))
-    contents = np.array([point for _, point in best.values()], np.float32)
+        for cell, point in zip(map(tuple, cells.astype(int).tolist()), xyz, strict=True):
+            first.setdefault(cell, tuple(point))
+    contents = np.array(list(first.values()), np.float32)
     return contents[np.lexsort(contents.T[::-1])]
 
 

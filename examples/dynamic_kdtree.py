@@ -27,7 +27,7 @@ revived = tree.reinsert_box([-5.0, -5.0, -5.0], [5.0, 5.0, 0.0])
 print(f"after reinsert_box of the lower half: {len(tree)} ({revived} revived)")
 print("within 2 m of the origin:", len(tree.radius_search([0.0, 0.0, 0.0], 2.0)))
 
-# A map that keeps one point per cell of 0.5 m, the one nearest to the cell's centre.
+# A map that keeps one point per cell of 0.5 m, the first one that came.
 sparse = IkdTree(cell_size=0.5)
 for batch in np.array_split(points, 20):
     report = sparse.insert(batch, downsample=True)

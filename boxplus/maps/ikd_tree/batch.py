@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_tree.box import disjoint, in_box
-from boxplus.maps.ikd_tree.leaf import BUCKET, trailing_zeros
 from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
@@ -22,7 +21,6 @@ from boxplus.maps.ikd_tree.pool import (
     all_bits,
     has_room,
 )
-from boxplus.maps.ikd_tree.replace import log_operation, remove_point, replace_point
 from boxplus.maps.ikd_tree.update import (
     DROP,
     IDLE,
@@ -75,24 +73,13 @@ def round_up(value: np.float64) -> np.float32:
 
 @kernel(borrow=True)
 def search_cell(
-    pool: Pool, node: np.uint32, side: np.uint32, stack: NDArray[np.void], cell: NDArray[np.float32], best: NDArray[np.float32]
-) -> tuple[np.int64, bool, np.uint32]:
-    """The live point of a cell nearest to its centre, below a slot.
+    pool: Pool, node: np.uint32, side: np.uint32, stack: NDArray[np.void], cell: NDArray[np.float32]
+) -> tuple[bool, bool]:
+    """Whether a cell, `cell` (6,) low and high corner, holds a live point below a slot, and whether it holds deleted ones.
 
-    Args:
-        pool: the tree.
-        node, side: the slot.
-        stack: scratch.
-        cell: (9,) low, high, centre.
-        best: (4,) overwritten: x, y, z of the point and its squared distance to the centre (inf if there is none).
-
-    Returns:
-        How many live points the cell holds, whether it may hold deleted ones, and the nearest as leaf · BUCKET + place.
+    The search ends with the first live point: the second answer is complete where the first one is no.
     """
     inner = pool.inner
-    best[3] = np.float32(np.inf)
-    found = np.int64(0)
-    nearest = NIL
     has_dead = False
     ref = NIL if disjoint(inner[node]["box"], side, cell) else np.uint32(inner[node]["child"][side])
     label = np.uint8(inner[node]["label"][side])
@@ -121,30 +108,34 @@ def search_cell(
             leaf = pool.leaf[index]
             bits = in_box(pool.leaf, index, cell)
             live = np.uint32(bits & (all_bits(np.uint32(leaf["count"])) if label == LABEL_LIVE else np.uint32(leaf["live"])))
+            if live != ZERO:
+                return True, has_dead
             has_dead = has_dead or bits != live
-            while live != ZERO:
-                i = trailing_zeros(live)
-                live &= live - ONE
-                found += 1
-                x, y, z = leaf["x"][i], leaf["y"][i], leaf["z"][i]
-                dx, dy, dz = x - cell[6], y - cell[7], z - cell[8]
-                sq = dx * dx + dy * dy + dz * dz
-                smaller = x < best[0] or (x == best[0] and (y < best[1] or (y == best[1] and z < best[2])))
-                if sq < best[3] or (sq == best[3] and smaller):
-                    best[0], best[1], best[2], best[3] = x, y, z, sq
-                    nearest = np.uint32(index * np.uint32(BUCKET) + i)
         if top == ZERO:
-            return found, has_dead, nearest
+            return False, has_dead
         top -= ONE
         ref = np.uint32(stack[top]["ref"])
         label = np.uint8(stack[top]["label"])
 
 
 @kernel(borrow=True)
+def log_operation(work: Work, kind: np.int64, box: NDArray[np.float32]) -> None:
+    """Note an operation for the running rebuild. Room in the log must be there."""
+    job = work.job[0]
+    if job["phase"] == IDLE:
+        return
+    entry = work.log[job["logged"]]
+    entry["kind"] = np.uint32(kind)
+    for i in range(6):
+        entry["box"][i] = box[i]
+    job["logged"] += ONE
+
+
+@kernel(borrow=True)
 def set_cell(
     x: np.float32, y: np.float32, z: np.float32, origin: NDArray[np.float64], size: float, cell: NDArray[np.float32]
 ) -> None:
-    """The cell [i c, (i + 1) c) of a point: `cell` (9,) gets its low and high corner and its centre, relative to the origin.
+    """The cell [i c, (i + 1) c) of a point: `cell` (6,) gets its low and high corner, relative to the origin.
 
     The bounds are rounded up to float32: `x ≥ b` and `x < b` have the same answer for a float32 `x` before and after. They
     are moved by a cell if the division was rounded across one.
@@ -161,7 +152,6 @@ def set_cell(
             low, high = high, round_up((index + 1.0) * size - origin[axis])
         cell[axis] = low
         cell[axis + 3] = high
-        cell[axis + 6] = np.float32((index + 0.5) * size - origin[axis])
 
 
 @kernel(borrow=True)
@@ -179,11 +169,10 @@ def update_batch(
     """Apply the operations `begin` to `end` below a slot, in order: to the tree, or to a new subtree from the log.
 
     Returns the number of the next operation: less than `end` if room ran out or the tree became too deep. `changed` of the
-    job is increased by the number of points deleted, revived and (of those given) stored, `replaced` by those of the
-    latter that took the place of another one.
+    job is increased by the number of points deleted, revived and (of those given) stored.
     """
     job = work.job[0]
-    cell, best, box = work.scratch[:9], work.scratch[9:13], work.scratch[13:19]
+    cell, box = work.scratch[:6], work.scratch[6:12]
     for row in range(begin, end):
         if job["phase"] != IDLE and job["logged"] + np.uint32(2) > np.uint32(len(work.log)):
             return np.int64(row)
@@ -198,39 +187,22 @@ def update_batch(
             continue
         x, y, z = box[0], box[1], box[2]
         drop = kind == DROP
-        stored = np.int64(kind != DROP)
-        nearest, single = NIL, False
         if kind == INSERT_DOWNSAMPLED:
             set_cell(x, y, z, origin, cell_size, cell)
-            found, has_dead, nearest = search_cell(pool, node, side, work.cell_stack, cell, best)
-            if found > 0:
-                dx, dy, dz = x - cell[6], y - cell[7], z - cell[8]
-                if best[3] <= dx * dx + dy * dy + dz * dz:
-                    if found == 1:
-                        continue
-                    x, y, z = best[0], best[1], best[2]
-                    stored = np.int64(0)
-                else:
-                    single = found == 1 and not has_dead
-                    if single and replace_point(pool, work, node, side, x, y, z, cell, nearest):
-                        job["changed"] += 1
-                        job["replaced"] += 1
-                        continue
-            drop = found > 0 or has_dead
+            taken, drop = search_cell(pool, node, side, work.cell_stack, cell)
+            if taken:
+                continue
             for i in range(6):
                 box[i] = cell[i]
         if job["depth"] > np.uint32(MAX_DEPTH) or not has_room(pool, np.uint32(2), np.uint32(4)):
             return np.int64(row)
         if drop:
-            if single and remove_point(pool, work, node, side, nearest):
-                job["live"] -= 1
-            else:
-                job["live"] -= update_box(pool, work, node, side, box, DROP)
+            job["live"] -= update_box(pool, work, node, side, box, DROP)
             log_operation(work, DROP, box)
         if kind != DROP:
             inside = insert_point(pool, work, node, side, x, y, z)
             job["live"] += 1
-            job["changed"] += stored
+            job["changed"] += 1
             if inside:
                 box[0], box[1], box[2] = x, y, z
                 log_operation(work, INSERT, box)

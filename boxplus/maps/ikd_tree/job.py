@@ -62,7 +62,7 @@ def new_work(in_place: int, balance: float, check: int) -> Work:
         walk=np.empty(2 * PATH_DEPTH, SLOT),
         gather=np.empty(PATH_DEPTH, SLOT),
         cell_stack=np.empty(PATH_DEPTH, PENDING),
-        scratch=np.zeros(19, np.float32),
+        scratch=np.zeros(12, np.float32),
         order=np.empty(BUCKET, np.uint32),
     )
 

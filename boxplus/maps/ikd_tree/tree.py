@@ -37,7 +37,7 @@ class InsertReport(NamedTuple):
     """What became of the points given to `insert` or `build`."""
 
     inserted: int  #: points stored (with downsampling: winners of their cells)
-    superseded: int  #: points not stored because a stored one is nearer to the centre of the cell
+    superseded: int  #: points not stored because their cell has one
     not_finite: int  #: rejected: a coordinate is NaN or infinite
     too_far: int  #: rejected: farther than 100 km from the origin on an axis
 
@@ -137,9 +137,8 @@ class IkdTree:
     def insert(self, points: ArrayLike, *, downsample: bool = False) -> InsertReport:
         """Add points, (N, 3) [m], one after the other.
 
-        With `downsample`, of the live points in a cell of side `cell_size` (aligned to the world's zero) and the new one only
-        the one nearest to the cell's centre stays; ties keep a stored one. Points that are not finite or too far from the
-        origin are rejected and counted.
+        With `downsample`, a cell of side `cell_size` (aligned to the world's zero) that has a live point takes no other one.
+        Points that are not finite or too far from the origin are rejected and counted.
 
         Raises:
             InputError: wrong shape, or `downsample` without a `cell_size`.
@@ -317,7 +316,7 @@ class IkdTree:
         changed = 0
         for begin in range(0, len(operations), _BATCH):
             row, end = begin, min(begin + _BATCH, len(operations))
-            self._job["changed"] = self._job["replaced"] = 0
+            self._job["changed"] = 0
             self._begin_update(2 * (end - begin) + 2)
             while row < end:
                 reserve(self._pool, _ROOM, _ROOM)
@@ -327,7 +326,7 @@ class IkdTree:
                 if self._job["depth"] > MAX_DEPTH:
                     self._rebuild_all()
             changed += int(self._job["changed"])
-            self._end_update(int(self._job["changed"] - self._job["replaced"]))
+            self._end_update(int(self._job["changed"]))
         return changed
 
     def _begin_update(self, operations: int) -> None:

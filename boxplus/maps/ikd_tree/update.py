@@ -66,7 +66,6 @@ JOB = np.dtype(
         ("check", np.uint32),  # no balance check up to this size
         ("live", np.int64),  # live points of the tree
         ("changed", np.int64),  # points deleted, revived and stored by the last call
-        ("replaced", np.int64),  # of these, points stored in the place of another one
     ],
     align=True,
 )
@@ -92,7 +91,7 @@ class Work(NamedTuple):
     walk: NDArray[np.void]  # scratch of the box updates
     gather: NDArray[np.void]  # scratch of the copy of a small subtree
     cell_stack: NDArray[np.void]  # scratch of the search of a cell
-    scratch: NDArray[np.float32]  # (16,)
+    scratch: NDArray[np.float32]  # (12,)
     order: NDArray[np.uint32]  # (BUCKET,)
 
 

@@ -39,9 +39,9 @@ class BruteForceMap:
         self.append(xyz)
         return len(xyz)
 
-    def cell(self, point: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Low and high corner and centre of a point's cell."""
-        low, high, center = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    def cell(self, point: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Low and high corner of a point's cell."""
+        low, high = np.empty(3, np.float32), np.empty(3, np.float32)
         for axis in range(3):
             size, origin = self.cell_size, self.origin[axis]
             guess = np.floor((origin + float(point[axis])) / size)
@@ -49,24 +49,15 @@ class BruteForceMap:
                 bounds = round_up(index * size - origin), round_up((index + 1) * size - origin)
                 if bounds[0] <= point[axis] < bounds[1]:
                     low[axis], high[axis] = bounds
-                    center[axis] = np.float32((index + 0.5) * size - origin)
-        return low, high, center
+        return low, high
 
     def insert_downsampled(self, points: ArrayLike) -> None:
         for point in self.relative(points):
-            low, high, center = self.cell(point)
+            low, high = self.cell(point)
             stored = ((self.xyz >= low) & (self.xyz < high)).all(axis=1)
-            rivals = self.xyz[stored & self.live]
-            winner = point
-            if len(rivals):
-                order = np.lexsort((*rivals.T[::-1], squares(rivals - center)))
-                best = rivals[order[0]]
-                if squares(best - center) <= squares(point - center):
-                    if len(rivals) == 1:
-                        continue
-                    winner = best
-            self.xyz, self.live = self.xyz[~stored], self.live[~stored]
-            self.append(winner[None])
+            if not (stored & self.live).any():
+                self.xyz, self.live = self.xyz[~stored], self.live[~stored]
+                self.append(point[None])
 
     def in_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.bool_]:
         xyz = self.xyz.astype(float)
