@@ -90,7 +90,7 @@ def iterated_update(
         min_used: fewest parts of the measurement that make an update.
 
     Example:
-        >>> posterior = iterated_update(x, cov, PlaneMeasurement(points, tree, config, voxel=0.5, with_extrinsic=False))
+        >>> posterior = iterated_update(x, cov, PlaneMeasurement(points, tree, config, with_extrinsic=False))
     """
     x = x_prior.copy()
     delta = np.zeros(TANGENT)

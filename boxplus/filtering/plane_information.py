@@ -16,7 +16,8 @@ MEASURED_DOF = 12
 # Variance of a map point as far as the tilt of a plane goes [m²]: five points of one or two scan lines are not independent,
 # and what they say beside these lines is worth less than their noise suggests.
 _TILT_VARIANCE = 0.1**2
-# Variance of a plane's normal [rad²] beyond which it counts less and less for the question which directions are measured.
+# Variance of a plane's normal [rad²] beyond which the plane counts less and less: its points lie on little more than a line,
+# and a normal that noise has chosen holds the sensor where it first saw that line.
 _SURE_TILT = 0.1**2
 
 
@@ -59,19 +60,13 @@ def _add_criterion(
 ) -> None:
     """signal += w h hᵀ, noise += w M Cov(u) Mᵀ of one plane, M u = [s × Rᵀu, u] (`filtering.degeneracy`).
 
-    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² of the plane's own points about it: as large as the noise really is,
-    whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian. A plane across
-    an edge, of which this makes nothing but noise, does not count.
+    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² of the plane's points about it: as large as the noise really is, whatever
+    the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
     """
     sx, sy, sz = imu
-    tilt = 0.0
-    for first in (5, 9):
-        tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
-    tilt *= plane[4]
-    weight /= 1.0 + tilt / _SURE_TILT
     for first in (5, 9):
         gx, gy, gz = plane[first], plane[first + 1], plane[first + 2]
-        factor = weight * plane[4] / (1.0 + plane[4] * (gx * gx + gy * gy + gz * gz))
+        factor = weight * plane[13] / (1.0 + plane[13] * (gx * gx + gy * gy + gz * gz))
         cx = x[R] * gx + x[R + 3] * gy + x[R + 6] * gz
         cy = x[R + 1] * gx + x[R + 4] * gy + x[R + 7] * gz
         cz = x[R + 2] * gx + x[R + 5] * gy + x[R + 8] * gz
@@ -142,6 +137,10 @@ def accumulate_planes(
         spread_sq = t0 * t0 + t1 * t1
         variance = range_variance + 0.2 * map_variance + _TILT_VARIANCE * spread_sq + plane[4] * (1.2 + spread_sq)
         weight = 1.0 / (variance + z * z)
+        tilt = 0.0
+        for first in (5, 9):
+            tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
+        weight /= 1.0 + plane[13] * tilt / _SURE_TILT
         _row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
         for i in range(size):
             wh = weight * h[i]

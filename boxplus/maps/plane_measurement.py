@@ -26,8 +26,9 @@ from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
 from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 512
+# Degrees of freedom that what a scan's neighbourhoods are like counts for; the five points of a plane leave two.
+_PRIOR_DOF, _OWN_DOF = 1.0, 2.0
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
-_INDEPENDENT = 0.5  # m between points whose errors are independent
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
     NOT_A_PLANE: "neighbours not on a plane",
@@ -43,7 +44,6 @@ class PlaneMeasurement:
         p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame.
         tree: the map, which must not change while the measurement lives.
         config: noise, gates and threads.
-        voxel: side of the voxels that thinned the scan [m].
         with_extrinsic: whether the extrinsic is measured.
         weight: factor of the information, below 1 where the points are not where they seem.
     """
@@ -54,7 +54,6 @@ class PlaneMeasurement:
         tree: IkdTree,
         config: RegistrationConfig,
         *,
-        voxel: float,
         with_extrinsic: bool,
         weight: float = 1.0,
     ) -> None:
@@ -70,8 +69,6 @@ class PlaneMeasurement:
         self._matched = False
         self._matched_at = np.zeros(PACKED)
         self._directions: PoseDirections
-        # Points that share map neighbours share their error: finer voxels give more points, not more information.
-        self._range_variance = (config.range_sigma * max(1.0, _INDEPENDENT / voxel)) ** 2
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
         self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
 
@@ -90,7 +87,7 @@ class PlaneMeasurement:
             self._p_lidar,
             self._planes,
             self._fate,
-            self._range_variance,
+            config.range_sigma**2,
             config.map_sigma**2,
             self._with_extrinsic,
             matches,
@@ -155,4 +152,18 @@ class PlaneMeasurement:
 
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
+        self._share_variance()
         self._matched_at = x.copy()
+
+    def _share_variance(self) -> None:
+        """Draw the variance that makes a plane's normal uncertain towards that of all neighbourhoods of the scan.
+
+        Two degrees of freedom say little: where surfaces are smaller than the distance of the points, five lie on a plane
+        by chance every so often, and the better they do, the more the chance would count. What is known of all the
+        neighbourhoods, those that are no planes included, tells how likely that is (empirical Bayes: Efron and Morris, 1973).
+        """
+        used = self._fate == USED
+        own = self._planes[used, 4]
+        rough = int(np.count_nonzero(self._fate == NOT_A_PLANE))
+        common = (own.sum() + rough * self._config.plane_threshold**2) / max(len(own) + rough, 1)
+        self._planes[used, 13] = (_OWN_DOF * own + _PRIOR_DOF * common) / (_OWN_DOF + _PRIOR_DOF)

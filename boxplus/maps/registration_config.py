@@ -24,13 +24,11 @@ class RegistrationConfig(BaseModel):
     map_cell: float = Field(0.25, gt=0, description="side of the map's cells, each keeps one point [m]")
     max_neighbour_distance: float = Field(2.236, gt=0, description="the fifth neighbour of a point lies within this [m]")
     plane_threshold: float = Field(0.1, gt=0, description="a plane's five points lie within this of it [m]")
-    range_sigma: float = Field(
-        0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal, for voxels of 0.5 m and more [m]"
-    )
+    range_sigma: float = Field(0.02, gt=0, description="standard deviation of a LiDAR point along a plane's normal [m]")
     map_sigma: float = Field(0.02, ge=0, description="standard deviation of a map point along a plane's normal [m]")
     min_points: int = Field(20, ge=6, description="fewest used points for an update; with fewer the scan is lost")
     weak_threshold: float = Field(
-        2.5,
+        1.3,
         ge=0,
         description="a direction is only predicted when the points say less about it than so many times what noise would",
     )

@@ -147,6 +147,7 @@ def test_the_noise_of_the_normals_is_what_tilted_normals_add(seed: int) -> None:
     random = np.random.default_rng(seed)
     x, point = random_state(random), (8.0 * random.normal(size=(1, 3))).astype(np.float32)
     plane = _planes_at(x, point, np.zeros(1), random)
+    plane[0, 13] = plane[0, 4]
     _, _, frame = np.linalg.svd(plane[:, :3])
     g = frame[1:] * random.uniform(0.5, 2.0, (2, 1))
     centroid = _world(x, point)[0]
@@ -156,7 +157,26 @@ def test_the_noise_of_the_normals_is_what_tilted_normals_add(seed: int) -> None:
     accumulate_planes(x.pack(), point, plane, np.zeros(1, np.uint8), 4e-4, 4e-4, False, True, A, np.zeros(12), S, N, np.zeros(2))
     weight = S[3:6, 3:6].trace()
     assert np.allclose(S / weight, A[:6, :6] / A[3:6, 3:6].trace())
-    assert weight == pytest.approx(A[3:6, 3:6].trace() / (1.0 + 1e-4 * np.sum(g**2) / 0.01))
+    assert weight == pytest.approx(A[3:6, 3:6].trace())
+    sharp = plane.copy()
+    sharp[:, 5:13] *= 1e-6  # the normal is known
+    known = np.zeros((12, 12))
+    accumulate_planes(
+        x.pack(),
+        point,
+        sharp,
+        np.zeros(1, np.uint8),
+        4e-4,
+        4e-4,
+        False,
+        False,
+        known,
+        np.zeros(12),
+        S.copy(),
+        N.copy(),
+        np.zeros(2),
+    )
+    assert weight == pytest.approx(known[3:6, 3:6].trace() / (1.0 + 1e-4 * np.sum(g**2) / 0.01), rel=1e-6)
     s = x.R_imu_lidar @ point[0].astype(np.float64) + x.p_imu_lidar
     signs = np.array([[a, b] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])  # four draws of exact mean and covariance
     expected = np.zeros((6, 6))

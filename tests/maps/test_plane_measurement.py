@@ -40,7 +40,7 @@ def _pose(random: np.random.Generator, scale: float = 1.0) -> NavState:
 
 
 def _measure(points: np.ndarray, tree: IkdTree, *, threads: int = 1, with_extrinsic: bool = False) -> PlaneMeasurement:
-    return PlaneMeasurement(points, tree, RegistrationConfig(threads=threads), voxel=0.5, with_extrinsic=with_extrinsic)
+    return PlaneMeasurement(points, tree, RegistrationConfig(threads=threads), with_extrinsic=with_extrinsic)
 
 
 @settings(max_examples=10)
@@ -89,7 +89,7 @@ def test_aligning_finds_the_pose(seed: int) -> None:
     off = np.zeros(24)
     off[:6] = 0.03 * random.normal(size=6)
     packed = truth.boxplus(off).pack()
-    measurement = PlaneMeasurement(points, tree, RegistrationConfig(), voxel=0.5, with_extrinsic=False)
+    measurement = PlaneMeasurement(points, tree, RegistrationConfig(), with_extrinsic=False)
     assert align(packed, measurement, RegistrationConfig()) is not None
     found = NavState.unpack(packed).boxminus(truth)
     assert np.abs(found[:6]).max() < 2e-3
@@ -97,7 +97,7 @@ def test_aligning_finds_the_pose(seed: int) -> None:
 
 
 def test_aligning_to_nothing_is_refused() -> None:
-    nothing = PlaneMeasurement(np.ones((50, 3), np.float32), IkdTree(), RegistrationConfig(), voxel=0.5, with_extrinsic=False)
+    nothing = PlaneMeasurement(np.ones((50, 3), np.float32), IkdTree(), RegistrationConfig(), with_extrinsic=False)
     assert align(NavState.identity().pack(), nothing, RegistrationConfig()) is None
 
 

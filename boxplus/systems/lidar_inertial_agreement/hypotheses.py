@@ -218,8 +218,9 @@ def _reversed(translation: TranslationFit) -> bool:
     if translation.explained < _REVERSED or translation.sigma > _MISFIT_M:
         return False
     std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
-    # Many times as far as anything accelerates: a path that has gone astray.
-    return -_FARTHEST_REVERSED < translation.slope < -0.4 and translation.slope + 5.0 * std < 0.0
+    # Many times as far as anything accelerates: a path that has gone astray. A flipped sign leaves the size: half of it is a
+    # motion that does not determine the mounting.
+    return -_FARTHEST_REVERSED < translation.slope < -0.6 and translation.slope + 5.0 * std < 0.0
 
 
 def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:

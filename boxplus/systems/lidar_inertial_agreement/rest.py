@@ -108,7 +108,7 @@ def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationCo
             x = NavState.identity().pack()
             if found:
                 x[R : R + 9], x[P : P + 3] = path.R_path_lidar[-k].ravel(), path.p_path_lidar[-k]
-            measurement = PlaneMeasurement(points, tree, config, voxel=voxel_filter.voxel_size, with_extrinsic=False)
+            measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
             fit = measurement.at(x, rematch=True)
             # A point that matches nothing counts as far off: a scan that has moved away fits what is left of it.
             share = measurement.on_map_share

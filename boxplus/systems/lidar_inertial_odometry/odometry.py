@@ -36,7 +36,7 @@ from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 
 _LONGEST_START_SCANS, _SCANS_BETWEEN_TRIES = 30, 5
-_BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 3.0  # shared: see `MapDatum`, what random recordings need
+_BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # shared: see `MapDatum`, what random recordings need
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
@@ -211,12 +211,12 @@ class LidarInertialOdometry:
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
-        voxel, (points, map_points) = self._voxel_filter.voxel_size, self._voxel_filter(p_lidar)
+        points, map_points = self._voxel_filter(p_lidar)
         clock.lap("voxel filter")
-        measurement = self._measurement(frame, points, voxel)
+        measurement = self._measurement(frame, points)
         x_prior, cov_prior = self._x.copy(), self._cov.copy()
         limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
-        posterior = iterated_update(x_prior, cov_prior, self._unshown.restrict(measurement), **limits)
+        posterior = self._unshown.mark(iterated_update(x_prior, cov_prior, measurement, **limits))
         on_map = measurement.on_map_share if posterior.valid else 0.0
         directions = posterior.last.directions if posterior.valid else None
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior.x, on_map, directions)
@@ -225,7 +225,7 @@ class LidarInertialOdometry:
             self._x, self._cov = posterior.x, posterior.cov
         self._datum.follow(self._x, cov_prior, self._cov, *((posterior.A, posterior.last.directions) if taken else ()))
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        self._unshown.look(NavState.unpack(self._x).to_world(map_points), self._cov, self._time_ns, self.config.map_cell)
+        self._unshown.look(NavState.unpack(self._x).to_world(map_points), self.config.map_cell)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
@@ -239,9 +239,7 @@ class LidarInertialOdometry:
         seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
         for _ in range(_BLIND_PASSES):
             points = self._voxel_filter(self._deskew(frame, self._density)[0])[0][::_BLIND_STRIDE].copy()
-            measurement = PlaneMeasurement(
-                points, self.map, self.config, voxel=self._voxel_filter.voxel_size, with_extrinsic=False
-            )
+            measurement = PlaneMeasurement(points, self.map, self.config, with_extrinsic=False)
             fits = align(self._x, measurement, self.config, steps=_BLIND_STEPS) is not None
             # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
             motion = 0.5 * (self._motion + mean_motion(x, self._x, seconds))
@@ -299,13 +297,13 @@ class LidarInertialOdometry:
         for low, high in self._box.follow(state.p_world_imu + state.R_world_imu @ state.p_imu_lidar):
             self.map.delete_box(low, high)
 
-    def _measurement(self, frame: Frame, points: NDArray[np.float32], voxel: float) -> PlaneMeasurement:
+    def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
         config = self.config
         with_extrinsic = config.extrinsic_estimation == "on" or (
             config.extrinsic_estimation == "gated" and self._excitation.sufficient
         )
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, config, voxel=voxel, with_extrinsic=with_extrinsic, weight=weight)
+        return PlaneMeasurement(points, self.map, config, with_extrinsic=with_extrinsic, weight=weight)
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap

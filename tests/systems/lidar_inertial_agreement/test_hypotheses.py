@@ -135,13 +135,13 @@ def test_too_few_scans_or_samples_are_no_verdict() -> None:
         assert agreement.rotation is None and contradictions(agreement, np.eye(4)) == []
 
 
-def test_stretches_together_show_lengths_that_none_shows_alone() -> None:
+def test_stretches_together_show_lengths() -> None:
     simulation = handheld(2, seconds=9.0, speed=2.2, rate=1.0)
     T = simulation.T_imu_lidar
     for fault, causes in ((None, []), (faults.scale_points(0.9), ["length_scale"])):
         scans, imu = data(simulation, fault)
         agreements = [compare_sensors(scans[k : k + 22], imu, CONFIG, T_declared=T) for k in range(0, 88, 22)]
-        assert all(contradictions(agreement, T) == [] for agreement in agreements)
+        assert {finding.cause for agreement in agreements for finding in contradictions(agreement, T)} <= set(causes)
         slopes = [slope for slope in map(slope_of, agreements) if slope is not None]
         found = lengths_of_many(slopes)
         assert [finding.cause for finding in (found,) if finding is not None] == causes
