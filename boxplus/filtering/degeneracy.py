@@ -11,8 +11,8 @@ rotation and translation nor on the number of points. In a weak direction the up
 its prediction. (Errors in variables: Fuller, Measurement Error Models, 1987, section 2.2; for degeneracy of a registration by
 eigenvalues see Zhang, Kaess, Singh, ICRA 2016.)
 
-S and N are taken over planes whose normals are known to a few degrees (`plane_information`): planes across an edge are as
-good as noise for the question, and would hide how well the others measure.
+A plane counts in both the less, the less its normal is known (`plane_information`): planes across an edge are as good as
+noise for the question, and would hide how well the others measure.
 """
 
 from __future__ import annotations

@@ -60,8 +60,8 @@ def _add_criterion(
 ) -> None:
     """signal += w h hᵀ, noise += w M Cov(u) Mᵀ of one plane, M u = [s × Rᵀu, u] (`filtering.degeneracy`).
 
-    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² of the plane's points about it: as large as the noise really is, whatever
-    the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
+    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
+    really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
     """
     sx, sy, sz = imu
     for first in (5, 9):

@@ -196,7 +196,7 @@ class LidarInertialOdometry:
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         (first, *rest), self._waiting = self._waiting, []
         p_lidar = deskew_first(first, found.state, self.config)
-        self._insert(self._voxel_filter(p_lidar)[1])
+        self._insert(found.state.to_world(self._voxel_filter(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
@@ -225,11 +225,12 @@ class LidarInertialOdometry:
             self._x, self._cov = posterior.x, posterior.cov
         self._datum.follow(self._x, cov_prior, self._cov, *((posterior.A, posterior.last.directions) if taken else ()))
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        self._unshown.look(NavState.unpack(self._x).to_world(map_points), self.config.map_cell)
+        map_points_world = NavState.unpack(self._x).to_world(map_points)
+        self._unshown.look(map_points_world, self.config.map_cell)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
-            self._insert(map_points)
+            self._insert(map_points_world)
         clock.lap("map insertion")
         return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior), clock.laps)
 
@@ -315,8 +316,8 @@ class LidarInertialOdometry:
         """
         return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
 
-    def _insert(self, points: NDArray[np.float32]) -> None:
-        self._datum.insert(self.map.insert(NavState.unpack(self._x).to_world(points), downsample=True).inserted)
+    def _insert(self, p_world: NDArray[np.float64]) -> None:
+        self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
 
     def _estimate(
         self,
@@ -338,7 +339,7 @@ class LidarInertialOdometry:
         return Estimate(
             time_ns=frame.scan.end_ns,
             state=NavState.unpack(self._x),
-            covariance=self._unshown.widened(self._cov.copy(), self._time_ns),
+            covariance=self._unshown.widened(self._cov, self._time_ns),
             pose_covariance=self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns),
             status=outcome.status if outcome else "ok" if self._gap is None else "lost",
             weak_directions=outcome.weak_directions if outcome else (),
