@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
+from boxplus.optimization.connections import check_connections
 from boxplus.optimization.elimination import choose_system
 from boxplus.optimization.faded import faded_notes, faded_shares
 from boxplus.optimization.group import Group
@@ -65,7 +66,12 @@ class Problem:
 
     @changes
     def add_residuals(
-        self, residual: Residual, *connections: VariableRows | Variables, loss: Loss | None = None, name: str | None = None
+        self,
+        residual: Residual,
+        *connections: VariableRows | Variables,
+        loss: Loss | None = None,
+        name: str | None = None,
+        carry_over: bool = False,
     ) -> Group:
         """A group of N residuals, each connected to one variable of every connection.
 
@@ -75,9 +81,12 @@ class Problem:
                 all N, or a block of N variables).
             loss: of `boxplus.losses`; least squares if left out.
             name: for messages.
+            carry_over: let poses live on another of `SE3`, `SE3Left` and `Product(UnitQuaternion, Euclidean(3))` than the
+                residual is derived for: the same transform, moved differently. Jacobians are then carried over.
 
         Raises:
-            InputError: wrong number of connections, wrong length, a manifold the residual is not defined for.
+            InputError: wrong number of connections, wrong length, another manifold than the residual is derived for, a
+                block that residuals take for different things (T_world_camera and T_camera_world).
         """
         if len(connections) != len(residual.manifolds):
             raise InputError(
@@ -88,6 +97,7 @@ class Problem:
         rows = [c[:] if isinstance(c, Variables) else c for c in connections]
         for connection in rows:
             self._require_own(connection)
+        check_connections(residual, rows, self.groups, carry_over)
         label = name if name is not None else f"{type(residual).__name__}_{len(self.groups)}"
         if any(group.name == label for group in self.groups):
             raise InputError("a new name", f"{label!r}, which another group has", "choose another name")
@@ -221,6 +231,11 @@ class Problem:
         values = given.values if isinstance(given, Solution) else given
         if len(values) != len(self.blocks):
             raise InputError(f"values of {len(self.blocks)} blocks", f"{len(values)}", "give one array for each block")
+        if isinstance(given, Solution):
+            for block, other in zip(self.blocks, given._problem.layout.blocks, strict=True):
+                if block.manifold != other.manifold:
+                    got = f"a solution with {other.name!r} on {other.manifold}"
+                    raise InputError(f"{block.name} on {block.manifold}", got, "start from a problem of the same blocks")
         checked = []
         for block, array in zip(self.blocks, values, strict=True):
             if np.shape(array) != block.values.shape:

@@ -54,7 +54,7 @@ def solved(
     poses = problem.add_variables(manifold, T, name="poses")
     points = problem.add_variables(bp.Euclidean(3), scale * p @ R.T + shift, name="points")
     residual = bp.residuals.Reprojection(CAMERA, pixels, sigma=SIGMA)
-    problem.add_residuals(residual, poses[camera_of], points[point_of], name="pixels")
+    problem.add_residuals(residual, poses[camera_of], points[point_of], name="pixels", carry_over=True)
     problem.fix(poses[:2])
     return Solved(problem, poses, points, problem.solve(cost_tolerance=TOLERANCE))
 
@@ -155,7 +155,7 @@ def test_poses_of_bodies_are_moved_about_themselves() -> None:
     problem = Problem()
     T = problem.add_variables(bp.SE3Left, poses)
     steps = np.tile([1.0, 0, 0, 0, 1.01, 0.02, 0.0], (4, 1))
-    problem.add_residuals(bp.residuals.RelativePose(steps, sigma=0.01), T[:4], T[1:])
+    problem.add_residuals(bp.residuals.RelativePose(steps, sigma=0.01), T[:4], T[1:], carry_over=True)
     problem.fix(T[0])
     solution = problem.solve()
     assert solution._problem.layout.tangents[0] == bp.SE3 and solution.status == "converged"
