@@ -29,7 +29,7 @@ from boxplus.formats.bal import BalProblem, read_bal, write_bal
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.problem import Problem
-from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
+from boxplus.residuals.camera.bal_reprojection import BalCamera, BalReprojection
 
 # Known optima, ½ Σ r² without robust loss.
 OPTIMA = {

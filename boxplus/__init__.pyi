@@ -20,6 +20,7 @@ from .formats.pose_graph_file import read_pose_graph as read_pose_graph
 from .formats.reconstruction import read_reconstruction as read_reconstruction
 from .formats.trajectory import Trajectory as Trajectory
 from .formats.trajectory import read_trajectory as read_trajectory
+from .manifolds.body_pose import BodyPose as BodyPose
 from .manifolds.euclidean import Euclidean as Euclidean
 from .manifolds.lines import Line3D as Line3D
 from .manifolds.manifold import Manifold as Manifold

@@ -38,13 +38,13 @@ closures[::5] = bp.SE3.random(rng, 12)
 
 located = np.arange(0, count, 20)
 satellites = true[located] + np.hstack([np.zeros((40, 4)), rng.normal(size=(40, 3))])
-rotation_and_position = bp.Product(bp.UnitQuaternion, bp.Euclidean(3))  # a prior in which positions are the world's
-information = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # nothing is known about the rotation
+# A prior in which positions are the world's, and which knows nothing of the rotation.
+located_by = bp.residuals.Prior(bp.BodyPose, satellites, information=np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
 
 problem = bp.Problem()
 poses = problem.add_variables(bp.SE3, start, name="poses")
 problem.add_residuals(bp.residuals.RelativePose(odometry, sigma=sigma_odometry), poses[:-1], poses[1:], name="odometry")
-problem.add_residuals(bp.residuals.Prior(rotation_and_position, satellites, information=information), poses[located])
+problem.add_residuals(located_by, poses[located], carry_over=True)  # onto SE3
 edges = bp.residuals.RelativePose(closures, sigma=sigma_loop)
 problem.add_residuals(edges, poses[first], poses[second], loss=bp.losses.GemanMcClure(6.0), name="loops")
 

@@ -1,7 +1,7 @@
 """The one place where a Jacobian goes over from one ⊞ of a pose to another (DESIGN section 4).
 
 A pose (7,) moves on the right, `SE3`; on the left, `SE3Left`; or with its rotation on the right and its translation by
-addition, `Product(UnitQuaternion, Euclidean(3))`. To first order the same motion is, with T = (R, t),
+addition, `BodyPose`. To first order the same motion is, with T = (R, t),
 
     δ_left = Ad_T δ_right,    δ_product = diag(I, R) δ_right,
 
@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
-from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion, rotate
+from boxplus.manifolds.quaternion import rotate
 from boxplus.manifolds.se3 import SE3, SE3Left
 
 TangentChange = Callable[[int, int, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]], None]
 
-POSES: tuple[Manifold, ...] = (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)))
+POSES: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose)
 """The updates of a pose (7,) that change into each other."""
 _RIGHT, _LEFT = 0, 1  # positions in POSES
 

@@ -81,8 +81,8 @@ class Problem:
                 all N, or a block of N variables).
             loss: of `boxplus.losses`; least squares if left out.
             name: for messages.
-            carry_over: let poses live on another of `SE3`, `SE3Left` and `Product(UnitQuaternion, Euclidean(3))` than the
-                residual is derived for: the same transform, moved differently. Jacobians are then carried over.
+            carry_over: let poses live on another of `SE3`, `SE3Left` and `BodyPose` than the residual is derived for: the
+                same transform, moved differently. Jacobians are then carried over.
 
         Raises:
             InputError: wrong number of connections, wrong length, another manifold than the residual is derived for, a

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.residuals.photometric_sampling import checked_image
+from boxplus.residuals.camera.photometric_sampling import checked_image
 
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
 

@@ -10,7 +10,7 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.formats.vgg_lines import read_vgg_lines
 from boxplus.manifolds import lines, quaternion
-from boxplus.residuals.line_reprojection import LineReprojection
+from boxplus.residuals.camera.line_reprojection import LineReprojection
 
 K = np.array([[500.0, 3.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 

@@ -19,7 +19,7 @@ from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.inertial.imu_preintegration import ImuNoise, Preintegration
 from boxplus.residuals.residual import Residual
 
 COUNT = 30
@@ -74,6 +74,14 @@ def _inverse_depth(rng: np.random.Generator) -> Case:
 def _inverse_depth_intrinsics(rng: np.random.Generator) -> Case:
     T, point = SE3.random(rng, COUNT), np.hstack([_pixels(rng), rng.uniform(0.1, 0.5, (COUNT, 1))])
     return residuals.InverseDepthIntrinsics(_pixels(rng)), [T, _near(rng, T), point, CAMERA.parameters]
+
+
+def _on_body(rng: np.random.Generator) -> Case:
+    T, p = _view(rng)
+    mounting = SE3.random(rng, COUNT)
+    body = se3.inverse(se3.compose(mounting, T))
+    seen = residuals.OnBody(residuals.Reprojection(LENS, _pixels(rng)), image_velocity=100.0 * rng.normal(size=(COUNT, 2)))
+    return seen, [body, mounting, p, np.array([0.01])]
 
 
 def _line(rng: np.random.Generator) -> Case:
@@ -160,6 +168,7 @@ CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "InverseDepthReprojection": _inverse_depth,
     "LineReprojection": _line,
     "MarginalPrior": _marginal,
+    "OnBody": _on_body,
     "Photometric": _photometric,
     "PointToPlane": _point_to_plane,
     "PointToPoint": _point_to_point,

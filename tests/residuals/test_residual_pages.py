@@ -23,6 +23,7 @@ WITH_PROGRAM = [
     "inverse_depth_intrinsics",
     "line_reprojection",
     "marginal_prior",
+    "on_body",
     "prior",
     "relative_pose",
     "reprojection_intrinsics",

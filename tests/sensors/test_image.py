@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from boxplus.cameras.distortion import Radial
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.residuals.photometric_sampling import sample
+from boxplus.residuals.camera.photometric_sampling import sample
 from boxplus.sensors.image import Image, half_camera
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import lines, quaternion
+from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.manifold import Manifold
@@ -24,8 +25,7 @@ DOF = 7
 """Numbers of a motion: rotation, translation, scale."""
 
 _STEP = 1e-6  # of the difference quotient for lines
-_SPLIT_POSE = Product(UnitQuaternion, Euclidean(3))
-_POSES: tuple[Manifold, ...] = (SE3, SE3Left, _SPLIT_POSE)
+_POSES: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose)
 _POSE_KINDS = ("world_from_body", "body_from_world")
 
 Motions = NDArray[np.float64]
@@ -84,7 +84,7 @@ def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
 def positions_of(manifold: Manifold, kind: str, x: Points) -> Points | None:
     """Where variables are in the world, (n, 3); None where they have no place."""
     n = len(x)
-    if isinstance(manifold, Product) and manifold != _SPLIT_POSE:
+    if isinstance(manifold, Product) and manifold != BodyPose:
         size = 0
         for part in manifold.components:
             if part in _POSES:
@@ -133,7 +133,7 @@ def _pose(manifold: Manifold, kind: str, x: Points) -> Motions:
     if manifold == SE3Left:  # t' = ω × t + v
         shift = shift - np.cross(turn, t[:, :, None], axis=1)
         return np.concatenate([turn, shift], axis=1)
-    return np.concatenate([Rt @ turn, shift if manifold == _SPLIT_POSE else Rt @ shift], axis=1)
+    return np.concatenate([Rt @ turn, shift if manifold == BodyPose else Rt @ shift], axis=1)
 
 
 def _pose_2d(kind: str, x: Points) -> Motions:

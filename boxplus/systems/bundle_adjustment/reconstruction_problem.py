@@ -19,9 +19,9 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.variables import Variables
-from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
-from boxplus.residuals.reprojection import Reprojection
-from boxplus.residuals.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
+from boxplus.residuals.camera.bal_reprojection import BalCamera, BalReprojection
+from boxplus.residuals.camera.reprojection import Reprojection
+from boxplus.residuals.camera.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.sightings import COLMAP_LAYOUT, colmap_layout, colmap_pinhole, gbp_pinhole
 

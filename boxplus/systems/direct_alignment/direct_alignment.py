@@ -25,7 +25,7 @@ from boxplus.manifolds import se3
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Huber, Loss, loss_at
-from boxplus.residuals.photometric_kernel import warped_pixel
+from boxplus.residuals.camera.photometric_kernel import warped_pixel
 from boxplus.sensors.image import Image, half_camera, two_by_two
 
 _DEPTH_STEP = 0.05  # share by which depths of 2×2 pixels may differ to be averaged: no means across an edge

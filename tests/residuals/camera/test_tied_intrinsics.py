@@ -11,8 +11,8 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
-from boxplus.residuals.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
+from boxplus.residuals.camera.reprojection_intrinsics import ReprojectionIntrinsics
+from boxplus.residuals.camera.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics
 
 CAMERA = Pinhole(500.0, 500.0, 320.0, 240.0, Radial(0.05, -0.02))
 OFFSET = np.array([0.0, 0.0, 320.0, 240.0, 0.0, -0.02])

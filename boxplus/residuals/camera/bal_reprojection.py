@@ -31,7 +31,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.reprojection import check_pixels
+from boxplus.residuals.camera.reprojection import check_pixels
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 

@@ -13,7 +13,7 @@ from boxplus.manifolds import lines
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.problem import Problem
-from boxplus.residuals.line_reprojection import LineReprojection
+from boxplus.residuals.camera.line_reprojection import LineReprojection
 
 
 def level(data: VggLines, poses: NDArray[np.float64], world: NDArray[np.float64]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.cameras.pinhole import project_point
 from boxplus.manifolds.quaternion import rotation_entries
-from boxplus.residuals.photometric_sampling import sample_bilinear
+from boxplus.residuals.camera.photometric_sampling import sample_bilinear
 
 LEAST_INVERSE_DEPTH = 1e-6  # 1/m; below it a point is at infinity (SPEC.md 8.3)
 _LEAST_Y_Z = 1e-6  # of a ray with z = 1: a point at infinity 90° off the optical axis

@@ -34,8 +34,9 @@ from boxplus.cameras.pinhole import Pinhole, project_point
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.reprojection import check_pixels
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.reprojection import check_pixels
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 RHO_MIN = 1e-6  # inverse depth below which a point counts as at infinity [1/m]
@@ -141,7 +142,7 @@ def _inverse_depth(
             )
 
 
-class InverseDepthReprojection(Residual):
+class InverseDepthReprojection(ImageResidual):
     """Points by bearing and inverse depth in an anchor camera, seen in cameras, as derived in the head of this file.
 
     Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera; `bearing_rho` on `Euclidean(3)`,

@@ -15,8 +15,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.photometric import DSO_PATTERN, Photometric
-from boxplus.residuals.photometric_sampling import sample
+from boxplus.residuals.camera.photometric import DSO_PATTERN, Photometric
+from boxplus.residuals.camera.photometric_sampling import sample
 
 HEIGHT, WIDTH = 60, 80
 CAMERA = Pinhole(70.0, 75.0, 39.5, 29.5)

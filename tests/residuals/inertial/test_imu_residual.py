@@ -14,11 +14,12 @@ from scipy.stats import chi2
 
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
+from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.optimization.problem import Problem
-from boxplus.residuals.imu import POSE, VELOCITY_BIAS, ImuPreintegration
-from boxplus.residuals.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.inertial.imu import VELOCITY_BIAS, ImuPreintegration
+from boxplus.residuals.inertial.imu_preintegration import ImuNoise, Preintegration
 from boxplus.residuals.prior import Prior
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
@@ -43,9 +44,9 @@ def random_states(seed: int, count: int = 6) -> list[NDArray[np.float64]]:
     """Poses anywhere, velocities and biases that have nothing to do with the samples: far from zero residual."""
     rng = np.random.default_rng(seed + 1)
     return [
-        POSE.random(rng, count),
+        BodyPose.random(rng, count),
         VELOCITY_BIAS.random(rng, count) * np.repeat([2.0, 0.3, 0.1], 3),
-        POSE.random(rng, count),
+        BodyPose.random(rng, count),
         VELOCITY_BIAS.random(rng, count) * np.repeat([2.0, 0.3, 0.1], 3),
     ]
 
@@ -102,7 +103,7 @@ def test_two_exyz_is_log_for_small_errors_and_saturates() -> None:
     for angle, largest in ((1e-3, 1e-9), (2.0, 0.4)):
         delta = np.zeros(6)
         delta[0] = angle
-        x = pose_i, state_i, POSE.boxplus(pose_j, delta), state_j
+        x = pose_i, state_i, BodyPose.boxplus(pose_j, delta), state_j
         log, vector = (ImuPreintegration(p, rotation=name).evaluate(*x)[:, 3] for name in ("log", "vector"))  # type: ignore[arg-type]
         np.testing.assert_allclose(log, angle, atol=1e-12)
         np.testing.assert_allclose(vector, 2.0 * np.sin(0.5 * angle), atol=1e-12)
@@ -126,7 +127,7 @@ def test_whitened_residual_has_the_right_scale() -> None:
     begin, end = np.arange(0, count - 1, steps), np.arange(steps, count, steps)
     times = np.stack([time_ns[begin], time_ns[end]], axis=1)
     truth = Preintegration.integrate(time_ns, gyro, accel, noise=noise, intervals_ns=times)
-    pose_i, v_i = POSE.random(rng, intervals), rng.normal(size=(intervals, 3))
+    pose_i, v_i = BodyPose.random(rng, intervals), rng.normal(size=(intervals, 3))
     pose_j, state_j = truth.predict(pose_i, np.hstack([v_i, np.zeros((intervals, 6))]))
     nees = {}
     for mode in ("merged", "independent"):
@@ -187,7 +188,7 @@ def test_biases_and_velocities_of_a_flight_from_its_poses(shared_data: Path) -> 
     truth_ns = np.loadtxt(folder / "V1_03_difficult.gt.csv", delimiter=",", usecols=0, dtype=np.int64)
     chosen = np.arange(2000, 6000, 40)
     times, truth = truth_ns[chosen], np.loadtxt(folder / "V1_03_difficult.gt.csv", delimiter=",")[chosen, 1:]
-    measured = POSE.check("truth", truth[:, [3, 4, 5, 6, 0, 1, 2]])
+    measured = BodyPose.check("truth", truth[:, [3, 4, 5, 6, 0, 1, 2]])
     imu = ImuPreintegration(
         Preintegration.integrate(
             time_ns,
@@ -198,10 +199,10 @@ def test_biases_and_velocities_of_a_flight_from_its_poses(shared_data: Path) -> 
         )
     )
     problem = Problem()
-    poses = problem.add_variables(POSE, measured)
+    poses = problem.add_variables(BodyPose, measured)
     states = problem.add_variables(VELOCITY_BIAS, np.zeros((len(times), 9)))
     problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:])
-    problem.add_residuals(Prior(POSE, measured, sigma=np.repeat([2e-3, 5e-3], 3)), poses)
+    problem.add_residuals(Prior(BodyPose, measured, sigma=np.repeat([2e-3, 5e-3], 3)), poses)
     first = problem.solve()
     assert imu.refresh(first[states][:-1]) > 0
     found = problem.solve()

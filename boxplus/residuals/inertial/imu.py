@@ -21,16 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import kernel
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
+from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
-from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion, exp_scalars, multiply_scalars, rotation_entries
+from boxplus.manifolds.quaternion import exp_scalars, multiply_scalars, rotation_entries
 from boxplus.manifolds.so3 import exp_coefficients, inverse_jacobian_coefficient, log_quaternion
-from boxplus.residuals.imu_preintegration import Preintegration, rows_of
+from boxplus.residuals.inertial.imu_preintegration import Preintegration, rows_of
 from boxplus.residuals.matrix3 import IDENTITY, Matrix3, apply, multiply, polynomial, scaled, transposed
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
-POSE = Product(UnitQuaternion, Euclidean(3))
 VELOCITY_BIAS = Euclidean(9)
 NO_JACOBIANS = (np.zeros((0, 15, 6)), np.zeros((0, 15, 9)))
 
@@ -174,8 +173,8 @@ class ImuPreintegration(Residual):
     """Preintegrated IMU samples between keyframes i and j, as derived in the head of this file.
 
     Rows [α, θ, β, b_a, b_g]: m, rad, m/s, m/s², rad/s, whitened by the covariance of the preintegration.
-    Variables: `T_world_imu_i`, `T_world_imu_j` (7,), wxyz and xyz, on `Product(UnitQuaternion, Euclidean(3))`: rotation and
-    position move apart, unlike on `SE3`; `velocity_bias_i`, `velocity_bias_j` (9,) on `Euclidean(9)`: v_world [m/s],
+    Variables: `T_world_imu_i`, `T_world_imu_j` (7,), wxyz and xyz, on `BodyPose`: rotation and position move
+    apart, unlike on `SE3`; `velocity_bias_i`, `velocity_bias_j` (9,) on `Euclidean(9)`: v_world [m/s],
     b_a [m/s²], b_g [rad/s]. They come in the order i, i, j, j.
 
     Args:
@@ -204,7 +203,7 @@ class ImuPreintegration(Residual):
         super().__init__(
             dim=15,
             count=len(preintegration),
-            manifolds=(POSE, VELOCITY_BIAS, POSE, VELOCITY_BIAS),
+            manifolds=(BodyPose, VELOCITY_BIAS, BodyPose, VELOCITY_BIAS),
             roles=("T_world_imu_i", "velocity_bias_i", "T_world_imu_j", "velocity_bias_j"),
             whitening=_whitening(preintegration),
         )

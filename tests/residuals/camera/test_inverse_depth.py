@@ -16,8 +16,8 @@ from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.optimization.problem import Problem
-from boxplus.residuals.inverse_depth import InverseDepthReprojection
-from boxplus.residuals.inverse_depth_intrinsics import InverseDepthIntrinsics
+from boxplus.residuals.camera.inverse_depth import InverseDepthReprojection
+from boxplus.residuals.camera.inverse_depth_intrinsics import InverseDepthIntrinsics
 from boxplus.residuals.residual import Residual
 
 CAMERA = Pinhole(420.0, 430.0, 310.0, 245.0)

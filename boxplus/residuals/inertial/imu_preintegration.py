@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._numbers import as_floats, as_numbers
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
-from boxplus.residuals.imu_midpoint import integrate_batch
+from boxplus.residuals.inertial.imu_midpoint import integrate_batch
 
 _log = logging.getLogger(__name__)
 

@@ -36,8 +36,9 @@ from boxplus.errors import InputError
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.reprojection import check_pixels
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.reprojection import check_pixels
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 _logger = logging.getLogger(__name__)
@@ -45,6 +46,54 @@ _LENGTH_MIN = 1.0  # of a segment [px]
 _AT_INFINITY = 1e-9  # n/|l₃| up to which an image line counts as at infinity
 _ROUNDING = 1e-13  # |m_c|/(|m| + |t| |d|) up to which m_c is zero
 _NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 4)))
+
+
+Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@kernel(inline=True)
+def _image_line(
+    R: Matrix3, tx: float, ty: float, tz: float, U: Matrix3, w1: float, w2: float, K_line: NDArray[np.float64]
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """l, m_c and d_c of the line (U, φ), w₁ = cos φ and w₂ = sin φ, in the camera T_camera_world = (R, t)."""
+    mx, my, mz = w1 * U[0], w1 * U[3], w1 * U[6]
+    dx, dy, dz = w2 * U[1], w2 * U[4], w2 * U[7]
+    ex = R[0] * dx + R[1] * dy + R[2] * dz
+    ey = R[3] * dx + R[4] * dy + R[5] * dz
+    ez = R[6] * dx + R[7] * dy + R[8] * dz
+    cx = R[0] * mx + R[1] * my + R[2] * mz + ty * ez - tz * ey
+    cy = R[3] * mx + R[4] * my + R[5] * mz + tz * ex - tx * ez
+    cz = R[6] * mx + R[7] * my + R[8] * mz + tx * ey - ty * ex
+    l0 = K_line[0, 0] * cx + K_line[0, 1] * cy + K_line[0, 2] * cz
+    l1 = K_line[1, 0] * cx + K_line[1, 1] * cy + K_line[1, 2] * cz
+    l2 = K_line[2, 0] * cx + K_line[2, 1] * cy + K_line[2, 2] * cz
+    return l0, l1, l2, cx, cy, cz, ex, ey, ez
+
+
+@kernel
+def _change(
+    begin: int,
+    end: int,
+    poses: NDArray[np.float64],
+    pose_of: NDArray[np.uint32],
+    lines: NDArray[np.float64],
+    line_of: NDArray[np.uint32],
+    delta: NDArray[np.float64],
+    K_line: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """out = ∂e/∂z δ: what δ (N, 4) of the end points does to their distances, across the line."""
+    one_camera = K_line.shape[0] == 1
+    for n in range(np.uint64(begin), np.uint64(end)):
+        i, j = pose_of[n], line_of[n]
+        R = rotation_entries(poses[i, 0], poses[i, 1], poses[i, 2], poses[i, 3])
+        U = rotation_entries(lines[j, 0], lines[j, 1], lines[j, 2], lines[j, 3])
+        w1, w2 = math.cos(lines[j, 4]), math.sin(lines[j, 4])
+        K = K_line[np.uint64(0) if one_camera else n]
+        l0, l1, _, _, _, _, _, _, _ = _image_line(R, poses[i, 4], poses[i, 5], poses[i, 6], U, w1, w2, K)
+        inverse = 1.0 / math.sqrt(l0 * l0 + l1 * l1)
+        out[n, 0] = (delta[n, 0] * l0 + delta[n, 1] * l1) * inverse
+        out[n, 1] = (delta[n, 2] * l0 + delta[n, 3] * l1) * inverse
 
 
 @kernel
@@ -71,17 +120,7 @@ def _line_reprojection(
         tx, ty, tz = poses[i, 4], poses[i, 5], poses[i, 6]
         U = rotation_entries(lines[j, 0], lines[j, 1], lines[j, 2], lines[j, 3])
         w1, w2 = math.cos(lines[j, 4]), math.sin(lines[j, 4])
-        mx, my, mz = w1 * U[0], w1 * U[3], w1 * U[6]
-        dx, dy, dz = w2 * U[1], w2 * U[4], w2 * U[7]
-        ex = R[0] * dx + R[1] * dy + R[2] * dz
-        ey = R[3] * dx + R[4] * dy + R[5] * dz
-        ez = R[6] * dx + R[7] * dy + R[8] * dz
-        cx = R[0] * mx + R[1] * my + R[2] * mz + ty * ez - tz * ey
-        cy = R[3] * mx + R[4] * my + R[5] * mz + tz * ex - tx * ez
-        cz = R[6] * mx + R[7] * my + R[8] * mz + tx * ey - ty * ex
-        l0 = K_line[k, 0, 0] * cx + K_line[k, 0, 1] * cy + K_line[k, 0, 2] * cz
-        l1 = K_line[k, 1, 0] * cx + K_line[k, 1, 1] * cy + K_line[k, 1, 2] * cz
-        l2 = K_line[k, 2, 0] * cx + K_line[k, 2, 1] * cy + K_line[k, 2, 2] * cz
+        l0, l1, l2, cx, cy, cz, ex, ey, ez = _image_line(R, tx, ty, tz, U, w1, w2, K_line[k])
         norm_sq = l0 * l0 + l1 * l1
         size = abs(w1) + math.sqrt(tx * tx + ty * ty + tz * tz) * abs(w2)
         # Both tests are false for a NaN, which passes on into the residual, where it is seen and named.
@@ -133,7 +172,7 @@ def _line_reprojection(
             J_line[n, row, 3] = w1 * c_u2 - w2 * b_u1
 
 
-class LineReprojection(Residual):
+class LineReprojection(ImageResidual):
     """Straight lines seen as segments: distances of the end points to the projected line, as derived above.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `line_world` on `Line3D` (5,).
@@ -154,6 +193,8 @@ class LineReprojection(Residual):
         InputError: segments of another shape, not finite or shorter than 1 px; a camera with distortion; a K that is not
             a calibration matrix; or noise that `Whitening.of` refuses.
     """
+
+    measured_name = "segments"
 
     def __init__(
         self,
@@ -200,6 +241,10 @@ class LineReprojection(Residual):
         _line_reprojection(
             begin, end, x[0], index[0], x[1], index[1], self.segments, self._K_line, r, *_NO_JACOBIANS, valid, False
         )
+
+    def change_into(self, begin: int, end: int, x: Arrays, index: Rows, delta: Array, out: Array) -> None:
+        """See `ImageResidual.change_into`."""
+        _change(begin, end, x[0], index[0], x[1], index[1], delta, self._K_line, out)
 
 
 def _line_matrices(camera: Pinhole | ArrayLike, count: int) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.line_reprojection import LineReprojection
+from boxplus.residuals.camera.line_reprojection import LineReprojection
 from boxplus.residuals.residual import Residual
 
 CAMERA = Pinhole(420.0, 430.0, 310.0, 245.0)

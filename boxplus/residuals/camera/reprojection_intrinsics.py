@@ -26,8 +26,9 @@ from boxplus.cameras.pinhole import Pinhole, intrinsics_jacobian, project_point
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.reprojection import check_pixels, write_pose_point
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.reprojection import check_pixels, write_pose_point
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 _NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
@@ -88,7 +89,7 @@ def _reprojection_intrinsics(
             intrinsics_jacobian(a, b, fx, fy, xd, yd, -1.0, J_intrinsics[n])
 
 
-class ReprojectionIntrinsics(Residual):
+class ReprojectionIntrinsics(ImageResidual):
     """Points seen in a camera that is calibrated along: pixel − π(T_camera_world p_world; intrinsics), as derived above.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `intrinsics` on `Euclidean(4)`, 6, 8

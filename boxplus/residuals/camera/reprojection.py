@@ -26,7 +26,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 _NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
@@ -123,7 +124,7 @@ def check_pixels(name: str, pixels: ArrayLike, columns: int = 2) -> NDArray[np.f
     return array
 
 
-class Reprojection(Residual):
+class Reprojection(ImageResidual):
     """Points seen in a calibrated camera: pixel − π(T_camera_world p_world), as derived in the head of this file.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m].

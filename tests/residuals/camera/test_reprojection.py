@@ -17,9 +17,9 @@ from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.bal_reprojection import BalCamera, BalReprojection
-from boxplus.residuals.reprojection import Reprojection
-from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
+from boxplus.residuals.camera.bal_reprojection import BalCamera, BalReprojection
+from boxplus.residuals.camera.reprojection import Reprojection
+from boxplus.residuals.camera.reprojection_intrinsics import ReprojectionIntrinsics
 from boxplus.residuals.residual import Residual
 
 CAMERAS = [

@@ -12,6 +12,8 @@ Source: SPEC.md 3.1 to 3.4.
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,11 +21,12 @@ from boxplus._numbers import as_floats
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
-from boxplus.residuals.reprojection_intrinsics import ReprojectionIntrinsics
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.reprojection_intrinsics import ReprojectionIntrinsics
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 
 
-class ReprojectionTiedIntrinsics(Residual):
+class ReprojectionTiedIntrinsics(ImageResidual):
     """Points seen in a camera that is calibrated along some directions only: pixel − π(T_camera_world p_world; c₀ + B q).
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `q` on `Euclidean(m)`.
@@ -72,6 +75,7 @@ class ReprojectionTiedIntrinsics(Residual):
             roles=("T_camera_world", "p_world", "q"),
             whitening=self._full.whitening,
         )
+        self.pixels = self._full.pixels
         self._J = np.zeros((self.count, 2, count))
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
@@ -82,6 +86,12 @@ class ReprojectionTiedIntrinsics(Residual):
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         self._full.evaluate_into(begin, end, self._expanded(x), index, r, valid)
+
+    def measuring(self, z: NDArray[np.float64]) -> Self:
+        """See `ImageResidual.measuring`."""
+        twin = super().measuring(z)
+        twin._full, twin._J = self._full.measuring(z), self._J.copy()
+        return twin
 
     def intrinsics(self, q: ArrayLike) -> NDArray[np.float64]:
         """c = c₀ + B q (..., n) of (..., m)."""

@@ -28,8 +28,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.photometric_kernel import photometric
-from boxplus.residuals.photometric_sampling import checked_image, sample
+from boxplus.residuals.camera.photometric_kernel import photometric
+from boxplus.residuals.camera.photometric_sampling import checked_image, sample
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 

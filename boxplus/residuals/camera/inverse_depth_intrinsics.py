@@ -32,9 +32,10 @@ from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.inverse_depth import RHO_MIN, relative_pose, write_anchor_observer_point
-from boxplus.residuals.reprojection import check_pixels
-from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.inverse_depth import RHO_MIN, relative_pose, write_anchor_observer_point
+from boxplus.residuals.camera.reprojection import check_pixels
+from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 _NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
@@ -109,7 +110,7 @@ def _inverse_depth_intrinsics(
         J_intrinsics[n, 1, 3] = -1.0 - a22
 
 
-class InverseDepthIntrinsics(Residual):
+class InverseDepthIntrinsics(ImageResidual):
     """As `InverseDepthReprojection`, with the pinhole intrinsics of both views as a variable, as derived above.
 
     Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,); `pixel_rho` on `Euclidean(3)`, the point's pixel in the

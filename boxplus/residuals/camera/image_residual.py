@@ -1,0 +1,37 @@
+"""What residuals of measured image coordinates share: the coordinates may move, as those of an image taken a little later do."""
+
+from __future__ import annotations
+
+import copy
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.residuals.residual import Array, Arrays, Residual, Rows
+
+
+class ImageResidual(Residual):
+    """A residual of image coordinates z (N, k) [px], in which it is affine: e(z + δ) = e(z) + ∂e/∂z δ, whatever δ.
+
+    Attributes:
+        measured_name: the attribute that holds z.
+    """
+
+    measured_name: ClassVar[str] = "pixels"
+
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """z (N, k) [px]."""
+        coordinates: NDArray[np.float64] = getattr(self, self.measured_name)
+        return coordinates
+
+    def measuring(self, z: NDArray[np.float64]) -> Self:
+        """The same residual of the coordinates z (N, k), which it reads anew in every evaluation."""
+        twin = copy.copy(self)
+        setattr(twin, self.measured_name, z)
+        return twin
+
+    def change_into(self, begin: int, end: int, x: Arrays, index: Rows, delta: Array, out: Array) -> None:
+        """out[begin:end] = ∂e/∂z δ (N, dim) for δ (N, k); here e = z − …"""
+        out[begin:end] = delta[begin:end]

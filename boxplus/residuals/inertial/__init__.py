@@ -1,0 +1,1 @@
+"""What an IMU measures between keyframes: preintegration, its covariance, and the error between two states."""
