@@ -30,6 +30,7 @@ from .manifolds.se2 import SE2 as SE2
 from .manifolds.se3 import SE3 as SE3
 from .manifolds.se3 import SE3Left as SE3Left
 from .manifolds.so3 import SO3 as SO3
+from .manifolds.sphere import S2 as S2
 from .maps.ikd_tree import IkdTree as IkdTree
 from .optimization import losses as losses
 from .optimization.graduated import graduate as graduate

@@ -20,6 +20,7 @@ from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
+from boxplus.manifolds.sphere import S2, tangent_basis
 
 DOF = 7
 """Numbers of a motion: rotation, translation, scale."""
@@ -46,6 +47,8 @@ def kinds_of(manifold: Manifold) -> tuple[str, ...]:
             2: ("point", "constant"),
             3: ("point", "vector", "constant", "inverse_depth"),
         }.get(manifold.n, ("constant", "velocity_first"))
+    if manifold == S2:
+        return ("direction",)
     return ("line",) if manifold == Line3D else ("constant",)
 
 
@@ -62,6 +65,8 @@ def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
         return B
     if manifold == Line3D:
         return _line(x)
+    if manifold == S2:
+        return _direction(x)
     B = np.zeros((len(x), manifold.dof, DOF))
     if isinstance(manifold, Product):
         size, dof = 0, 0
@@ -115,6 +120,13 @@ def _displacement(p: Points) -> Motions:
     B[:, 2, 0], B[:, 2, 1] = p[:, 1], -p[:, 0]
     B[:, :, 3:6] = np.eye(3)
     B[:, :, 6] = p
+    return B
+
+
+def _direction(x: Points) -> Motions:
+    """A direction turns with the world and does not know of its origin: w × x along the basis of the tangent."""
+    B = np.zeros((len(x), 2, DOF))
+    B[:, :, :3] = np.cross(x[:, None, :], np.swapaxes(tangent_basis(x), 1, 2))
     return B
 
 
