@@ -21,7 +21,8 @@ import numpy as np
 from metrics import Metric, run_as_script
 from numpy.typing import NDArray
 
-from boxplus.residuals.inertial.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
 
 HERE = Path(__file__).resolve().parent
 NOISE = ImuNoise(gyro=1.6968e-4, accel=2.0e-3, gyro_walk=1.9393e-5, accel_walk=3.0e-3)

@@ -25,6 +25,8 @@ _MEANINGS = (
     (r"p_world", "a point in the world"),
     (r"bearing_rho", "a bearing and an inverse depth in an anchor"),
     (r"pixel_rho", "a pixel and an inverse depth in an anchor"),
+    (r"image_time_offset", "one by which images are brought to the poses"),
+    (r"imu_time_offset", "one by which the IMU is brought to the poses"),
 )
 
 

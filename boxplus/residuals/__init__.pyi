@@ -16,7 +16,7 @@ from .chordal_pose import chordal_weights as chordal_weights
 from .gicp import Gicp as Gicp
 from .gicp import plane_covariances as plane_covariances
 from .inertial.imu import ImuPreintegration as ImuPreintegration
-from .inertial.imu_preintegration import ImuNoise as ImuNoise
+from .inertial.imu_noise import ImuNoise as ImuNoise
 from .inertial.imu_preintegration import Preintegration as Preintegration
 from .marginal_prior import MarginalPrior as MarginalPrior
 from .point_to_plane import PointToPlane as PointToPlane

@@ -19,7 +19,8 @@ from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.inertial.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.residual import Residual
 
 COUNT = 30

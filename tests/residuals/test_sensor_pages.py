@@ -16,9 +16,10 @@ PAGES = Path(__file__).resolve().parents[2] / "docs" / "residuals"
 def test_programs_print_what_they_promise(page: str) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (PAGES / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
     assert blocks
+    names: dict[str, object] = {}  # a page goes on where its last program ended
     for block in blocks:
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
-            exec(compile(block, page, "exec"), {})
+            exec(compile(block, page, "exec"), names)
         promised = re.findall(r"^print\(.*\) +# (.*)$", block, re.MULTILINE)
         assert promised and printed.getvalue().splitlines() == promised

@@ -79,8 +79,8 @@ class OnBody(Residual):
     Variables: those of the camera residual in their order, but for every `T_camera_world` the two `T_world_body` and
     `T_body_camera` (7,) on `BodyPose`; for `InverseDepthReprojection` thus T_world_anchor_body, T_body_anchor_camera,
     T_world_observer_body, T_body_observer_camera, bearing_rho; for `Photometric`, which has `T_21`, two pairs. With
-    `image_velocity` the last one is `time_offset` (1,) [s] on `Euclidean(1)`: IMU clock minus camera clock. What is known is
-    held by `Problem.fix`. Cameras of a rig each have a group: `on_rig` makes them.
+    `image_velocity` the last one is `image_time_offset` (1,) [s] on `Euclidean(1)`: IMU clock minus camera clock. What is
+    known is held by `Problem.fix`. Cameras of a rig each have a group: `on_rig` makes them.
 
     Args:
         residual: on poses of cameras: `Reprojection`, `InverseDepthReprojection`, `LineReprojection`, those with intrinsics as
@@ -120,7 +120,7 @@ class OnBody(Residual):
         self.residual = residual
         if image_velocity is not None:
             self._observe_clock(residual, image_velocity, 0.0 if time_offset_s is None else time_offset_s)
-            roles.append("time_offset")
+            roles.append("image_time_offset")
             manifolds.append(Euclidean(1))
         self._each = np.arange(count, dtype=np.uint32)
         super().__init__(

@@ -7,60 +7,35 @@ its exact derivatives as in SPEC.md 7.1 to 7.4.
 from __future__ import annotations
 
 import logging
-import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus._numbers import as_floats, as_numbers
+from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.inertial.imu_midpoint import integrate_batch
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.residuals.inertial.sample_checks import checked_bias, checked_intervals, checked_samples, rows_of
 
 _log = logging.getLogger(__name__)
 
 GAP_S = 0.1  # between samples; the midpoint rule is inaccurate above it (SPEC.md 7, singular cases)
 REINTEGRATE_ACCEL = 0.1  # m/s², change of bias above which the linear correction is given up (SPEC.md 7.4)
 REINTEGRATE_GYRO = 0.01  # rad/s
+SPARE_NS = 50_000_000  # of samples kept on both sides of intervals that were selected, by which they may still be shifted
 
 NoiseMode = Literal["merged", "independent"]
 
-
-@dataclass(frozen=True, slots=True)
-class ImuNoise:
-    """Noise densities, as data sheets and Allan deviations give them.
-
-    Attributes:
-        gyro: rad/s/√Hz.
-        accel: m/s²/√Hz.
-        gyro_walk: of the gyroscope's bias, rad/s²/√Hz.
-        accel_walk: of the accelerometer's bias, m/s³/√Hz.
-
-    Raises:
-        InputError: a density that is not positive and finite: the covariance would be singular.
-    """
-
-    gyro: float
-    accel: float
-    gyro_walk: float
-    accel_walk: float
-
-    def __post_init__(self) -> None:
-        for name in ("gyro", "accel", "gyro_walk", "accel_walk"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(
-                    f"the noise density {name} positive and finite",
-                    f"{value}",
-                    "take it from the data sheet; a bias that does not change has a small one",
-                )
-
-    @property
-    def variances(self) -> NDArray[np.float64]:
-        """Squared densities (4,): gyroscope, accelerometer, gyroscope bias, accelerometer bias."""
-        return np.square(np.array([self.gyro, self.accel, self.gyro_walk, self.accel_walk], dtype=np.float64))
+# Arrays with a row for each interval, and with one for each sample.
+_OF_INTERVALS = (
+    *("intervals_ns", "alpha", "beta", "gamma_wxyz", "covariance", "bias_jacobian", "bias_accel", "bias_gyro"),
+    *("steps", "longest_gap_s"),
+)
+_OF_SAMPLES = ("time_ns", "gyro", "accel")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,9 +106,9 @@ class Preintegration:
         """
         if mode not in ("merged", "independent"):
             raise InputError('mode "merged" or "independent"', repr(mode), 'leave it out for "merged"')
-        time, w, a = _checked_samples(time_ns, gyro, accel)
+        time, w, a = checked_samples(time_ns, gyro, accel)
         given = (time[0], time[-1]) if intervals_ns is None else intervals_ns
-        intervals = _checked_intervals(given, time)
+        intervals = checked_intervals(given, time)
         count = len(intervals)
         result = cls(
             intervals_ns=intervals,
@@ -142,8 +117,8 @@ class Preintegration:
             gamma_wxyz=np.zeros((count, 4)),
             covariance=np.zeros((count, 15, 15)),
             bias_jacobian=np.zeros((count, 9, 6)),
-            bias_accel=_checked_bias("bias_accel", bias_accel, count),
-            bias_gyro=_checked_bias("bias_gyro", bias_gyro, count),
+            bias_accel=checked_bias("bias_accel", bias_accel, count),
+            bias_gyro=checked_bias("bias_gyro", bias_gyro, count),
             noise=noise,
             mode=mode,
             steps=np.zeros(count, dtype=np.int64),
@@ -180,16 +155,16 @@ class Preintegration:
         self, bias_accel: ArrayLike, bias_gyro: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """α (N, 3), γ wxyz (N, 4) and β (N, 3) for other biases (3,) or (N, 3), to first order (SPEC.md 7.4)."""
-        change_a = _checked_bias("bias_accel", bias_accel, len(self)) - self.bias_accel
-        change_g = _checked_bias("bias_gyro", bias_gyro, len(self)) - self.bias_gyro
+        change_a = checked_bias("bias_accel", bias_accel, len(self)) - self.bias_accel
+        change_g = checked_bias("bias_gyro", bias_gyro, len(self)) - self.bias_gyro
         moved = (self.bias_jacobian @ np.hstack([change_a, change_g])[:, :, None])[:, :, 0]
         turned = quaternion.multiply(self.gamma_wxyz, quaternion.from_matrix(so3.exp(moved[:, 3:6])))
         return self.alpha + moved[:, :3], turned, self.beta + moved[:, 6:]
 
     def is_stale(self, bias_accel: ArrayLike, bias_gyro: ArrayLike) -> NDArray[np.bool_]:
         """(N,) whether the biases moved so far (0.1 m/s², 0.01 rad/s) that the linear correction no longer does."""
-        change_a = _checked_bias("bias_accel", bias_accel, len(self)) - self.bias_accel
-        change_g = _checked_bias("bias_gyro", bias_gyro, len(self)) - self.bias_gyro
+        change_a = checked_bias("bias_accel", bias_accel, len(self)) - self.bias_accel
+        change_g = checked_bias("bias_gyro", bias_gyro, len(self)) - self.bias_gyro
         far: NDArray[np.bool_] = (np.linalg.norm(change_a, axis=1) > REINTEGRATE_ACCEL) | (
             np.linalg.norm(change_g, axis=1) > REINTEGRATE_GYRO
         )
@@ -200,16 +175,127 @@ class Preintegration:
 
         The others keep their biases and numbers.
         """
-        ba, bg = _checked_bias("bias_accel", bias_accel, len(self)), _checked_bias("bias_gyro", bias_gyro, len(self))
+        ba, bg = checked_bias("bias_accel", bias_accel, len(self)), checked_bias("bias_gyro", bias_gyro, len(self))
         anew = self.is_stale(ba, bg) if where is None else np.asarray(where, dtype=np.bool_)
-        result = replace(
-            self,
-            **{name: getattr(self, name).copy() for name in ("alpha", "beta", "gamma_wxyz", "covariance", "bias_jacobian")},
-            bias_accel=np.where(anew[:, None], ba, self.bias_accel),
-            bias_gyro=np.where(anew[:, None], bg, self.bias_gyro),
-        )
+        result = self._with_intervals(np.copy)
+        result.bias_accel[anew], result.bias_gyro[anew] = ba[anew], bg[anew]
         result._integrate(np.flatnonzero(anew).astype(np.uint32))
         return result
+
+    def __getitem__(self, rows: int | slice | NDArray[np.integer] | NDArray[np.bool_] | list[int]) -> Preintegration:
+        """The intervals selected, with the samples they need and 50 ms on both sides.
+
+        Raises:
+            InputError: no interval is selected, or one that is not there.
+        """
+        try:
+            chosen = np.atleast_1d(np.arange(len(self))[rows])
+        except IndexError as error:
+            raise InputError(f"intervals from 0 to {len(self) - 1}", repr(rows), f"select some of them ({error})") from None
+        if not len(chosen):
+            raise InputError("at least one interval", repr(rows), "keep what the residual is made of")
+        intervals = self.intervals_ns[chosen]
+        first = np.searchsorted(self.time_ns, intervals[:, 0].min() - SPARE_NS, side="right") - 1
+        last = np.searchsorted(self.time_ns, intervals[:, 1].max() + SPARE_NS, side="left")
+        samples = slice(max(int(first), 0), int(last) + 1)
+        kept: dict[str, Any] = {name: getattr(self, name)[samples].copy() for name in _OF_SAMPLES}
+        return replace(self._with_intervals(lambda array: array[chosen].copy()), **kept)
+
+    def append(self, other: Preintegration) -> Preintegration:
+        """The intervals of both, on the samples of both; nothing is integrated anew.
+
+        Args:
+            other: of the same IMU: the same noise and mode, and the same samples where both have some.
+
+        Raises:
+            InputError: another noise or mode, or samples that differ.
+        """
+        if other.noise != self.noise or other.mode != self.mode:
+            raise InputError(
+                f"{self.noise}, {self.mode}", f"{other.noise}, {other.mode}", "integrate both with the same noise and mode"
+            )
+        shared = [
+            (p.time_ns >= max(self.time_ns[0], other.time_ns[0])) & (p.time_ns <= min(self.time_ns[-1], other.time_ns[-1]))
+            for p in (self, other)
+        ]
+        for name in _OF_SAMPLES:
+            own, its = getattr(self, name)[shared[0]], getattr(other, name)[shared[1]]
+            if not np.array_equal(own, its):
+                raise InputError(
+                    "the same samples where both have some",
+                    f"{len(own)} and {len(its)} whose {name} differ, from {max(self.time_ns[0], other.time_ns[0])} ns",
+                    "append intervals of the same stream",
+                )
+        both: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_INTERVALS + _OF_SAMPLES
+        }
+        _, kept = np.unique(both["time_ns"], return_index=True)
+        return replace(self, **both | {name: both[name][kept] for name in _OF_SAMPLES})
+
+    def merge(self, first: int, last: int | None = None) -> Preintegration:
+        """With the intervals `first` to `last` (by default the next one) as one, integrated anew from the samples.
+
+        The result is what would have been integrated without the keyframes between them, at the biases of the first.
+
+        Raises:
+            InputError: intervals that are not there, or that do not follow each other without a break.
+        """
+        end = first + 1 if last is None else last
+        if not 0 <= first < end < len(self):
+            raise InputError(f"intervals first < last from 0 to {len(self) - 1}", f"{first} and {end}", "merge neighbours")
+        joints = self.intervals_ns[first : end + 1]
+        broken = np.flatnonzero(joints[1:, 0] != joints[:-1, 1])
+        if len(broken):
+            k = first + int(broken[0])
+            raise InputError(
+                "intervals that follow each other",
+                f"interval {k + 1} from {self.intervals_ns[k + 1, 0]} ns, interval {k} to {self.intervals_ns[k, 1]} ns",
+                "merge neighbours in time",
+            )
+        gone = np.arange(first + 1, end + 1)
+        result = self._with_intervals(lambda array: np.delete(array, gone, axis=0))
+        result.intervals_ns[first, 1] = self.intervals_ns[end, 1]
+        result._integrate(np.array([first], dtype=np.uint32))
+        return result
+
+    def shifted(self, shift_ns: int) -> Preintegration:
+        """Integrated anew over intervals that begin and end `shift_ns` later.
+
+        Raises:
+            InputError: the samples do not cover them.
+        """
+        result = self._with_intervals(np.copy)
+        result.intervals_ns[:] = checked_intervals(self.intervals_ns + int(shift_ns), self.time_ns)
+        result._integrate(np.arange(len(self), dtype=np.uint32))
+        return result
+
+    @property
+    def time_jacobian(self) -> NDArray[np.float64]:
+        """∂[α, θ, β]/∂t (N, 9) of intervals that begin and end later by t [m/s, rad/s, m/s²].
+
+        With ω_i, a_i at the begin and ω_j, a_j at the end, biases taken off: the frame of the begin turns, what lies before it
+        leaves the sums and what follows the end comes in,
+
+            ∂α/∂t = β − ω_i × α − a_i T,    ∂θ/∂t = ω_j − γᵀ ω_i,    ∂β/∂t = γ a_j − a_i − ω_i × β
+        """
+        (w_i, a_i), (w_j, a_j) = (self._sample_at(self.intervals_ns[:, end]) for end in (0, 1))
+        R = quaternion.to_matrix(self.gamma_wxyz)
+        by_alpha = self.beta - np.cross(w_i, self.alpha) - a_i * self.duration_s[:, None]
+        by_theta = w_j - np.einsum("nji,nj->ni", R, w_i)
+        by_beta = np.einsum("nij,nj->ni", R, a_j) - a_i - np.cross(w_i, self.beta)
+        return np.hstack([by_alpha, by_theta, by_beta])
+
+    def _with_intervals(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Preintegration:
+        """The same samples with other arrays of the intervals, none of them shared."""
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _OF_INTERVALS}
+        return replace(self, **changed)
+
+    def _sample_at(self, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Angular velocity and specific force (N, 3) at one time of every interval, interpolated, without biases."""
+        k = np.clip(np.searchsorted(self.time_ns, at_ns, side="right") - 1, 0, len(self.time_ns) - 2)
+        share = ((at_ns - self.time_ns[k]) / (self.time_ns[k + 1] - self.time_ns[k]))[:, None]
+        w, a = (values[k] + share * (values[k + 1] - values[k]) for values in (self.gyro, self.accel))
+        return w - self.bias_gyro, a - self.bias_accel
 
     def predict(
         self, pose_i: ArrayLike, velocity_bias_i: ArrayLike, gravity: ArrayLike = (0.0, 0.0, -9.81)
@@ -243,83 +329,3 @@ class Preintegration:
             self.noise.variances, self.mode == "merged", self.alpha, self.gamma_wxyz, self.beta, self.covariance,
             self.bias_jacobian, self.steps, self.longest_gap_s,
         )  # fmt: skip
-
-
-def rows_of(name: str, values: ArrayLike, count: int, size: int) -> NDArray[np.float64]:
-    """`values` (size,) or (count, size) as (count, size).
-
-    Raises:
-        InputError: another shape.
-    """
-    array = as_floats(values, name)
-    if array.shape not in ((size,), (count, size)):
-        raise InputError(
-            f"{name} of shape ({size},) or ({count}, {size})", f"shape {array.shape}", "give one row for each interval"
-        )
-    return np.broadcast_to(array, (count, size))
-
-
-def _checked_samples(
-    time_ns: ArrayLike, gyro: ArrayLike, accel: ArrayLike
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    time = as_numbers(time_ns, "time_ns (S,)")
-    if time.ndim != 1 or time.dtype.kind not in "iu":
-        raise InputError(
-            "time_ns as integer nanoseconds of shape (S,)",
-            f"{time.dtype} of shape {time.shape}",
-            "convert seconds with np.round(seconds * 1e9).astype(np.int64)",
-        )
-    if time.size < 2:
-        raise InputError("at least two IMU samples", f"{time.size}", "an interval without motion data gives no factor")
-    time = np.ascontiguousarray(time, dtype=np.int64)
-    ordered = time[1:] > time[:-1]
-    if not ordered.all():
-        k = int(np.argmin(ordered)) + 1
-        raise InputError(
-            "time_ns strictly increasing", f"{time[k]} after {time[k - 1]} at sample {k}", "sort the samples, drop doubles"
-        )
-    vectors = []
-    for name, values in (("gyro", gyro), ("accel", accel)):
-        array = np.ascontiguousarray(as_floats(values, f"{name} (S, 3)"))
-        if array.shape != (time.size, 3):
-            raise InputError(f"{name} of shape ({time.size}, 3)", f"shape {array.shape}", "give one row for every time stamp")
-        if not np.isfinite(array).all():
-            k = int(np.argmin(np.isfinite(array).all(axis=1)))
-            raise InputError(f"{name} finite", f"{array[k]} at sample {k}", "drop that sample")
-        vectors.append(array)
-    return time, vectors[0], vectors[1]
-
-
-def _checked_intervals(intervals_ns: ArrayLike, time: NDArray[np.int64]) -> NDArray[np.int64]:
-    intervals = np.atleast_2d(as_numbers(intervals_ns, "intervals_ns"))
-    if intervals.ndim != 2 or intervals.shape[1] != 2 or intervals.dtype.kind not in "iu":
-        raise InputError(
-            "intervals_ns as integer nanoseconds of shape (N, 2)",
-            f"{intervals.dtype} of shape {np.shape(intervals)}",
-            "give begin and end of every interval",
-        )
-    intervals = np.ascontiguousarray(intervals, dtype=np.int64)
-    lasts = intervals[:, 1] > intervals[:, 0]
-    if not lasts.all():
-        n = int(np.argmin(lasts))
-        raise InputError("intervals that end after they begin", f"{intervals[n]} in interval {n}", "order the keyframes by time")
-    covered = (intervals[:, 0] >= time[0]) & (intervals[:, 1] <= time[-1])
-    if not covered.all():
-        n = int(np.argmin(covered))
-        raise InputError(
-            f"intervals within the samples, {time[0]} to {time[-1]} ns",
-            f"{intervals[n]} in interval {n}",
-            "leave out keyframes without IMU samples on both sides",
-        )
-    return intervals
-
-
-def _checked_bias(name: str, bias: ArrayLike, count: int) -> NDArray[np.float64]:
-    array = as_floats(bias, name)
-    if array.shape not in ((3,), (count, 3)) or not np.isfinite(array).all():
-        raise InputError(
-            f"{name} finite, of shape (3,) or ({count}, 3)",
-            f"{array.shape} {array.ravel()[:3]}",
-            "give one bias for each interval",
-        )
-    return np.array(np.broadcast_to(array, (count, 3)))

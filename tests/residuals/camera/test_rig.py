@@ -30,7 +30,7 @@ def test_a_group_for_each_camera_that_saw_something() -> None:
         np.testing.assert_array_equal(seen.evaluate(*(v[n] for v in x)), alone.evaluate(*(v[n] for v in x)))
         np.testing.assert_array_equal(seen.whitening.factors, alone.whitening.factors)
     (without, _), _ = residuals.on_rig(residuals.InverseDepthReprojection, CAMERAS, CAMERA_OF, PIXELS)
-    assert "time_offset" not in without.roles and without.count == 3
+    assert "image_time_offset" not in without.roles and without.count == 3
 
 
 def test_lines_that_are_left_out() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.residuals.inertial.imu_preintegration import ImuNoise
+from boxplus.residuals.inertial.imu_noise import ImuNoise
 
 Stream = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 

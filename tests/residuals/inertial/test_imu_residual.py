@@ -12,14 +12,20 @@ from imu_streams import random_stream
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.body_pose import BodyPose
+from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3
+from boxplus.manifolds.sphere import S2
 from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.optimization.problem import Problem
+from boxplus.residuals.camera.on_body import OnBody
+from boxplus.residuals.camera.reprojection import Reprojection
 from boxplus.residuals.inertial.imu import VELOCITY_BIAS, ImuPreintegration
-from boxplus.residuals.inertial.imu_preintegration import ImuNoise, Preintegration
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
@@ -59,6 +65,104 @@ def test_jacobians(rotation: str, seed: int) -> None:
     for manifolds in (residual.manifolds, (SE3, VELOCITY_BIAS, SE3, VELOCITY_BIAS)):
         report = check_jacobian(residual, *random_states(seed), manifolds=manifolds)
         assert report.passed and report.invalid == report.unsteady == 0 and report.largest_residual > 0.5, str(report)
+
+
+@pytest.mark.parametrize(("gravity_direction", "time_offset"), [(True, False), (False, True), (True, True)])
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=6)
+def test_jacobians_with_gravity_and_time_offset(gravity_direction: bool, time_offset: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    residual = ImuPreintegration(
+        preintegration(seed), gravity=GRAVITY, gravity_direction=gravity_direction, time_offset=time_offset, time_offset_s=-0.01
+    )
+    more = [S2.random(rng, 6)] * gravity_direction + [rng.uniform(-0.05, 0.05, (6, 1))] * time_offset
+    assert residual.roles[4:] == ("gravity_direction",) * gravity_direction + ("imu_time_offset",) * time_offset
+    report = check_jacobian(residual, *random_states(seed), *more)
+    assert report.passed and report.invalid == report.unsteady == 0 and report.largest_residual > 0.5, str(report)
+    plain = ImuPreintegration(preintegration(seed), gravity=GRAVITY)
+    at = [GRAVITY / np.linalg.norm(GRAVITY)] * gravity_direction + [np.array([-0.01])] * time_offset
+    x = random_states(seed)
+    np.testing.assert_allclose(residual.evaluate(*x, *at), plain.evaluate(*x), atol=1e-13)
+
+
+def smooth_stream(step_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    time_ns = np.arange(0, 1_000_000_001, step_ns, dtype=np.int64)
+    s = time_ns * 1e-9
+    gyro = np.stack([np.sin(3.0 * s), 0.8 * np.cos(2.0 * s), 0.5 * np.sin(4.0 * s + 1.0)], axis=1)
+    return time_ns, gyro, np.stack([2.0 * np.sin(3.0 * s), np.cos(5.0 * s), 9.8 + np.sin(4.0 * s)], axis=1)
+
+
+def test_intervals_that_move_in_time() -> None:
+    """The derivative by time against shifted integration: right but for the midpoint rule's own error, of second order."""
+    errors = []
+    for step_ns in (8_000_000, 4_000_000):
+        p = Preintegration.integrate(
+            *smooth_stream(step_ns), noise=NOISE, intervals_ns=[[200_000_000, 500_000_000], [402_000_000, 801_000_000]],
+            bias_accel=[0.1, -0.2, 0.3], bias_gyro=[0.02, 0.01, -0.03],
+        )  # fmt: skip
+        h = 16_000_000
+        ahead, back = p.shifted(h), p.shifted(-h)
+        further, before = p.shifted(2 * h), p.shifted(-2 * h)
+        R = quaternion.to_matrix(p.gamma_wxyz)
+        values = [
+            np.hstack([q.alpha, so3.boxminus(quaternion.to_matrix(q.gamma_wxyz), R), q.beta])
+            for q in (ahead, back, further, before)
+        ]
+        numeric = (8 * (values[0] - values[1]) - (values[2] - values[3])) / (12 * h * 1e-9)
+        errors.append(np.abs(p.time_jacobian - numeric).max())
+    assert errors[0] < 1e-3 and errors[1] < 0.3 * errors[0]
+    assert np.abs(p.time_jacobian).max() > 1.0
+
+
+def test_the_time_offset_of_a_flight_is_found() -> None:
+    """Poses that are stamped 8 ms early, by the clock of the IMU: found to 20 µs, intervals cut anew on the way."""
+    stream, t_d = smooth_stream(2_000_000), 0.008
+    stamps = np.arange(100_000_000, 900_000_001, 100_000_000)
+    at = np.column_stack([stamps[:-1], stamps[1:]])
+    rng = np.random.default_rng(0)
+    truth = Preintegration.integrate(*stream, noise=NOISE, intervals_ns=at + round(t_d * 1e9))
+    pose, state = BodyPose.random(rng, 1), np.array([[1.0, -0.5, 0.2, *np.zeros(6)]])
+    poses, states = [pose[0]], [state[0]]
+    for k in range(len(at)):
+        pose_j, state_j = truth[k].predict(poses[-1], states[-1], GRAVITY)
+        poses.append(pose_j[0])
+        states.append(state_j[0])
+    imu = ImuPreintegration(
+        Preintegration.integrate(*stream, noise=NOISE, intervals_ns=at),
+        gravity=-GRAVITY,
+        gravity_direction=True,
+        time_offset=True,
+    )
+    problem = Problem()
+    T, s = problem.add_variables(BodyPose, np.array(poses)), problem.add_variables(VELOCITY_BIAS, np.array(states))
+    g, offset = problem.add_variables(S2, [0.0, 0.0, -1.0]), problem.add_variables(Euclidean(1), [0.0])
+    problem.add_residuals(imu, T[:-1], s[:-1], T[1:], s[1:], g, offset)
+    problem.fix(T)
+    problem.add_residuals(Prior(VELOCITY_BIAS, np.array(states), sigma=np.repeat([100.0, 1e-6], [3, 6])), s)
+    solution = problem.solve()
+    assert imu.refresh(solution[s][:-1], solution[offset][0, 0]) == len(at)
+    assert imu.time_offset_s == pytest.approx(t_d, abs=1e-3)
+    solution = problem.solve()
+    assert imu.refresh(solution[s][:-1], solution[offset][0, 0]) == 0
+    assert solution[offset][0, 0] == pytest.approx(t_d, abs=2e-5)
+    np.testing.assert_allclose(solution[g][0], GRAVITY / np.linalg.norm(GRAVITY), atol=1e-4)
+
+
+def test_one_offset_is_not_counted_twice() -> None:
+    problem = Problem()
+    T, s = (
+        problem.add_variables(BodyPose, BodyPose.random(np.random.default_rng(0), 2)),
+        problem.add_variables(VELOCITY_BIAS, np.zeros((2, 9))),
+    )
+    p, offset = problem.add_variables(Euclidean(3), [0.0, 0.0, 5.0]), problem.add_variables(Euclidean(1), [0.0], name="offset")
+    seen = OnBody(Reprojection(Pinhole(400.0, 400.0, 320.0, 240.0), [[1.0, 2.0]]), image_velocity=[[3.0, 4.0]])
+    mounting = problem.add_variables(BodyPose, BodyPose.identity())
+    problem.add_residuals(seen, T[[0]], mounting, p, offset)
+    imu = ImuPreintegration(preintegration(1, 1), time_offset=True)
+    with pytest.raises(
+        InputError, match=r"imu_time_offset of ImuPreintegration, one by which the IMU is brought .* got 'offset'"
+    ):
+        problem.add_residuals(imu, T[[0]], s[[0]], T[[1]], s[[1]], offset)
 
 
 @pytest.mark.parametrize("rotation", ["log", "vector"])
@@ -176,6 +280,12 @@ def test_refusals() -> None:
         ImuPreintegration(p).refresh(np.zeros((5, 9)))
     with pytest.raises(InputError, match="pose_i of shape"):
         p.predict(np.eye(4), np.zeros(9))
+    with pytest.raises(InputError, match="gravity with a magnitude where its direction is a variable – got zero"):
+        ImuPreintegration(p, gravity=(0.0, 0.0, 0.0), gravity_direction=True)
+    with pytest.raises(InputError, match="time_offset_s finite"):
+        ImuPreintegration(p, time_offset=True, time_offset_s=np.nan)
+    with pytest.raises(InputError, match="no time_offset_s where it is no variable"):
+        ImuPreintegration(p).refresh(np.zeros(9), 0.1)
     with pytest.raises(InputError, match='rotation "log" or "vector"'):
         ImuPreintegration(p, rotation="euler")  # type: ignore[arg-type]
 

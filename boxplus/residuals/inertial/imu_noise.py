@@ -1,0 +1,46 @@
+"""How much an IMU errs, as data sheets and Allan deviations say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Noise densities, as data sheets and Allan deviations give them.
+
+    Attributes:
+        gyro: rad/s/√Hz.
+        accel: m/s²/√Hz.
+        gyro_walk: of the gyroscope's bias, rad/s²/√Hz.
+        accel_walk: of the accelerometer's bias, m/s³/√Hz.
+
+    Raises:
+        InputError: a density that is not positive and finite: the covariance would be singular.
+    """
+
+    gyro: float
+    accel: float
+    gyro_walk: float
+    accel_walk: float
+
+    def __post_init__(self) -> None:
+        for name in ("gyro", "accel", "gyro_walk", "accel_walk"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(
+                    f"the noise density {name} positive and finite",
+                    f"{value}",
+                    "take it from the data sheet; a bias that does not change has a small one",
+                )
+
+    @property
+    def variances(self) -> NDArray[np.float64]:
+        """Squared densities (4,): gyroscope, accelerometer, gyroscope bias, accelerometer bias."""
+        return np.square(np.array([self.gyro, self.accel, self.gyro_walk, self.accel_walk], dtype=np.float64))
