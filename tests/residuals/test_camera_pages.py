@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGES = ["cameras", "residuals/reprojection"]
+PAGES = ["cameras", "residuals/reprojection", "visual_inertial"]
 
 
 @pytest.mark.parametrize("page", PAGES)
