@@ -25,6 +25,9 @@ _MEANINGS = (
     (r"p_world", "a point in the world"),
     (r"bearing_rho", "a bearing and an inverse depth in an anchor"),
     (r"pixel_rho", "a pixel and an inverse depth in an anchor"),
+    (r"rho", "an inverse depth"),
+    (r"intrinsics", "the intrinsics of a camera"),
+    (r"velocity_bias_[ij]", "a velocity and the biases of an IMU"),
     (r"image_time_offset", "one by which images are brought to the poses"),
     (r"imu_time_offset", "one by which the IMU is brought to the poses"),
 )

@@ -66,6 +66,22 @@ def test_a_point_is_no_bearing() -> None:
         problem.add_residuals(bp.residuals.InverseDepthReprojection(CAMERA, [[320.0, 240.0]]), poses[[0]], poses[[1]], points)
 
 
+def test_numbers_of_the_same_kind_of_vector_are_told_apart() -> None:
+    """Euclidean(9): velocity and biases for the one, intrinsics with distortion for the other."""
+    camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0, bp.RadialTangential(0.1, 0.0, 0.0, 0.0, 0.01))
+    problem = bp.Problem()
+    poses = problem.add_variables(bp.SE3Left, IDENTITY)
+    points = problem.add_variables(bp.Euclidean(3), [0.0, 0, 4])
+    bodies = problem.add_variables(bp.BodyPose, np.tile(IDENTITY, (2, 1)))
+    nine = problem.add_variables(bp.Euclidean(9), np.tile(camera.parameters, (2, 1)), name="nine")
+    problem.add_residuals(bp.residuals.ReprojectionIntrinsics(camera, [[320.0, 240.0]]), poses, points, nine[[0]])
+    noise = bp.residuals.ImuNoise(gyro=1e-3, accel=1e-2, gyro_walk=1e-5, accel_walk=1e-4)
+    samples = np.arange(5) * 10_000_000, np.zeros((5, 3)), np.zeros((5, 3))
+    imu = bp.residuals.ImuPreintegration(bp.residuals.Preintegration.integrate(*samples, noise=noise))
+    with pytest.raises(bp.InputError, match=r"velocity_bias_i of .*, a velocity and the biases of an IMU – got 'nine', which"):
+        problem.add_residuals(imu, bodies[[0]], nine[[0]], bodies[[1]], nine[[1]])
+
+
 def test_two_meanings_within_one_residual() -> None:
     problem = bp.Problem()
     poses = problem.add_variables(bp.SE3, np.tile(IDENTITY, (2, 1)), name="poses")

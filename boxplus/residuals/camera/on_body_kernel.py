@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.manifolds.quaternion import multiply_scalars, rotate
+from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
+from boxplus.residuals.matrix3 import apply
 
 
 @kernel
@@ -75,18 +76,17 @@ def body_jacobians(
     """From rows [a, b] by a left step of T_camera_world to those by T_world_body and T_body_camera; all (N, d, 6)."""
     for n in range(np.uint64(begin), np.uint64(end)):
         i, k = body_of[n], mounting_of[n]
-        bw, bx, by, bz = bodies[i, 0], bodies[i, 1], bodies[i, 2], bodies[i, 3]
-        w, x, y, z = mountings[k, 0], mountings[k, 1], mountings[k, 2], mountings[k, 3]
+        R = rotation_entries(bodies[i, 0], bodies[i, 1], bodies[i, 2], bodies[i, 3])
+        C = rotation_entries(mountings[k, 0], mountings[k, 1], mountings[k, 2], mountings[k, 3])
         px, py, pz = mountings[k, 4], mountings[k, 5], mountings[k, 6]
         for row in range(np.uint64(J.shape[1])):
             a0, a1, a2 = J[n, row, 0], J[n, row, 1], J[n, row, 2]
-            # c = R_body_camera b and R_body_camera a.
-            c0, c1, c2 = rotate(w, x, y, z, J[n, row, 3], J[n, row, 4], J[n, row, 5])
-            d0, d1, d2 = rotate(w, x, y, z, a0, a1, a2)
+            c0, c1, c2 = apply(C, J[n, row, 3], J[n, row, 4], J[n, row, 5])
+            d0, d1, d2 = apply(C, a0, a1, a2)
+            e0, e1, e2 = apply(R, c0, c1, c2)
             J_mounting[n, row, 0], J_mounting[n, row, 1], J_mounting[n, row, 2] = -a0, -a1, -a2
             J_mounting[n, row, 3], J_mounting[n, row, 4], J_mounting[n, row, 5] = -c0, -c1, -c2
             J_body[n, row, 0] = c1 * pz - c2 * py - d0
             J_body[n, row, 1] = c2 * px - c0 * pz - d1
             J_body[n, row, 2] = c0 * py - c1 * px - d2
-            e0, e1, e2 = rotate(bw, bx, by, bz, c0, c1, c2)
             J_body[n, row, 3], J_body[n, row, 4], J_body[n, row, 5] = -e0, -e1, -e2
