@@ -82,6 +82,20 @@ def test_numbers_of_the_same_kind_of_vector_are_told_apart() -> None:
         problem.add_residuals(imu, bodies[[0]], nine[[0]], bodies[[1]], nine[[1]])
 
 
+def test_body_and_mounting_are_not_exchanged() -> None:
+    """Both are on BodyPose, so that only their meaning tells them apart."""
+    problem = bp.Problem()
+    bodies = problem.add_variables(bp.BodyPose, IDENTITY, name="bodies")
+    mountings = problem.add_variables(bp.BodyPose, IDENTITY, name="mountings")
+    points = problem.add_variables(bp.Euclidean(3), [0.0, 0, 4])
+    seen = bp.residuals.OnBody(reprojection())
+    problem.add_residuals(seen, bodies, mountings, points, name="left")
+    with pytest.raises(
+        bp.InputError, match=r"T_world_body of OnBody, .* – got 'mountings', which 'left' takes for T_body_camera"
+    ):
+        problem.add_residuals(seen, mountings, bodies, points)
+
+
 def test_two_meanings_within_one_residual() -> None:
     problem = bp.Problem()
     poses = problem.add_variables(bp.SE3, np.tile(IDENTITY, (2, 1)), name="poses")

@@ -22,7 +22,7 @@ What is seen moves with the velocity ż in the image, so that at the time of the
 
 (with + the offset would be that of the camera's clock against the IMU's). The anchor's own pixel is a measurement like any other
 and moves too: the bearing of the point is that at the time of the anchor's pose. Good while the velocity in the image does not
-change: a few milliseconds.
+change: `is_stale` says where the offset moved by more than 5 ms.
 
 Singular: as the residual on the camera's pose.
 
@@ -46,6 +46,8 @@ from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.camera.image_residual import ImageResidual
 from boxplus.residuals.camera.on_body_kernel import body_jacobians, camera_poses, first_of_relative, relative_poses
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
+
+CUT_ANEW_S = 0.005  # change of the time offset above which the velocity in the image is not constant any more
 
 # The poses of camera residuals, and the pairs of variables that take their places.
 _PAIRS = {
@@ -152,6 +154,19 @@ class OnBody(Residual):
         self._measured = residual.measured
         self._moved = residual.measured.copy()
         self.residual = residual.measuring(self._moved)
+
+    def is_stale(self, time_offset_s: float) -> NDArray[np.bool_]:
+        """(N,) whether the offset moved so far (5 ms) from that of the poses that the velocity in the image no longer does.
+
+        The poses are then to be taken at the new offset, and the residuals made anew with it.
+
+        Raises:
+            InputError: the time offset is no variable of these residuals.
+        """
+        if self.image_velocity is None:
+            raise InputError("residuals with a time offset", "no image_velocity", "give the velocities when making them")
+        far: NDArray[np.bool_] = np.abs(float(time_offset_s) - self.time_offset_s) > CUT_ANEW_S
+        return far
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""

@@ -269,6 +269,31 @@ def test_the_time_offset_moves_what_was_measured() -> None:
     )
 
 
+def test_an_offset_far_from_that_of_the_poses_is_told() -> None:
+    seen = residuals.Reprojection(CAMERA, [[1.0, 2.0], [3.0, 4.0]])
+    residual = residuals.OnBody(seen, image_velocity=[[5.0, 6.0]] * 2, time_offset_s=[0.0, 0.004])
+    assert residual.is_stale(0.003).tolist() == [False, False]
+    assert residual.is_stale(0.006).tolist() == [True, False]
+    with pytest.raises(bp.InputError, match="residuals with a time offset – got no image_velocity"):
+        residuals.OnBody(seen).is_stale(0.0)
+
+
+def test_a_residual_of_ones_own() -> None:
+    """By the name of its variable."""
+
+    def depth(T_camera_world, p_world, measured):  # type: ignore[no-untyped-def]
+        qw, qx, qy, qz = T_camera_world[0], T_camera_world[1], T_camera_world[2], T_camera_world[3]
+        z = 2.0 * (qx * qz - qw * qy) * p_world[0] + 2.0 * (qy * qz + qw * qx) * p_world[1]
+        z += (1.0 - 2.0 * (qx * qx + qy * qy)) * p_world[2] + T_camera_world[6]
+        return (measured - z,)
+
+    rng = np.random.default_rng(6)
+    pair, p = one_view(rng)
+    own = residuals.UserResidual(depth, dim=1, manifolds=(bp.SE3Left, bp.Euclidean(3)), data=(rng.uniform(1, 9, COUNT),))
+    report = bp.check_jacobian(residuals.OnBody(own), *pair, p)
+    assert report.passed and report.largest_residual > 0.5, str(report)
+
+
 def test_the_sign_of_the_time_offset() -> None:
     """A turning camera whose images are taken 4 ms later, by the IMU's clock, than they are stamped."""
     rng = np.random.default_rng(5)
