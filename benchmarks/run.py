@@ -86,6 +86,7 @@ BENCHMARKS = {
     "memory": Benchmark(("--minutes", "3")),
     "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),
     "graphs": Benchmark(("--rounds", "1", "--only", "intel", "MIT")),
+    "incremental": Benchmark(("--only", "world", "--poses", "300")),
     "loops": Benchmark(("--poses", "300", "--seeds", "1", "--without-gtsam")),
     "bundle": Benchmark(("--rounds", "1")),
     "imu": Benchmark(("--rounds", "2")),

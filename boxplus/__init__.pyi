@@ -34,6 +34,8 @@ from .manifolds.sphere import S2 as S2
 from .maps.ikd_tree import IkdTree as IkdTree
 from .optimization import losses as losses
 from .optimization.graduated import graduate as graduate
+from .optimization.incremental.options import IncrementalOptions as IncrementalOptions
+from .optimization.incremental.problem import IncrementalProblem as IncrementalProblem
 from .optimization.jacobian_check import check_jacobian as check_jacobian
 from .optimization.marginalization import marginalize as marginalize
 from .optimization.problem import Problem as Problem

@@ -15,6 +15,7 @@ SHOWS = {
     "bundle_adjustment": "before, 0.51 px after",
     "dynamic_kdtree": "after delete_box: 24668 (332 removed)",
     "evaluate_trajectory": "ATE rmse: 1.7",
+    "incremental_slam": "of the whole problem solved anew 211.732",
     "least_squares_problem": "every fifth is wrong: [0, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55]",
     "line_bundle_adjustment": "after : end points are 0.2",
     "odometry_from_arrays": "position error:",

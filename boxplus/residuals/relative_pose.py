@@ -30,7 +30,7 @@ def error_scalars(
 
 
 @kernel
-def _evaluate(
+def evaluate_rows(
     begin: int,
     end: int,
     T_i: NDArray[np.float64],
@@ -48,7 +48,7 @@ def _evaluate(
 
 
 @kernel
-def _linearize(
+def linearize_rows(
     begin: int,
     end: int,
     T_i: NDArray[np.float64],
@@ -127,10 +127,10 @@ class RelativePose(Residual):
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         is_exact = self.jacobian == "exact"
-        _linearize(begin, end, x[0], x[1], index[0], index[1], self.measured, is_exact, r, jacobians[0], jacobians[1], valid)
+        linearize_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, is_exact, r, jacobians[0], jacobians[1], valid)
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        _evaluate(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
+        evaluate_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
 
     def at_half_turn(self, *x: ArrayLike) -> NDArray[np.bool_]:
         """Which residuals (N,) have a rotation error within 1e-6 rad of π, the singular case of SPEC.md 5.3."""

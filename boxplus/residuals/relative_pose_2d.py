@@ -23,7 +23,7 @@ def _error(Z: NDArray[np.float64], theta: float, x: float, y: float) -> tuple[fl
 
 
 @kernel
-def _evaluate(
+def evaluate_rows(
     begin: int,
     end: int,
     T_i: NDArray[np.float64],
@@ -42,7 +42,7 @@ def _evaluate(
 
 
 @kernel
-def _linearize(
+def linearize_rows(
     begin: int,
     end: int,
     T_i: NDArray[np.float64],
@@ -110,7 +110,7 @@ class RelativePose2D(Residual):
         )
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
-        _linearize(begin, end, x[0], x[1], index[0], index[1], self.measured, r, jacobians[0], jacobians[1], valid)
+        linearize_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, r, jacobians[0], jacobians[1], valid)
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        _evaluate(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
+        evaluate_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)

@@ -17,12 +17,12 @@ NONE = np.uint32(0xFFFFFFFF)
 _ZERO = np.uint32(0)
 _ONE = np.uint32(1)
 
-_VARIABLE = np.uint32(0)  # a principal variable not yet eliminated
-_ELEMENT = np.uint32(1)
-_DEAD = np.uint32(2)  # an absorbed element, a merged or an eliminated variable
+VARIABLE = np.uint32(0)  # a principal variable not yet eliminated
+ELEMENT = np.uint32(1)
+DEAD = np.uint32(2)  # an absorbed element, a merged or an eliminated variable
 
 # A variable's list holds its variables first and its elements behind them, an element's list its variables.
-_NODE = np.dtype(
+NODE = np.dtype(
     [
         ("start", np.uint32),
         ("length", np.uint32),
@@ -41,7 +41,7 @@ _NODE = np.dtype(
 
 
 @kernel(inline=True)
-def _insert(nodes: NDArray[np.void], head: NDArray[np.uint32], i: np.uint32) -> None:
+def insert(nodes: NDArray[np.void], head: NDArray[np.uint32], i: np.uint32) -> None:
     """Put variable `i` at the front of the list of its degree."""
     degree = np.uint64(nodes[i]["degree"])
     following = head[degree]
@@ -76,7 +76,7 @@ def _compact(nodes: NDArray[np.void], lists: NDArray[np.uint32], spare: NDArray[
     """Copy the lists of all live nodes to `spare` without gaps; returns the space used."""
     used = np.uint64(0)
     for i in range(np.uint64(len(nodes))):
-        if nodes[i]["state"] != _DEAD:
+        if nodes[i]["state"] != DEAD:
             begin = nodes[i]["start"]
             nodes[i]["start"] = np.uint32(used)
             for k in range(begin, begin + nodes[i]["length"]):
@@ -101,7 +101,7 @@ def _form_element(
     weight = np.int64(0)
     for k in range(first, split):
         i = lists[k]
-        if nodes[i]["state"] == _VARIABLE and nodes[i]["work"] != stamp:
+        if nodes[i]["state"] == VARIABLE and nodes[i]["work"] != stamp:
             nodes[i]["work"] = stamp
             _remove(nodes, head, i)
             weight += nodes[i]["weight"]
@@ -109,18 +109,18 @@ def _form_element(
             out += _ONE
     for k in range(split, end):
         e = lists[k]
-        if nodes[e]["state"] != _ELEMENT:
+        if nodes[e]["state"] != ELEMENT:
             continue
-        nodes[e]["state"] = _DEAD
+        nodes[e]["state"] = DEAD
         for m in range(nodes[e]["start"], nodes[e]["start"] + nodes[e]["length"]):
             i = lists[m]
-            if nodes[i]["state"] == _VARIABLE and nodes[i]["work"] != stamp:
+            if nodes[i]["state"] == VARIABLE and nodes[i]["work"] != stamp:
                 nodes[i]["work"] = stamp
                 _remove(nodes, head, i)
                 weight += nodes[i]["weight"]
                 lists[out] = i
                 out += _ONE
-    nodes[p]["state"] = _ELEMENT
+    nodes[p]["state"] = ELEMENT
     nodes[p]["start"] = np.uint32(begin)
     nodes[p]["length"] = np.uint32(out - begin)
     return weight
@@ -135,7 +135,7 @@ def _scan_elements(nodes: NDArray[np.void], lists: NDArray[np.uint32], p: np.uin
         first = nodes[i]["start"]
         for m in range(first + nodes[i]["variables"], first + nodes[i]["length"]):
             e = lists[m]
-            if nodes[e]["state"] == _ELEMENT:
+            if nodes[e]["state"] == ELEMENT:
                 if nodes[e]["work"] < stamp:
                     nodes[e]["work"] = stamp + nodes[e]["degree"]
                 nodes[e]["work"] -= weight
@@ -162,7 +162,7 @@ def _update_lists(
         key = np.uint64(p)
         for m in range(first, split):
             j = lists[m]
-            if nodes[j]["state"] == _VARIABLE and nodes[j]["work"] != stamp:
+            if nodes[j]["state"] == VARIABLE and nodes[j]["work"] != stamp:
                 outside += nodes[j]["weight"]
                 key += j
                 lists[out] = j
@@ -170,17 +170,17 @@ def _update_lists(
         nodes[i]["variables"] = np.uint32(out - first)
         for m in range(split, end):
             e = lists[m]
-            if nodes[e]["state"] == _ELEMENT:
+            if nodes[e]["state"] == ELEMENT:
                 beyond = nodes[e]["work"] - stamp
                 if beyond == 0:
-                    nodes[e]["state"] = _DEAD
+                    nodes[e]["state"] = DEAD
                 else:
                     outside += beyond
                     key += e
                     lists[out] = e
                     out += _ONE
         if outside == 0:
-            nodes[i]["state"] = _DEAD
+            nodes[i]["state"] = DEAD
             eliminated += nodes[i]["weight"]
             _append_members(nodes, p, i)
             continue
@@ -202,7 +202,7 @@ def _merge_equal(
     """Merge the members of L_p whose lists are equal (ADD, section 2.3). Returns the next unused stamp."""
     for k in range(nodes[p]["start"], nodes[p]["start"] + nodes[p]["length"]):
         i = lists[k]
-        if nodes[i]["state"] != _VARIABLE:
+        if nodes[i]["state"] != VARIABLE:
             continue
         slot = nodes[i]["previous"]
         i = bucket[slot]
@@ -224,7 +224,7 @@ def _merge_equal(
                 following = nodes[j]["next"]
                 if equal:
                     nodes[i]["weight"] += nodes[j]["weight"]
-                    nodes[j]["state"] = _DEAD
+                    nodes[j]["state"] = DEAD
                     _append_members(nodes, i, j)
                     nodes[before]["next"] = following
                 else:
@@ -244,23 +244,23 @@ def _reinsert(
     smallest = left
     for k in range(begin, begin + nodes[p]["length"]):
         i = lists[k]
-        if nodes[i]["state"] == _VARIABLE:
+        if nodes[i]["state"] == VARIABLE:
             lists[out] = i
             out += _ONE
             own = nodes[i]["weight"]
             degree = min(nodes[i]["degree"] + weight - own, left - own)
             nodes[i]["degree"] = degree
             smallest = min(smallest, degree)
-            _insert(nodes, head, i)
+            insert(nodes, head, i)
     nodes[p]["length"] = np.uint32(out - begin)
     nodes[p]["degree"] = weight
     if out == begin:
-        nodes[p]["state"] = _DEAD
+        nodes[p]["state"] = DEAD
     return smallest
 
 
 @kernel
-def _eliminate(
+def eliminate(
     nodes: NDArray[np.void],
     lists: NDArray[np.uint32],
     spare: NDArray[np.uint32],
@@ -322,28 +322,28 @@ def _set_up(
         node["weight"] = sizes[k]
         node["member"] = NONE
         node["last_member"] = np.uint32(k)
-        node["state"] = _VARIABLE
+        node["state"] = VARIABLE
         node["work"] = 0
         if start[k + _ONE] - start[k] > dense:
-            node["state"] = _DEAD
+            node["state"] = DEAD
             back -= _ONE
             order[back] = np.int64(k)
     used = np.uint64(0)
     for step in range(count):
         i = count - _ONE - np.uint64(step)  # so that among nodes of equal degree the first is taken
-        if nodes[i]["state"] == _DEAD:
+        if nodes[i]["state"] == DEAD:
             continue
         nodes[i]["start"] = np.uint32(used)
         degree = np.int64(0)
         for m in range(np.uint64(start[i]), np.uint64(start[i + _ONE])):
             j = np.uint64(neighbours[m])
-            if nodes[j]["state"] == _VARIABLE:
+            if nodes[j]["state"] == VARIABLE:
                 lists[used] = np.uint32(j)
                 used += _ONE
                 degree += sizes[j]
         nodes[i]["length"] = nodes[i]["variables"] = np.uint32(used - nodes[i]["start"])
         nodes[i]["degree"] = degree
-        _insert(nodes, head, np.uint32(i))
+        insert(nodes, head, np.uint32(i))
     return used
 
 
@@ -363,7 +363,7 @@ def minimum_degree(start: NDArray[np.int64], neighbours: NDArray[np.int32], size
     order = np.empty(count, np.int64)
     if count == 0:
         return order
-    nodes = np.zeros(count, _NODE)
+    nodes = np.zeros(count, NODE)
     total = int(sizes.sum())
     head = np.full(total + 1, NONE, np.uint32)
     bucket = np.full(count, NONE, np.uint32)
@@ -372,5 +372,5 @@ def minimum_degree(start: NDArray[np.int64], neighbours: NDArray[np.int32], size
     if np.count_nonzero(np.diff(start) > dense) > np.sqrt(count):
         dense = count
     used = _set_up(nodes, start, neighbours, sizes, dense, head, lists, order)
-    _eliminate(nodes, lists, np.empty_like(lists), np.uint64(used), head, bucket, np.int64(total), order)
+    eliminate(nodes, lists, np.empty_like(lists), np.uint64(used), head, bucket, np.int64(total), order)
     return order

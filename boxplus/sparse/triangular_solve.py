@@ -166,7 +166,7 @@ def _subtract(y: Buffer, y_at: np.uint64, factor: Buffer, at: np.uint64, ld: np.
 
 
 @kernel(inline=True)
-def _backward_one(factor: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64, below: np.uint64, inverse: Buffer,
+def backward_one(factor: Buffer, at: np.uint64, ld: np.uint64, width: np.uint64, below: np.uint64, inverse: Buffer,
                   column: np.uint64, x: Buffer, y: Buffer) -> None:  # fmt: skip
     """As `_backward`, for one right-hand side."""
     end = width
@@ -223,6 +223,6 @@ def solve_one(table: Table, rows: Indices, order: Indices, factor: Buffer, inver
         width, below, at, ld, row = front["width"], front["below"], front["panel_at"], front["panel_ld"], front["row_start"]
         for i in range(below):
             y[i] = x[rows[row + i]]
-        _backward_one(factor, at, ld, width, below, inverse, front["column"], x, y)
+        backward_one(factor, at, ld, width, below, inverse, front["column"], x, y)
     for k in range(np.uint64(len(order))):
         z[order[k]] = x[k]

@@ -1,4 +1,4 @@
-"""The programs on the pages about covariance, singular problems and losses run, and print what the pages say."""
+"""The programs on the pages about covariance, singular and incremental problems and losses run and print what they say."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-@pytest.mark.parametrize("page", ["covariance", "singular_problems", "robust_losses"])
+@pytest.mark.parametrize("page", ["covariance", "singular_problems", "robust_losses", "incremental"])
 def test_programs_run_and_print_what_stands_below_them(page: str) -> None:
     scope: dict[str, object] = {}
     blocks = re.findall(r"```(python)?\n(.*?)```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
