@@ -88,20 +88,25 @@ def _variables_of(factors: Indices, factor_start: Indices, factor_variables: Ind
 
 
 @kernel
-def _add_information(first: int, end: int, factor_start: Indices, factor_variables: Indices, dof: Indices, start: Indices,
-                     contribution_at: Indices, contributions: NDArray[np.float64],
-                     information: NDArray[np.float64]) -> None:  # fmt: skip
-    """Add the diagonals of JᵀJ of factors, as they are linearised first."""
-    for f in range(first, end):
-        columns = 1
-        for k in range(factor_start[f], factor_start[f + 1]):
-            columns += dof[factor_variables[k]]
-        at = contribution_at[f]
-        for k in range(factor_start[f], factor_start[f + 1]):
-            v = factor_variables[k]
+def _refresh_information(variables: Indices, adjacency: Indices, next_entry: Indices, factor_of: Indices, factor_start: Indices,
+                         factor_variables: Indices, dof: Indices, start: Indices, contribution_at: Indices,
+                         contributions: NDArray[np.float64], information: NDArray[np.float64]) -> None:  # fmt: skip
+    """Diagonals of JᵀJ of variables, over all their factors as they are linearised now."""
+    for v in variables:
+        for i in range(start[v], start[v] + dof[v]):
+            information[i] = 0.0
+        entry = adjacency[v]
+        while entry != NONE:
+            f = factor_of[entry]
+            before, columns = 0, 1
+            for k in range(factor_start[f], factor_start[f + 1]):
+                before += dof[factor_variables[k]] if k < entry else 0
+                columns += dof[factor_variables[k]]
+            at = contribution_at[f] + before * (columns + 1)
             for i in range(start[v], start[v] + dof[v]):
                 information[i] += contributions[at]
                 at += columns + 1
+            entry = next_entry[entry]
 
 
 class BayesTree:
@@ -131,7 +136,6 @@ class BayesTree:
         self._counts = np.zeros(4, np.int64)
         self._mark = 0
         self._tangents = 0
-        self._informed = 0  # factors whose information is counted
 
     def add_variables(self, count: int, dof: int) -> int:
         """Number of the first of `count` new variables."""
@@ -191,11 +195,10 @@ class BayesTree:
 
     def update(self, seeds: Indices, last: Indices, wildfire: float) -> TreeUpdate:
         """Eliminate what `seeds` touch and all above; see `update_tree`."""
-        _add_information(
-            self._informed, self.factors, self._factor_start, self._factor_variables, self.dof, self.start, self.contribution_at,
-            self.contributions, self._information,
+        _refresh_information(
+            seeds, self._adjacency, self._next_entry, self._factor_of, self._factor_start, self._factor_variables, self.dof,
+            self.start, self.contribution_at, self.contributions, self._information,
         )  # fmt: skip
-        self._informed = self.factors
         while True:
             self._mark += 1
             status = update_tree(

@@ -68,7 +68,7 @@ class IncrementalProblem:
         none = np.zeros(0, np.int64)
         self._off, self._last = none, none
         self._linearized, self._solved_variables = 0, 0  # factors and variables that the tree has
-        self._is_stale = False  # an update failed: the tree lacks what it should have
+        self._is_stale = False  # an update did not come to its end: the tree lacks what it should have
 
     @changes
     def add_variables(
@@ -201,23 +201,25 @@ class IncrementalProblem:
         options, tree = self.options, self._tree
         rounds, relinearized, eliminated, solved = 0, 0, 0, 0
         while rounds < options.max_rounds:
-            off = self._off
+            off, rebuild = self._off, self._is_stale
+            self._is_stale = True  # until the tree has what follows
             if len(off):
                 self._move_points(off)
                 relinearized += len(off)
             factors, seeds = tree.touched(off, self._linearized)
             if self._linearized < tree.factors:
-                self._last = tree.touched(off[:0], self._linearized)[1]
+                self._last = tree.touched(off[:0], self._linearized)[1] if len(off) else seeds
             self._linearize(factors)
             self._off, self._linearized = off[:0], tree.factors
-            if self._is_stale:
+            if rebuild:
                 seeds = np.arange(tree.variables)
             if not len(seeds):
+                self._is_stale = False
                 break
             done = tree.update(seeds, self._last, options.wildfire)
-            self._is_stale = done.undetermined >= 0
-            if self._is_stale:
+            if done.undetermined >= 0:
                 raise self._explained(done)
+            self._is_stale = False
             self._solved_variables = tree.variables
             rounds, eliminated, solved = rounds + 1, max(eliminated, done.eliminated), max(solved, done.solved)
             self._follow(done.changed)

@@ -161,6 +161,16 @@ def test_small_changes_do_not_add_up_beyond_the_wildfire_threshold() -> None:
     assert np.abs(estimates[1]).max() > 5.0
 
 
+def test_a_residual_that_hardly_counted_at_first_moves_its_variable_later() -> None:
+    """What a variable is known by is taken from the weights of now: with those of the start 0.02 would stand for 2 m."""
+    problem = IncrementalProblem(max_rounds=60)
+    point = problem.add_variables(PLANE, [12.0, 0.0], name="point")
+    problem.add_residuals(Prior(PLANE, [12.0, 0.0], sigma=100.0), point)
+    problem.add_residuals(Prior(PLANE, [0.0, 0.0], sigma=0.1), point, loss=losses.GemanMcClure(10.0))
+    problem.update()
+    np.testing.assert_allclose(problem.estimate(point), [[0.0, 0.0]], atol=2 * 0.02 * 0.1)
+
+
 def test_poses_on_other_sides_and_priors_go_together() -> None:
     graph = loop_graph(3)
     problem = IncrementalProblem(tolerance=1e-6, wildfire=0.0, max_rounds=30)
