@@ -54,11 +54,17 @@ class Covariances:
             blocks = to_first @ blocks
         if to_second is not None:
             blocks = blocks @ np.swapaxes(to_second, 1, 2)
-        return blocks
+        return blocks * self._moving(first)[:, :, None] * self._moving(second)[:, None, :]
+
+    def _moving(self, rows: VariableRows) -> NDArray[np.float64]:
+        """(k, dof) 0 for components that are held, which are known, else 1."""
+        if rows.block.is_held is None:
+            return np.ones((len(rows), rows.block.manifold.dof))
+        return (~rows.block.is_held[rows.rows]).astype(np.float64)
 
     def _to_own(self, rows: VariableRows) -> NDArray[np.float64] | None:
         number = rows.block.number
-        return to_own_tangent(self._problem.layout, number, self._values[number][rows.rows])
+        return to_own_tangent(self._problem.layout, number, self._values[number][self._problem.layout.rows(rows)])
 
     def joint(self, selected: Sequence[VariableRows]) -> NDArray[np.float64]:
         """The covariance (D, D) of all selected variables together, tangent after tangent in the order given.
@@ -87,6 +93,8 @@ class Covariances:
                 matrix[here] = change @ matrix[here]
                 matrix[:, here] = matrix[:, here] @ change.T
             first += len(rows)
+        moving = np.concatenate([self._moving(rows).reshape(-1) for rows in selected])
+        matrix *= moving[:, None] * moving
         return 0.5 * (matrix + matrix.T)
 
     def _prepare(self, wanted: NDArray[np.int64]) -> None:

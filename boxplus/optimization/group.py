@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
@@ -47,25 +47,48 @@ class GroupCost:
         return GroupCost(self.cost + other.cost, self.common + other.common, self.lost + other.lost, self.valid + other.valid)
 
 
+@dataclass(frozen=True, slots=True)
+class ResidualRows:
+    """Some residuals of one group, for `Problem.remove`: `group[rows]`.
+
+    Attributes:
+        group: theirs.
+        chosen: (N,) bool.
+    """
+
+    group: Group
+    chosen: NDArray[np.bool_]
+
+
 class Group:
     """N residuals of one kind, connected to variables.
+
+    A residual keeps its row, from 0 to N − 1, whatever is removed.
 
     Attributes:
         residual, name: as given to `Problem.add_residuals`.
         loss: as given there, or to `set_loss` since.
         connections: one `VariableRows` of length N for each connected variable.
         left_out: (N,) residuals of weight zero that the structure of the problem leaves out; None for none.
+        removed: (N,) residuals that are gone for good and count nothing; None for none.
+        revision: grows when residuals are removed.
         r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,).
     """
 
-    def __init__(self, residual: Residual, connections: Sequence[VariableRows], loss: Loss, name: str) -> None:
+    def __init__(
+        self, residual: Residual, connections: Sequence[VariableRows], loss: Loss, name: str, *, holds: bool = False
+    ) -> None:
+        """`holds`: the group stands for components that are held, and is the only one that has Jacobians for them."""
         self.residual, self.name = residual, name
         self.connections = tuple(_broadcast(rows, residual.count) for rows in connections)
         self.r = np.zeros((residual.count, residual.dim))
         self.jacobians = tuple(np.zeros((residual.count, residual.dim, c.block.manifold.dof)) for c in self.connections)
         self.valid = np.ones(residual.count, dtype=np.bool_)
         self.counted = np.zeros(residual.count, dtype=np.bool_)
-        self._index = tuple(c.rows for c in self.connections)
+        self._holds = holds
+        self.removed: NDArray[np.bool_] | None = None
+        self.revision = 0
+        self.synchronize()
         self._change = [
             tangent_change(native, c.block.manifold) for native, c in zip(residual.manifolds, self.connections, strict=True)
         ]
@@ -75,6 +98,46 @@ class Group:
         self.left_out: NDArray[np.bool_] | None = None
         self._root: NDArray[np.float64] | None = None
         self._sums = np.zeros((-(-residual.count // _CHUNK), 4))
+
+    def __getitem__(self, rows: ArrayLike | slice) -> ResidualRows:
+        """Residuals by their rows, or by a mask (N,).
+
+        Raises:
+            InputError: rows that the group does not have.
+        """
+        chosen = np.zeros(self.residual.count, dtype=np.bool_)
+        try:
+            chosen[rows if isinstance(rows, slice) else np.asarray(rows)] = True
+        except IndexError:
+            raise InputError(
+                f"rows of {self.name!r} from 0 to {self.residual.count - 1}, or a mask", f"{rows!r}", "select with integers"
+            ) from None
+        return ResidualRows(self, chosen)
+
+    @property
+    def absent(self) -> NDArray[np.bool_] | None:
+        """(N,) residuals that are not in the structure of the problem, removed or left out; None for none."""
+        if self.removed is None or self.left_out is None:
+            return self.removed if self.left_out is None else self.left_out
+        return self.removed | self.left_out
+
+    def remove(self, gone: NDArray[np.bool_]) -> None:
+        """Let residuals (N,) count nothing from now on, for `Problem.remove`; one at least is left."""
+        if not gone.any():
+            return
+        self.removed = gone if self.removed is None else self.removed | gone
+        # What they were connected to may go as well: they are connected to what another one has, and never looked at.
+        present = int(np.argmin(self.removed))
+        self.connections = tuple(VariableRows(c.block, np.where(self.removed, c.ids[present], c.ids)) for c in self.connections)
+        self.revision += 1
+
+    def synchronize(self) -> None:
+        """Look up where the variables stand, after some were removed, held, or had their first estimates kept."""
+        self._index = tuple(c.rows for c in self.connections)
+        self._at_first = any(c.block.has_first_estimate[c.rows].any() for c in self.connections)
+        self._free = [
+            None if c.block.is_held is None or self._holds else (~c.block.is_held).astype(np.float64) for c in self.connections
+        ]
 
     def __repr__(self) -> str:
         return f"{self.name!r} ({self.residual.count} × {type(self.residual).__name__})"
@@ -139,13 +202,19 @@ class Group:
     ) -> GroupCost:
         """Residuals, and unless `changes` is None Jacobians with the change of tangent of every connected variable."""
         x = tuple(values[c.block.number] for c in self.connections)
+        # Jacobians where the variables were first known, residuals where they are.
+        x0 = tuple(c.block.linearized_at(values[c.block.number]) for c in self.connections) if self._at_first else x
         residual, factors, diagonal = self.residual, self.residual.whitening.factors, self.residual.whitening.is_diagonal
 
         def work(chunk: int, begin: int, end: int) -> None:
             if changes is not None:
-                residual.linearize_into(begin, end, x, self._index, self.r, self.jacobians, self.valid)
+                residual.linearize_into(begin, end, x0, self._index, self.r, self.jacobians, self.valid)
+                if self._at_first:
+                    self._evaluate_beside(begin, end, x)
             else:
                 residual.evaluate_into(begin, end, x, self._index, self.r, self.valid)
+            if self.removed is not None:
+                self._leave_out(begin, end, self.removed[begin:end], changes is not None)
             if not self._is_white:
                 whiten_residuals(begin, end, factors, diagonal, self.r)
             if self._root is not None:
@@ -159,7 +228,10 @@ class Group:
             for slot, J in enumerate(self.jacobians):
                 change = changes[slot]
                 if change is not None:
-                    change(begin, end, x[slot], self._index[slot], J)
+                    change(begin, end, x0[slot], self._index[slot], J)
+                free = self._free[slot]
+                if free is not None:
+                    J[begin:end] *= free[self._index[slot][begin:end], None, :]
                 if not self._is_white:
                     whiten_jacobian(begin, end, factors, diagonal, J)
                 if self._root is not None:
@@ -170,6 +242,21 @@ class Group:
         run_chunks(work, residual.count, _CHUNK, threads)
         cost, common, lost, valid = self._sums.sum(axis=0) if len(self._sums) else (0.0, 0.0, 0, 0)
         return GroupCost(float(cost), float(common), int(lost), int(valid))
+
+    def _evaluate_beside(self, begin: int, end: int, x: tuple[NDArray[np.float64], ...]) -> None:
+        """Residuals at x, beside Jacobians that were taken elsewhere; what is singular at one of the points counts nothing."""
+        valid = self.valid[begin:end].copy()
+        self.residual.evaluate_into(begin, end, x, self._index, self.r, self.valid)
+        self.valid[begin:end] &= valid
+        self._leave_out(begin, end, ~self.valid[begin:end], True)
+
+    def _leave_out(self, begin: int, end: int, rows: NDArray[np.bool_], with_jacobians: bool) -> None:
+        """Let the marked ones of the residuals [begin, end) be invalid."""
+        self.valid[begin:end][rows] = False
+        self.r[begin:end][rows] = 0.0
+        if with_jacobians:
+            for J in self.jacobians:
+                J[begin:end][rows] = 0.0
 
     def find_not_finite(self) -> tuple[int, str] | None:
         """(residual, what) of the first NaN or infinity in the current linearisation."""
@@ -187,7 +274,7 @@ def _broadcast(rows: VariableRows, count: int) -> VariableRows:
     if len(rows) == count:
         return rows
     if len(rows) == 1:
-        return VariableRows(rows.block, np.repeat(rows.rows, count))
+        return VariableRows(rows.block, np.repeat(rows.ids, count))
     raise InputError(
         f"{count} rows of {rows.block.name!r}, one for each residual (or one for all)",
         f"{len(rows)}",

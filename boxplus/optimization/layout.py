@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.group import Group
@@ -20,6 +21,7 @@ class Layout:
 
     Attributes:
         blocks: the blocks of the problem.
+        ids: of the variables of every block when the layout was made.
         number: for every block (n,) int64, the number of each of its variables, −1 where it is fixed.
         sizes: (free variables,) int64 degrees of freedom of each.
         start: (free variables + 1,) int64, where each begins in the tangent vector; the last is its length.
@@ -30,6 +32,8 @@ class Layout:
     def __init__(self, blocks: Sequence[Variables], without: Variables | None = None) -> None:
         self.blocks = tuple(blocks)
         self.tangents: tuple[Manifold, ...] = tuple(block.manifold for block in self.blocks)
+        self.ids = tuple(block.ids for block in self.blocks)
+        self._revisions = tuple(block.revision for block in self.blocks)
         self.number: list[NDArray[np.int64]] = []
         count = 0
         sizes = []
@@ -52,9 +56,33 @@ class Layout:
         """Length of the tangent vector."""
         return int(self.start[-1])
 
+    @property
+    def is_current(self) -> bool:
+        """Whether all variables of the layout are still there, and held and linearised as they were."""
+        return all(block.revision == then for block, then in zip(self.blocks, self._revisions, strict=True))
+
+    def rows(self, selected: VariableRows) -> NDArray[np.uint32]:
+        """Where the selected variables stand in the values of the layout.
+
+        Raises:
+            InputError: a variable was removed before the layout was made, or added since.
+        """
+        ids, known = selected.ids, self.ids[selected.block.number]
+        if known is selected.block.ids:
+            return selected.rows
+        rows = np.minimum(np.searchsorted(known, ids), max(len(known) - 1, 0))
+        other = known[rows] != ids if len(known) else np.ones(len(ids), dtype=np.bool_)
+        if other.any():
+            raise InputError(
+                "variables that were there when the problem was solved",
+                f"{selected.block.name}[{ids[np.argmax(other)]}]",
+                "solve again",
+            )
+        return rows.astype(np.uint32)
+
     def numbers(self, rows: VariableRows) -> NDArray[np.int64]:
         """Numbers of the selected variables, −1 where fixed."""
-        return self.number[rows.block.number][rows.rows]
+        return self.number[rows.block.number][self.rows(rows)]
 
     def starts(self, rows: VariableRows) -> NDArray[np.int64]:
         """Where the selected variables begin in the tangent vector, −1 where fixed."""
@@ -98,16 +126,17 @@ class Layout:
 
     def describe(self, number: int) -> str:
         """Name of a free variable, such as `poses[12]`."""
-        for block, numbers in zip(self.blocks, self.number, strict=True):
+        for block, numbers, ids in zip(self.blocks, self.number, self.ids, strict=True):
             row = np.flatnonzero(numbers == number)
             if len(row):
-                return f"{block.name}[{int(row[0])}]"
+                return f"{block.name}[{ids[row[0]]}]"
         return f"variable {number}"
 
 
 def connected_numbers(layout: Layout, group: Group) -> list[NDArray[np.int64]]:
-    """For every connection of a group, the numbers of its variables, −1 where fixed or where the residual is left out."""
+    """For every connection of a group, the numbers of its variables, −1 where fixed or the residual is left out or removed."""
     numbers = [layout.numbers(connection) for connection in group.connections]
-    if group.left_out is not None:
-        numbers = [np.where(group.left_out, -1, number) for number in numbers]
+    absent = group.absent
+    if absent is not None:
+        numbers = [np.where(absent, -1, number) for number in numbers]
     return numbers

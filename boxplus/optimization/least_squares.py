@@ -39,6 +39,7 @@ class LeastSquares:
         self.cost = GroupCost(0.0, 0.0, 0, 0)
         self.timing_s = {"residuals and Jacobians": 0.0, "normal equations": 0.0, "linear solve": 0.0}
         self._threads = threads
+        self._revisions = tuple(group.revision for group in self.groups)
         self._linearized: Values = ()
         self._tangents: tuple[Manifold, ...] | None = None  # where they are not the blocks' own
         self._has_tangents = False
@@ -47,8 +48,16 @@ class LeastSquares:
         """Linearise at `values` and accept them.
 
         Raises:
+            InputError: variables or residuals were removed since the problem was analysed; no residual can be evaluated.
             NotFiniteError: a residual or a Jacobian is NaN or infinite there.
         """
+        revisions = tuple(group.revision for group in self.groups)
+        if not self.layout.is_current or revisions != self._revisions:
+            raise InputError(
+                "a problem that is as it was when it was solved",
+                "one from which variables or residuals were removed since",
+                "ask a solution about covariances before that, or solve again",
+            )
         for group in self.groups:
             group.counted[:] = False
         cost = self.linearize(values)
@@ -141,7 +150,7 @@ class LeastSquares:
                 continue
             row, what = found
             inputs = ", ".join(
-                f"{role} = {c.block.name}[{c.rows[row]}] = {np.array2string(values[c.block.number][c.rows[row]], precision=6)}"
+                f"{role} = {c.block.name}[{c.ids[row]}] = {np.array2string(values[c.block.number][c.rows[row]], precision=6)}"
                 for role, c in zip(group.residual.roles, group.connections, strict=True)
             )
             raise NotFiniteError(

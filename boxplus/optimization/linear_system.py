@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.optimization.dense_kernels import factorize_dense, solve_dense
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.normal_equations import NormalEquations
@@ -57,8 +58,7 @@ class DenseSystem(LinearSystem):
     def __init__(self, layout: Layout, groups: Sequence[Group], threads: int) -> None:
         self._equations = NormalEquations(layout, groups)
         self._layout, self._threads = layout, threads
-        self._factor: NDArray[np.float64] = np.zeros((0, 0))
-        self._dense = np.zeros((layout.dof, layout.dof))
+        self._dense, self._factor = np.zeros((layout.dof, layout.dof)), np.zeros((layout.dof, layout.dof))
         self._places = self._equations.pattern.dense_places()
         self.description = f"dense Cholesky of {layout.dof} degrees of freedom"
 
@@ -70,32 +70,24 @@ class DenseSystem(LinearSystem):
 
     def factorize(self, damping: NDArray[np.float64] | None) -> None:
         """See `LinearSystem.factorize`."""
-        from scipy.linalg.lapack import dpotrf
-
-        matrix = self._dense.copy()
+        self._factor[:] = self._dense
         if damping is not None:
-            matrix[np.diag_indices_from(matrix)] += damping
-        diagonal = np.diag(matrix).copy()
-        # The lower triangle of rows is LAPACK's upper one of columns, which spares a transposition.
-        self._factor, info = dpotrf(matrix.T, lower=0, clean=1, overwrite_a=1)
-        pivots = np.diag(self._factor) ** 2
-        rounded = np.flatnonzero(pivots <= SINGULAR * diagonal)
-        row = info - 1 if info > 0 else int(rounded[0]) if len(rounded) else -1
-        if row >= 0:
+            self._factor[np.diag_indices_from(self._factor)] += damping
+        row = factorize_dense(self._factor, SINGULAR)
+        if row < self._layout.dof:
             block = int(np.searchsorted(self._layout.start, row, side="right")) - 1
-            raise NotPositiveDefinite(block, row - int(self._layout.start[block]), float(pivots[row]))
+            raise NotPositiveDefinite(block, row - int(self._layout.start[block]), float(self._factor[row, row]))
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `LinearSystem.solve`."""
-        from scipy.linalg import cho_solve
-
-        return np.asarray(cho_solve((self._factor, False), right))
+        x = right.reshape(-1, 1).copy()
+        solve_dense(self._factor, x)
+        return x[:, 0]
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """See `LinearSystem.inverse_blocks`."""
-        from scipy.linalg import cho_solve
-
-        inverse = cho_solve((self._factor, False), np.eye(self._layout.dof))
+        inverse = np.eye(self._layout.dof)
+        solve_dense(self._factor, inverse)
         start = self._layout.start
         return [inverse[start[i] : start[i + 1], start[j] : start[j + 1]] for i, j in zip(first, second, strict=True)]
 

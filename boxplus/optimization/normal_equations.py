@@ -22,6 +22,7 @@ from boxplus.sparse.product_tiles import add_sums, tile_of
 
 # Pieces for every thread, so that one with more work does not hold up the others; more cost more calls than they even out.
 _PIECES = 4
+_FEW = 4  # variables of a residual whose products are worth a call each
 
 
 def piece(items: int, threads: int) -> int:
@@ -79,6 +80,60 @@ def _accumulate_gradient(
                     gradient[at + q] += J[n, i, q] * factor
 
 
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A group of a single residual of many variables, such as a marginal prior: all its products JₐᵀJ_b in one go.
+
+    Attributes:
+        group: of one residual.
+        column: (slots + 1,) where the Jacobian of each variable begins among all columns.
+        start: (slots,) where each variable begins in the tangent vector; −1 where it is fixed.
+        place: (slots, slots) where the values of block (a, b) begin; −1 where it is not in the lower triangle, or fixed.
+    """
+
+    group: Group
+    column: NDArray[np.int64]
+    start: NDArray[np.int64]
+    place: NDArray[np.int64]
+
+    def add(self, values: NDArray[np.float64], gradient: NDArray[np.float64]) -> None:
+        """Add JᵀJ and Jᵀr of the current linearisation."""
+        Jt = np.ascontiguousarray(np.concatenate([J[0] for J in self.group.jacobians], axis=1).T)
+        _add_joint(Jt, self.group.r[0], self.column, self.start, self.place, values, gradient)
+
+
+@kernel(fastmath=True)
+def _add_joint(
+    Jt: NDArray[np.float64],
+    r: NDArray[np.float64],
+    column: NDArray[np.int64],
+    start: NDArray[np.int64],
+    place: NDArray[np.int64],
+    values: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    depth = np.uint64(Jt.shape[1])
+    for a in range(len(start)):
+        if start[a] < 0:
+            continue
+        for i in range(column[a], column[a + 1]):
+            total = 0.0
+            for k in range(depth):
+                total += Jt[i, k] * r[k]
+            gradient[start[a] + i - column[a]] += total
+        for b in range(len(start)):
+            at = place[a, b]
+            if at < 0:
+                continue
+            for i in range(column[a], column[a + 1]):
+                for j in range(column[b], column[b + 1]):
+                    total = 0.0
+                    for k in range(depth):
+                        total += Jt[i, k] * Jt[j, k]
+                    values[at] += total
+                    at += 1
+
+
 def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> None:
     """values[place:] += Σ Jₐᵀ J_b, row-major, for every place of `gather`."""
     Ja, Jb = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
@@ -115,8 +170,13 @@ class NormalEquations:
         columns: list[NDArray[np.int64]] = []
         parts: list[tuple[Group, int, int, NDArray[np.intp]]] = []
         self._gradients: list[Gather] = []
+        joint: list[tuple[Group, NDArray[np.int64], NDArray[np.bool_]]] = []
         for group in groups:
             numbers = connected_numbers(layout, group)
+            if group.residual.count == 1 and len(numbers) > _FEW:
+                number = np.concatenate(numbers)
+                joint.append((group, number, (number[:, None] >= number) & (number >= 0)))
+                continue
             for a, number_a in enumerate(numbers):
                 free = np.flatnonzero(number_a >= 0)
                 if len(free):
@@ -129,9 +189,21 @@ class NormalEquations:
                         rows.append(number_a[selected])
                         columns.append(number_b[selected])
                         parts.append((group, a, b, selected))
+        ends = np.cumsum([len(selected) for *_, selected in parts], dtype=np.int64)
+        for _, number, lower in joint:
+            first, second = np.nonzero(lower)
+            rows.append(number[first])
+            columns.append(number[second])
         none = [np.zeros(0, dtype=np.int64)]
         self.pattern, pairs = BlockPattern.from_pairs(layout.sizes, np.concatenate(rows or none), np.concatenate(columns or none))
-        ends = np.cumsum([len(selected) for *_, selected in parts])
+        self._joint = []
+        end = int(ends[-1]) if len(ends) else 0
+        for group, number, lower in joint:
+            place = np.full(lower.shape, -1)
+            place[lower] = self.pattern.value_start[:-1][pairs.block[end : end + int(lower.sum())]]
+            end += int(lower.sum())
+            column = np.cumsum([0, *(J.shape[2] for J in group.jacobians)])
+            self._joint.append(Joint(group, column, np.where(number >= 0, layout.start[number], -1), place))
         self._products = [
             Gather.sorted_by(group, a, b, pairs.block[end - len(selected) : end], self.pattern.value_start[:-1], selected)
             for (group, a, b, selected), end in zip(parts, ends, strict=True)
@@ -148,6 +220,8 @@ class NormalEquations:
             add_products(gather, self.values, threads)
         for gather in self._gradients:
             add_gradient(gather, self.gradient, threads)
+        for group in self._joint:
+            group.add(self.values, self.gradient)
 
     @property
     def diagonal(self) -> NDArray[np.float64]:

@@ -16,15 +16,18 @@ from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.connections import check_connections
 from boxplus.optimization.elimination import choose_system
 from boxplus.optimization.faded import faded_notes, faded_shares
-from boxplus.optimization.group import Group
+from boxplus.optimization.group import Group, ResidualRows
+from boxplus.optimization.held_components import component_mask, held_groups
 from boxplus.optimization.layout import Layout
 from boxplus.optimization.least_squares import LeastSquares
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.minimize import Callback, minimize, strategy_of
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
+from boxplus.optimization.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
@@ -35,14 +38,16 @@ _STALE = 0.05
 class Problem:
     """Minimises ½ Σ ρ(‖W r(x)‖²) over variables on manifolds.
 
-    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. One thread at a
-    time may use a problem, its solving included; a second one is refused (InputError).
+    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. Variables and
+    residuals may come and go (`extend`, `remove`, `boxplus.marginalize`); what stays keeps its name. One thread at a time may use
+    a problem, its solving included; a second one is refused (InputError).
     """
 
     def __init__(self) -> None:
         self._guard = ThreadGuard("Problem")
         self.blocks: list[Variables] = []
         self.groups: list[Group] = []
+        self._added = 0  # groups, ever: the number in a name is not given twice
         self._analysed: tuple[tuple[Any, ...], LeastSquares, tuple[str, ...]] | None = None
 
     @changes
@@ -98,22 +103,131 @@ class Problem:
         for connection in rows:
             self._require_own(connection)
         check_connections(residual, rows, self.groups, carry_over)
-        label = name if name is not None else f"{type(residual).__name__}_{len(self.groups)}"
+        label = name if name is not None else f"{type(residual).__name__}_{self._added}"
         if any(group.name == label for group in self.groups):
             raise InputError("a new name", f"{label!r}, which another group has", "choose another name")
         self.groups.append(Group(residual, rows, loss if loss is not None else Squared(), label))
+        self._added += 1
+        if isinstance(residual, MarginalPrior):
+            keep_first_estimates(self.blocks, self.groups)
         self._analysed = None
         return self.groups[-1]
 
     @changes
-    def fix(self, selected: VariableRows | Variables) -> None:
-        """Hold variables at their values: known quantities, or the gauge."""
-        self._set_fixed(selected, True)
+    def extend(self, block: Variables, values: ArrayLike) -> VariableRows:
+        """Add variables to a block; returns them. The ids of the others stay.
+
+        Args:
+            values: (n, size) where they start; (size,) for a single one.
+
+        Raises:
+            InputError: a block of another problem; wrong shape, not finite, off the manifold.
+
+        Example:
+            `newest = problem.extend(poses, T_world_imu)`
+        """
+        self._require_own(block[:])
+        self._analysed = None
+        return block.extend(block.manifold.check(block.name, values))
+
+    @changes
+    def remove(self, *leaving: VariableRows | Variables | Group | ResidualRows) -> dict[str, int]:
+        """Take out residuals (`group`, `group[rows]`) and variables (`block`, `block[rows]`) with all residuals that touch them.
+
+        What was known about variables through those that go is lost; `boxplus.marginalize` keeps it. Ids and rows of what
+        stays do not change. A group without residuals leaves the problem; solutions from before have values, but no
+        covariances any more.
+
+        Returns:
+            For every group that lost some, by name, how many residuals.
+
+        Raises:
+            InputError: something of another problem; a variable that a marginal prior knows, which cannot forget it.
+
+        Example:
+            `problem.remove(pixels[is_outlier], points[lost])`
+        """
+        gone, chosen = self._selection(leaving)
+        require_forgettable(self.groups, gone, chosen)
+        for rows, touched in zip(chosen, touching(self.groups, gone), strict=True):
+            rows |= touched
+        self.groups, counts = take_out(self.blocks, self.groups, gone, chosen)
+        self._analysed = None
+        return counts
+
+    def reach_of(self, leaving: Sequence[VariableRows | Variables]) -> tuple[Masks, Masks]:
+        """For every block which variables are selected, and for every group which residuals touch them.
+
+        Raises:
+            InputError: variables of another problem.
+        """
+        gone, _ = self._selection(leaving)
+        return gone, touching(self.groups, gone)
+
+    def _selection(self, leaving: Sequence[VariableRows | Variables | Group | ResidualRows]) -> tuple[Masks, Masks]:
+        """For every block and every group which variables and residuals are selected."""
+        gone = [np.zeros(len(block), dtype=np.bool_) for block in self.blocks]
+        chosen = [np.zeros(group.residual.count, dtype=np.bool_) for group in self.groups]
+        for part in leaving:
+            if isinstance(part, (Group, ResidualRows)):
+                rows = part if isinstance(part, ResidualRows) else part[:]
+                number = self._number_of(rows.group)
+                chosen[number] |= rows.chosen
+            else:
+                selected = part[:] if isinstance(part, Variables) else part
+                self._require_own(selected)
+                gone[selected.block.number][selected.rows] = True
+        return gone, chosen
+
+    def _number_of(self, group: Group) -> int:
+        for number, own in enumerate(self.groups):
+            if own is group:
+                return number
+        raise InputError("a group of this problem", f"{group!r}", "give what `add_residuals` returned")
+
+    @changes
+    def fix(self, selected: VariableRows | Variables, *, components: ArrayLike | None = None) -> None:
+        """Hold variables at their values: known quantities, or the gauge.
+
+        Args:
+            components: places in the tangent to hold alone, such as [0, 1, 5] for roll, pitch and height of an SE3 in the body's
+                axes; all of them where left out.
+
+        Raises:
+            InputError: variables of another problem, components that the manifold does not have.
+        """
+        rows = selected[:] if isinstance(selected, Variables) else selected
+        self._require_own(rows)
+        if components is None:
+            self._set_fixed(rows, True)
+            return
+        block, mask = rows.block, component_mask(rows.block, components)
+        held = np.zeros((len(block), block.manifold.dof), dtype=np.bool_) if block.is_held is None else block.is_held.copy()
+        held[rows.rows] |= mask
+        self._set_held(block, held)
 
     @changes
     def free(self, selected: VariableRows | Variables) -> None:
-        """Let fixed variables move again."""
-        self._set_fixed(selected, False)
+        """Let fixed variables, and held components of them, move again."""
+        rows = selected[:] if isinstance(selected, Variables) else selected
+        self._require_own(rows)
+        self._set_fixed(rows, False)
+        if rows.block.is_held is not None:
+            held = rows.block.is_held.copy()
+            held[rows.rows] = False
+            self._set_held(rows.block, held)
+
+    @changes
+    def set_values(self, values: Solution | Sequence[NDArray[np.float64]]) -> None:
+        """Take the values of a solution, or one array a block, as the variables' own: where the next search starts.
+
+        Variables that were added since the solution keep theirs.
+
+        Raises:
+            InputError: as for `values_at`.
+        """
+        for block, array in zip(self.blocks, self.values_at(values), strict=True):
+            block.values = array
 
     def set_weights(self, group: Group, weights: ArrayLike | None) -> None:
         """Let every residual of a group count `weights` times: ½ Σ ρ(w ‖W r‖²), until other weights are set.
@@ -125,8 +239,7 @@ class Problem:
         Raises:
             InputError: a group of another problem, weights of another shape, negative or not finite.
         """
-        if not any(group is own for own in self.groups):
-            raise InputError("a group of this problem", f"{group!r}", "give what `add_residuals` returned")
+        self._number_of(group)
         if weights is None:
             group.set_weights(None)
             none = np.zeros(group.residual.count, dtype=np.bool_)
@@ -143,13 +256,16 @@ class Problem:
             group.left_out = none if none.any() else None
             self._analysed = None
 
-    def _set_fixed(self, selected: VariableRows | Variables, fixed: bool) -> None:
-        rows = selected[:] if isinstance(selected, Variables) else selected
-        self._require_own(rows)
+    def _set_fixed(self, rows: VariableRows, fixed: bool) -> None:
         is_fixed = rows.block.is_fixed.copy()
         is_fixed[rows.rows] = fixed
-        is_fixed.flags.writeable = False
-        rows.block.is_fixed = is_fixed
+        rows.block.set_fixed(is_fixed)
+        self._analysed = None
+
+    def _set_held(self, block: Variables, held: NDArray[np.bool_]) -> None:
+        block.set_held(held)
+        for group in self.groups:
+            group.synchronize()
         self._analysed = None
 
     def _require_own(self, rows: VariableRows) -> None:
@@ -165,7 +281,7 @@ class Problem:
 
     def defects(self) -> list[str]:
         """What is wrong with the structure, a sentence each: variables without residuals, components without gauge."""
-        return structural_defects(self.blocks, self.groups)
+        return structural_defects(self.blocks, [*self.groups, *held_groups(self.blocks)])
 
     @changes
     def solve(
@@ -213,7 +329,10 @@ class Problem:
             history=tuple(history),
             method=strategy.name,
             linear_solver=model.system.description,
-            invalid={group.name: int((~group.counted).sum()) for group in self.groups},
+            invalid={
+                group.name: int((~(group.counted if group.removed is None else group.counted | group.removed)).sum())
+                for group in self.groups
+            },
             faded=faded,
             notes=(*notes, *faded_notes(self.groups, faded)),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
@@ -223,16 +342,18 @@ class Problem:
     def values_at(self, given: Solution | Sequence[NDArray[np.float64]] | None = None) -> list[NDArray[np.float64]]:
         """Values (n, size) of every block at a solution or as given, fixed variables too; by default copies of the blocks' own.
 
+        Of a solution, variables that were added since have their own values, and those that were removed since are left out.
+
         Raises:
             InputError: another number of blocks or variables, points that are not on their manifolds.
         """
         if given is None:
             return [block.values.copy() for block in self.blocks]
-        values = given.values if isinstance(given, Solution) else given
+        values = given.values_of(self.blocks) if isinstance(given, Solution) else given
         if len(values) != len(self.blocks):
             raise InputError(f"values of {len(self.blocks)} blocks", f"{len(values)}", "give one array for each block")
         if isinstance(given, Solution):
-            for block, other in zip(self.blocks, given._problem.layout.blocks, strict=True):
+            for block, other in zip(self.blocks, given._problem.layout.blocks, strict=False):  # some may be new
                 if block.manifold != other.manifold:
                     got = f"a solution with {other.name!r} on {other.manifold}"
                     raise InputError(f"{block.name} on {block.manifold}", got, "start from a problem of the same blocks")
@@ -255,8 +376,9 @@ class Problem:
             layout = Layout(self.blocks)
             if layout.dof == 0:
                 raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
-            system = choose_system(layout, self.groups, options)
-            model = LeastSquares(layout, self.groups, system, options.threads)
+            groups = [*self.groups, *held_groups(self.blocks)]
+            system = choose_system(layout, groups, options)
+            model = LeastSquares(layout, groups, system, options.threads)
             self._analysed = (key, model, tuple(self.defects()))
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -77,10 +78,27 @@ class Solution:
         object.__setattr__(self, "_covariances", Covariances(self._problem, self.values))
 
     def __getitem__(self, selected: Variables | VariableRows) -> NDArray[np.float64]:
-        """Values (n, size) of a block, or (k, size) of rows of it."""
+        """Values (n, size) of a block as it was when the problem was solved, or (k, size) of rows of it."""
         rows = self._own(selected)
         values = self.values[rows.block.number]
-        return values if isinstance(selected, Variables) else values[rows.rows]
+        return values if isinstance(selected, Variables) else values[self._problem.layout.rows(rows)]
+
+    def values_of(self, blocks: Sequence[Variables]) -> list[NDArray[np.float64]]:
+        """Values (n, size) of the variables that are in `blocks` now; those that were added since have their own."""
+        layout = self._problem.layout
+        if len(blocks) < len(layout.blocks):
+            return list(self.values)  # of another problem: whoever asked for them sees that
+        known = []
+        for number, block in enumerate(blocks):
+            own = number < len(layout.blocks) and layout.blocks[number] is block
+            if not own or layout.ids[number] is block.ids:
+                known.append(self.values[number] if number < len(self.values) else block.values)
+                continue
+            x = block.values.copy()
+            _, here, there = np.intersect1d(block.ids, layout.ids[number], assume_unique=True, return_indices=True)
+            x[here] = self.values[number][there]
+            known.append(x)
+        return known
 
     def _own(self, selected: VariableRows | Variables) -> VariableRows:
         rows = selected[:] if isinstance(selected, Variables) else selected

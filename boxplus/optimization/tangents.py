@@ -31,7 +31,7 @@ def best_tangents(layout: Layout, groups: Sequence[Group], values: Sequence[NDAr
     best = list(layout.tangents)
     for number, current in enumerate(layout.tangents):
         others = [manifold for manifold in _alternatives(current) if manifold != current]
-        if not others:
+        if not others or layout.blocks[number].is_held is not None:  # components are held in the block's own tangent
             continue
         own = _log_diagonal(layout, groups, values, number, current)
         gains = [own - _log_diagonal(layout, groups, values, number, other) for other in others]

@@ -15,48 +15,130 @@ from boxplus.manifolds.manifold import Manifold
 class Variables:
     """A block of n variables on one manifold, made by `Problem.add_variables`.
 
-    `block[rows]` selects variables for `add_residuals`, `fix` and `covariance`; rows may repeat.
+    `block[3]` and `block[[3, 5]]` select variables by their ids for `add_residuals`, `fix` and `covariance`; ids may repeat. An
+    id is the place at which a variable was added, counted from 0, and stays its name for good: removing others does not change
+    it, and it is never given again. Slices and masks select among the variables that are there, in their order.
 
     Attributes:
         manifold: of every variable of the block.
         name: for messages.
-        values: (n, size) as given; a solution has its own.
+        ids: (n,) of the variables that are there, ascending.
+        values: (n, size), where the next search starts; a solution has its own.
         is_fixed: (n,) bool, held where they start by the solver; set by `Problem.fix` and `free` only.
+        is_held: (n, dof) bool, single components that are held; None for none. Set likewise.
         number: of the block in its problem.
+        revision: grows when something happens that invalidates what was worked out about the block; not when it is extended.
     """
 
     def __init__(self, number: int, name: str, manifold: Manifold, values: NDArray[np.float64]) -> None:
         self.number, self.name, self.manifold, self.values = number, name, manifold, values
+        self.ids = np.arange(len(values))
         self.is_fixed = np.zeros(len(values), dtype=np.bool_)
         self.is_fixed.flags.writeable = False
+        self.is_held: NDArray[np.bool_] | None = None
+        self.revision = 0
+        self.next_id = len(values)
+        self._is_first = np.zeros(len(values), dtype=np.bool_)
+        self._first = values
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def __getitem__(self, rows: Any) -> VariableRows:
-        return VariableRows(self, rows)
+    def __getitem__(self, selected: Any) -> VariableRows:
+        return VariableRows(self, selected)
 
     def __iter__(self) -> Iterator[VariableRows]:
-        return (self[row] for row in range(len(self)))
+        return (self[int(k)] for k in self.ids)
 
     def __repr__(self) -> str:
         return f"{len(self)} variables {self.name!r} on {self.manifold}"
 
+    def rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """At which row each variable stands now.
+
+        Raises:
+            InputError: one of them was removed.
+        """
+        if self.next_id == len(self.ids):  # nothing was ever removed
+            return ids.astype(np.uint32)
+        rows = np.searchsorted(self.ids, ids)
+        gone = rows == len(self.ids)
+        gone[~gone] = self.ids[rows[~gone]] != ids[~gone]
+        if gone.any():
+            raise InputError(
+                f"variables of {self.name!r} that are there",
+                f"{self.name}[{ids[np.argmax(gone)]}], which was removed",
+                "drop what was connected to it",
+            )
+        return rows.astype(np.uint32)
+
+    def extend(self, values: NDArray[np.float64]) -> VariableRows:
+        """Append variables, for `Problem.extend`."""
+        count = len(values)
+        self.ids = np.append(self.ids, self.next_id + np.arange(count))
+        self.next_id += count
+        self.values, self._first = np.concatenate([self.values, values]), np.concatenate([self._first, values])
+        self._is_first = np.append(self._is_first, np.zeros(count, dtype=np.bool_))
+        self.set_fixed(np.append(self.is_fixed, np.zeros(count, dtype=np.bool_)))
+        if self.is_held is not None:
+            self.is_held = np.concatenate([self.is_held, np.zeros((count, self.manifold.dof), dtype=np.bool_)])
+        return VariableRows(self, self.ids[len(self.ids) - count :])
+
+    def drop(self, gone: NDArray[np.bool_]) -> None:
+        """Remove variables (n,), for `Problem.remove`."""
+        if not gone.any():
+            return
+        self.ids, self.values, self._first = self.ids[~gone], self.values[~gone], self._first[~gone]
+        self._is_first = self._is_first[~gone]
+        self.set_fixed(self.is_fixed[~gone])
+        if self.is_held is not None:
+            self.is_held = self.is_held[~gone]
+        self.revision += 1
+
+    def set_fixed(self, is_fixed: NDArray[np.bool_]) -> None:
+        """Take over (n,) which are fixed, for `Problem.fix` and `free`."""
+        self.is_fixed = is_fixed
+        self.is_fixed.flags.writeable = False
+
+    def set_held(self, is_held: NDArray[np.bool_]) -> None:
+        """Take over (n, dof) which components are held, for `Problem.fix` and `free`."""
+        self.is_held = is_held if is_held.any() else None
+        self.revision += 1
+
+    @property
+    def has_first_estimate(self) -> NDArray[np.bool_]:
+        """(n,) variables whose Jacobians are taken at their first estimates, as a marginal prior knows them."""
+        return self._is_first
+
+    def keep_first_estimates(self, known: NDArray[np.bool_], x0: NDArray[np.float64]) -> None:
+        """Take Jacobians of the variables `known` (n,) at their points x0 (n, size) from now on, others where they are."""
+        if not np.array_equal(known, self._is_first):
+            self.revision += 1
+        self._is_first, self._first = known, x0
+
+    def linearized_at(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where Jacobians are taken when the block is at `values`: there, or at the first estimates."""
+        known = self._is_first[: len(values)]  # a solution may be older than the last variables
+        return np.where(known[:, None], self._first[: len(values)], values) if known.any() else values
+
 
 class VariableRows:
-    """Rows of one block: the variables that each residual of a group is connected to.
+    """Some variables of one block, such as those that each residual of a group is connected to; see `Variables`.
+
+    Attributes:
+        block, ids: the block, and the ids of the variables in it.
 
     Raises:
-        InputError: an index is out of range, negative, or not an integer.
+        InputError: an id out of range, negative, of a removed variable, or not an integer.
     """
 
-    def __init__(self, block: Variables, rows: ArrayLike | slice) -> None:
+    def __init__(self, block: Variables, selected: ArrayLike | slice) -> None:
         self.block = block
-        if isinstance(rows, slice):
-            rows = np.arange(len(block))[rows]
-        given = np.asarray(rows)
+        if isinstance(selected, slice):
+            selected = block.ids[selected]
+        given = np.asarray(selected)
         if given.dtype == np.bool_ and given.shape == (len(block),):
-            given = np.flatnonzero(given)
+            given = block.ids[given]
         if given.size == 0:
             given = given.astype(np.int64)
         if given.ndim > 1 or not np.issubdtype(given.dtype, np.integer):
@@ -66,15 +148,27 @@ class VariableRows:
                 "select with integers",
             )
         given = np.atleast_1d(given)
-        outside = (given < 0) | (given >= len(block))
+        outside = (given < 0) | (given >= block.next_id)
         if outside.any():
             at = int(np.argmax(outside))
             raise InputError(
-                f"rows of {block.name!r} from 0 to {len(block) - 1}",
+                f"rows of {block.name!r} from 0 to {block.next_id - 1}",
                 f"{given[at]} at position {at}",
                 "the index dangles: repair the association",
             )
-        self.rows = given.astype(np.uint32)
+        self.ids = given.astype(np.int64)
+        self._rows, self._revision = block.rows_of(self.ids), block.revision
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self.ids)
+
+    @property
+    def rows(self) -> NDArray[np.uint32]:
+        """(k,) where the variables stand in the values of their block now.
+
+        Raises:
+            InputError: one of them was removed.
+        """
+        if self._revision != self.block.revision:
+            self._rows, self._revision = self.block.rows_of(self.ids), self.block.revision
+        return self._rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
@@ -15,13 +15,12 @@ from boxplus.residuals.whitening import Whitening
 
 
 class MarginalPrior(Residual):
-    """r(x) = r₀ + J (x ⊟ x₀), whitened, over several variables together; `marginalize` makes it.
+    """r(x) = r₀ + J (x ⊟ x₀), whitened, over several variables together; `boxplus.marginalize` makes it.
 
-    The rows are d residuals of dimension 1 that share their variables. J and x₀ stay as they were where the variables were
-    marginalised: only ∂(x ⊟ x₀)/∂x follows x (Jacobian J_k · `boxminus_jacobian(x_k, x₀_k)` for variable k). Other residuals
-    take their Jacobians where x is now; where the two points drift apart, a direction that nothing measures may seem measured
-    (first-estimates Jacobians would avoid it). As ½ ‖r‖² is a Gaussian already, it takes no robust loss: one would weigh each
-    row alone.
+    One residual of d rows (docs/marginalization.md). J and x₀ stay as they were; only ∂(x ⊟ x₀)/∂x follows x (Jacobian
+    J_k · `boxminus_jacobian(x_k, x₀_k)` for variable k). A problem takes the Jacobians of its variables, those of other residuals
+    too, at x₀, unless `keeps_first_estimates` is off: where the two points differ, a direction that nothing measures would seem
+    measured. As ½ ‖r‖² is a Gaussian already, it takes no robust loss.
 
     Args:
         manifolds: of the variables.
@@ -30,6 +29,7 @@ class MarginalPrior(Residual):
         r0: (d,).
         roles: names of the variables, for messages.
         fixes_gauge: whether the variables are tied to the world through what was marginalised.
+        keeps_first_estimates: whether a problem takes all Jacobians of the variables at x0.
 
     Raises:
         InputError: shapes that do not fit each other, points that are not on their manifolds.
@@ -44,6 +44,7 @@ class MarginalPrior(Residual):
         *,
         roles: Sequence[str] | None = None,
         fixes_gauge: bool = False,
+        keeps_first_estimates: bool = True,
     ) -> None:
         self.J, self.r0 = np.array(as_floats(J, "J")), np.array(as_floats(r0, "r0"))
         dof = sum(manifold.dof for manifold in manifolds)
@@ -58,34 +59,38 @@ class MarginalPrior(Residual):
         if not (np.isfinite(self.J).all() and np.isfinite(self.r0).all()):
             raise InputError("finite J and r0", "NaN or infinity", "marginalise where all residuals can be evaluated")
         self.x0 = tuple(m.check(f"x0[{k}]", x)[0] for k, (m, x) in enumerate(zip(manifolds, x0, strict=True)))
+        self.keeps_first_estimates = keeps_first_estimates
         ends = np.cumsum([m.dof for m in manifolds])
         self._columns = tuple(slice(int(end) - m.dof, int(end)) for end, m in zip(ends, manifolds, strict=True))
+        # Variables on one manifold are compared with their points all at once.
+        self._alike = [
+            (manifold, slots, np.stack([self.x0[k] for k in slots]), np.concatenate([np.r_[self._columns[k]] for k in slots]))
+            for manifold in dict.fromkeys(manifolds)
+            for slots in [[k for k, other in enumerate(manifolds) if other == manifold]]
+        ]
+        rows = len(self.J)
         super().__init__(
-            dim=1,
-            count=len(self.J),
+            dim=rows,
+            count=1,
             manifolds=tuple(manifolds),
             roles=tuple(roles) if roles is not None else tuple(f"x{k}" for k in range(len(manifolds))),
-            whitening=Whitening.of(1, len(self.J)),
+            whitening=Whitening(np.eye(rows)[None], True),
             fixes_gauge=fixes_gauge,
         )
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
+        """See `Residual.linearize_into`."""
         self.evaluate_into(begin, end, x, index, r, valid)
         for k, (manifold, columns) in enumerate(zip(self.manifolds, self._columns, strict=True)):
             at = x[k][index[k][begin:end]]
-            # Every row is connected to the same variable, unless someone evaluates the rows apart.
-            change = manifold.boxminus_jacobian(at[:1] if self._is_shared(at) else at, self.x0[k])
-            jacobians[k][begin:end] = self.J[begin:end, None, columns] @ change
+            jacobians[k][begin:end] = self.J[:, columns]
+            if not (at == self.x0[k]).all():  # as it is where first estimates are kept
+                jacobians[k][begin:end] = self.J[:, columns] @ manifold.boxminus_jacobian(at, self.x0[k])
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        total = self.r0[begin:end].copy()
-        for k, (manifold, columns) in enumerate(zip(self.manifolds, self._columns, strict=True)):
-            at = x[k][index[k][begin:end]]
-            moved = manifold.boxminus(at[:1] if self._is_shared(at) else at, self.x0[k])
-            total += (self.J[begin:end, columns] * moved).sum(axis=1)
-        r[begin:end, 0] = total
+        """See `Residual.evaluate_into`."""
+        moved = np.empty(self.J.shape[1])
+        for manifold, slots, x0, columns in self._alike:
+            moved[columns] = manifold.boxminus(np.stack([x[k][index[k][0]] for k in slots]), x0).reshape(-1)
+        r[begin:end] = self.r0 + (self.J * moved).sum(axis=1)
         valid[begin:end] = True
-
-    @staticmethod
-    def _is_shared(at: NDArray[np.float64]) -> bool:
-        return bool((at == at[:1]).all())

@@ -28,3 +28,15 @@ def test_programs_run_and_print_what_stands_below_them(page: str) -> None:
             assert printed == text
             printed = ""
     assert not printed
+
+
+def test_the_program_of_the_page_about_windows_runs() -> None:
+    scope: dict[str, object] = {}
+    text = (DOCS / "marginalization.md").read_text(encoding="utf-8")
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        for program in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+            exec(compile(program, "marginalization", "exec"), scope)
+    first, second = out.getvalue().splitlines()
+    assert first.startswith("[34 35 36 37 38 39]")
+    assert second.startswith("True ['translation x: one sigma of the prior is ")

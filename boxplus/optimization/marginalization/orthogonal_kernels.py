@@ -1,0 +1,322 @@
+"""Householder reflections for marginalisation: landmark by landmark, then into one triangle (docs/marginalization.md).
+
+Matrices lie column by column, A[column, row], so that a reflection works along contiguous memory. No LAPACK is called: for
+matrices this small it is slower, wakes the threads of BLAS, and lets the bits depend on their number.
+
+Source: Golub and Van Loan, Matrix Computations, 5.1 and 5.5; Demmel et al., ICCV 2021, section 4.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel
+
+OWN = -2  # column of a slot: the landmark that is eliminated
+BATCH = 256  # rows gathered before they are merged into the triangle; few enough for the second-level cache
+TOGETHER = 3  # reflections applied in one go; the degrees of freedom of a point
+STEPS = 4  # parts of the columns; rows that begin in a later one are kept apart, as they have less to be merged into
+
+
+@kernel(fastmath=True)
+def eliminate_columns(
+    A: NDArray[np.float64],
+    columns_used: int,
+    rows_used: int,
+    count: int,
+    lengths: NDArray[np.float64],
+    least: float,
+    order: NDArray[np.int64],
+    V: NDArray[np.float64],
+) -> np.int64:
+    """Bring the first `count` columns of a matrix to triangular form with pivoting, in place; returns their rank.
+
+    Args:
+        A: (columns, rows), of which the first `columns_used` and `rows_used` are the matrix.
+        lengths: (count,) of the columns as they were measured; permuted with the columns.
+        least: share of its length below which what is left of a column is rounding.
+        order: (count,) receives which column stands where.
+        V: (TOGETHER, rows) to work in.
+    """
+    columns, rows = np.uint64(columns_used), np.uint64(rows_used)
+    n, one = np.uint64(count), np.uint64(1)
+    for c in range(n):
+        order[c] = c
+    diagonal, factor = np.empty(min(n, rows)), np.empty(min(n, rows))
+    rank = np.uint64(0)
+    for s in range(min(n, rows)):
+        best, pivot = 0.0, s
+        for c in range(s, n):
+            total = 0.0
+            for i in range(s, rows):
+                total += A[c, i] * A[c, i]
+            share = math.sqrt(total) / lengths[c] if lengths[c] > 0.0 else 0.0
+            if share > best:
+                best, pivot = share, c
+        if not best > least:
+            break
+        if pivot != s:
+            order[s], order[pivot] = order[pivot], order[s]
+            lengths[s], lengths[pivot] = lengths[pivot], lengths[s]
+            for i in range(rows):
+                A[s, i], A[pivot, i] = A[pivot, i], A[s, i]
+        total = 0.0
+        for i in range(s, rows):
+            total += A[s, i] * A[s, i]
+        diagonal[s] = -math.copysign(math.sqrt(total), A[s, s])
+        A[s, s] -= diagonal[s]
+        factor[s] = -1.0 / (diagonal[s] * A[s, s])  # 2 / ‖v‖² of v = a − diagonal e, which takes the place of a
+        for c in range(s + one, n):
+            along = 0.0
+            for i in range(s, rows):
+                along += A[s, i] * A[c, i]
+            along *= factor[s]
+            for i in range(s, rows):
+                A[c, i] -= along * A[s, i]
+        rank += one
+    for s in range(np.uint64(0), rank, np.uint64(TOGETHER)):
+        _reflect(A, s, min(rank - s, np.uint64(TOGETHER)), n, columns, rows, factor, V)
+    for s in range(rank):
+        A[s, s] = diagonal[s]
+        for i in range(s + one, rows):
+            A[s, i] = 0.0
+    return np.int64(rank)
+
+
+@kernel(fastmath=True)
+def _reflect(
+    A: NDArray[np.float64],
+    s: np.uint64,
+    count: np.uint64,
+    first: np.uint64,
+    columns: np.uint64,
+    rows: np.uint64,
+    factor: NDArray[np.float64],
+    V: NDArray[np.float64],
+) -> None:
+    """Apply the `count` reflections whose vectors stand in columns s … of A, three at most, to the columns from `first` on."""
+    length = rows - s
+    for k in range(np.uint64(TOGETHER)):
+        for i in range(length):
+            V[k, i] = A[s + k, s + i] if k < count and i >= k else 0.0
+    f0 = factor[s]
+    f1 = factor[s + np.uint64(1)] if count > np.uint64(1) else 0.0
+    f2 = factor[s + np.uint64(2)] if count > np.uint64(2) else 0.0
+    c01, c02, c12 = 0.0, 0.0, 0.0
+    for i in range(length):
+        c01 += V[0, i] * V[1, i]
+        c02 += V[0, i] * V[2, i]
+        c12 += V[1, i] * V[2, i]
+    for c in range(first, columns):
+        w0, w1, w2 = 0.0, 0.0, 0.0
+        for i in range(length):
+            w0 += V[0, i] * A[c, s + i]
+            w1 += V[1, i] * A[c, s + i]
+            w2 += V[2, i] * A[c, s + i]
+        w0 *= f0
+        w1 = f1 * (w1 - w0 * c01)
+        w2 = f2 * (w2 - w0 * c02 - w1 * c12)
+        for i in range(length):
+            A[c, s + i] -= w0 * V[0, i] + w1 * V[1, i] + w2 * V[2, i]
+
+
+@kernel(fastmath=True, inline=True)
+def _reflection(B: NDArray[np.float64], c: np.uint64, rows: np.uint64, triangle: NDArray[np.float64]) -> tuple[float, float]:
+    """(head, factor) of the reflection that takes column c of B into the diagonal of the triangle; factor 0 where it is zero."""
+    total = 0.0
+    for i in range(rows):
+        total += B[c, i] * B[c, i]
+    if total == 0.0:
+        return 0.0, 0.0
+    above = triangle[c, c]
+    diagonal = -math.copysign(math.sqrt(above * above + total), above)
+    triangle[c, c] = diagonal
+    return above - diagonal, -1.0 / (diagonal * (above - diagonal))
+
+
+@kernel(fastmath=True)
+def merge_batch(B: NDArray[np.float64], start: int, used: int, triangle: NDArray[np.float64]) -> None:
+    """triangle ← R of [triangle; rows of B], two reflections at a time; B is used up and left at zero.
+
+    Args:
+        B: (w + 1, BATCH), the last column the residuals; its columns before `start` are zero.
+        used: rows.
+        triangle: (w, w + 1).
+    """
+    width, rows = np.uint64(triangle.shape[0]), np.uint64(used)
+    one = np.uint64(1)
+    c = np.uint64(start)
+    while c < width:
+        d = c + one
+        head_c, factor_c = _reflection(B, c, rows, triangle)
+        along = head_c * triangle[c, d]
+        for i in range(rows):
+            along += B[c, i] * B[d, i]
+        along *= factor_c
+        triangle[c, d] -= along * head_c
+        for i in range(rows):
+            B[d, i] -= along * B[c, i]
+        if d >= width:
+            break
+        head_d, factor_d = _reflection(B, d, rows, triangle)
+        cross = 0.0
+        for i in range(rows):
+            cross += B[c, i] * B[d, i]
+        for j in range(d + one, width + one):
+            s, t = head_c * triangle[c, j], head_d * triangle[d, j]
+            for i in range(rows):
+                s += B[c, i] * B[j, i]
+                t += B[d, i] * B[j, i]
+            s *= factor_c
+            t = factor_d * (t - s * cross)
+            triangle[c, j] -= s * head_c
+            triangle[d, j] -= t * head_d
+            for i in range(rows):
+                B[j, i] -= s * B[c, i] + t * B[d, i]
+        c += one + one
+    for j in range(np.uint64(start), width + one):
+        for i in range(rows):
+            B[j, i] = 0.0
+
+
+@kernel(fastmath=True)
+def add_rows(
+    data: NDArray[np.float64],
+    at: NDArray[np.int64],
+    dim: NDArray[np.int64],
+    slot: NDArray[np.int64],
+    column: NDArray[np.int64],
+    dof: NDArray[np.int64],
+    step: NDArray[np.int64],
+    residual: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    own: NDArray[np.int64],
+    least: float,
+    work: NDArray[np.float64],
+    squares: NDArray[np.float64],
+    triangle: NDArray[np.float64],
+) -> None:
+    """Take landmarks out of their residuals, and merge what is left into the triangle, landmark by landmark.
+
+    A landmark goes through its residuals from those that begin at the last columns to those that begin at the first, and takes
+    what is known about itself along: so what the later ones leave does not reach back to the columns of the earlier ones.
+
+    Args:
+        data: Jacobians and residuals, one after the other: residual n is (dim, sum of the dof of its slots + 1) from at[n] on.
+        slot: (residuals + 1,) where the slots of each begin in `column` and `dof`.
+        column: of the triangle for every slot; −1 for what is held, OWN for the landmark.
+        step: (residuals,) the part of the columns in which each begins, from 0 to STEPS − 1.
+        residual, begin: the residuals of landmark l are residual[begin[l]:begin[l + 1]], steps descending.
+        own: (landmarks,) degrees of freedom of each; 0 for residuals without one, which are merged as they are.
+        least: see `eliminate_columns`.
+        work: as many numbers as the largest landmark has rows times columns.
+        squares: (w,) receives the sum of squares of every column.
+        triangle: (w, w + 1).
+    """
+    width = triangle.shape[0]
+    place = np.full(width, -1)
+    touched = np.empty(width, dtype=np.int64)
+    lengths, order = np.empty(max(1, own.max())), np.empty(max(1, own.max()), dtype=np.int64)
+    shares, position = np.empty_like(lengths), np.empty_like(order)
+    highest = 0
+    for landmark in range(len(own)):
+        height = 0
+        for e in range(begin[landmark], begin[landmark + 1]):
+            height += dim[residual[e]]
+        highest = max(highest, height)
+    V = np.empty((TOGETHER, highest))
+    B = np.zeros((STEPS, width + 1, BATCH))
+    used = np.zeros(STEPS, dtype=np.int64)
+    start = np.full(STEPS, width)
+    for landmark in range(len(own)):
+        k = own[landmark]
+        height, count = 0, 0
+        for e in range(begin[landmark], begin[landmark + 1]):
+            n = residual[e]
+            height += dim[n]
+            for q in range(slot[n], slot[n + 1]):
+                if column[q] >= 0 and place[column[q]] < 0:
+                    place[column[q]] = k + 1 + count
+                    for j in range(dof[q]):
+                        touched[count] = column[q] + j
+                        count += 1
+        # Its own columns, the residuals, then the columns in the order in which they are met.
+        A = work[: (k + 1 + count) * height].reshape((k + 1 + count, height))
+        lengths[:] = 0.0
+        for c in range(k):
+            position[c] = c
+        reach, rows, lowest = k + 1, 0, width
+        e = begin[landmark]
+        while e < begin[landmark + 1]:
+            now = step[residual[e]]
+            kept = rows
+            while e < begin[landmark + 1] and step[residual[e]] == now:
+                n = residual[e]
+                for q in range(slot[n], slot[n + 1]):
+                    if column[q] >= 0:
+                        lowest = min(lowest, column[q])
+                        end = place[column[q]] + dof[q]
+                        for c in range(reach, end):
+                            for i in range(rows):
+                                A[c, i] = 0.0
+                        reach = max(reach, end)
+                for c in range(reach):
+                    for i in range(rows, rows + dim[n]):
+                        A[c, i] = 0.0
+                source = at[n]
+                for i in range(rows, rows + dim[n]):
+                    for q in range(slot[n], slot[n + 1]):
+                        if column[q] >= 0:
+                            to = place[column[q]]
+                            for j in range(dof[q]):
+                                A[to + j, i] += data[source + j]
+                        elif column[q] == OWN:
+                            for j in range(k):
+                                A[position[j], i] += data[source + j]
+                        source += dof[q]
+                    A[k, i] = data[source]
+                    source += 1
+                rows += dim[n]
+                e += 1
+            for c in range(k):
+                for i in range(kept, rows):
+                    lengths[c] += A[c, i] * A[c, i]
+            for c in range(k + 1, reach):
+                for i in range(kept, rows):
+                    squares[touched[c - k - 1]] += A[c, i] * A[c, i]
+            rank = 0
+            if k > 0:
+                for c in range(k):
+                    shares[c] = math.sqrt(lengths[c])
+                rank = eliminate_columns(A, reach, rows, k, shares, least, order, V)
+                for c in range(k):
+                    shares[c] = lengths[order[c]]
+                lengths[:k] = shares[:k]
+                for j in range(k):
+                    for c in range(k):
+                        if order[c] == position[j]:
+                            position[j] = c
+                            break
+            done = rank
+            while done < rows:
+                if used[now] == BATCH:
+                    merge_batch(B[now], start[now], used[now], triangle)
+                    used[now] = 0
+                fresh, below = min(rows - done, BATCH - used[now]), used[now]
+                for c in range(k + 1, reach):
+                    to = touched[c - k - 1]
+                    for i in range(fresh):
+                        B[now, to, below + i] = A[c, done + i]
+                for i in range(fresh):
+                    B[now, width, below + i] = A[k, done + i]
+                start[now] = min(start[now], lowest)
+                used[now] += fresh
+                done += fresh
+            rows = rank
+        for c in range(count):
+            place[touched[c]] = -1
+    for now in range(STEPS):
+        merge_batch(B[now], start[now], used[now], triangle)

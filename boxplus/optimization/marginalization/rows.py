@@ -1,0 +1,152 @@
+"""The rows of residuals that leave a problem, packed for the kernels, and which variables they leave to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.optimization.group import Group
+from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, eliminate_columns
+from boxplus.optimization.removal import Masks
+from boxplus.optimization.variables import Variables
+
+_RANK = 1e-10  # share of a column's length: what is left of it below this is rounding
+_NONE = -1
+Places = list[NDArray[np.int64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Which variables the leaving residuals touch, and their columns [leaving together | staying].
+
+    Attributes:
+        place: for every block (n,) the column at which each variable begins; −1 where it is held or not touched, OWN for a
+            landmark: a leaving variable that shares no residual with another one, and goes alone.
+        landmark: for every block (n,) the number of each landmark, −1 for others.
+        own: (landmarks,) degrees of freedom of each.
+        leaving: columns of the variables that leave together.
+        width: of all columns.
+        staying: for every block the rows of variables that stay, in the order of their columns.
+    """
+
+    place: Places
+    landmark: Places
+    own: NDArray[np.int64]
+    leaving: int
+    width: int
+    staying: list[NDArray[np.intp]]
+
+    @classmethod
+    def of(cls, blocks: Sequence[Variables], groups: Sequence[Group], touched: Masks, gone: Masks) -> Columns:
+        """From the residuals `touched` of every group and the variables `gone` of every block."""
+        met = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
+        for group, chosen in zip(groups, touched, strict=True):
+            for c in group.connections:
+                met[c.block.number][c.rows[chosen]] = True
+        for block in blocks:
+            met[block.number] &= ~block.is_fixed
+        alone = _independent(blocks, groups, touched, [m & g for m, g in zip(met, gone, strict=True)])
+        place = [np.full(len(block), _NONE) for block in blocks]
+        landmark = [np.full(len(block), _NONE) for block in blocks]
+        own, end = [np.zeros(0, dtype=np.int64)], 0
+        count = 0
+        for block, single in zip(blocks, alone, strict=True):
+            rows = np.flatnonzero(single)
+            place[block.number][rows] = OWN
+            landmark[block.number][rows] = count + np.arange(len(rows))
+            own.append(np.full(len(rows), block.manifold.dof))
+            count += len(rows)
+        leaving = 0
+        staying = []
+        for leaves in (True, False):
+            for block in blocks:
+                chosen = met[block.number] & (gone[block.number] == leaves) & ~alone[block.number]
+                rows = np.flatnonzero(chosen)
+                place[block.number][rows] = end + np.arange(len(rows)) * block.manifold.dof
+                end += len(rows) * block.manifold.dof
+                if not leaves:
+                    staying.append(rows)
+            leaving = end if leaves else leaving
+        return cls(place, landmark, np.concatenate(own), leaving, end, staying)
+
+
+def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: Masks, leaving: Masks) -> Masks:
+    """For every block which of its leaving variables share no residual with another such variable, most of them first."""
+    alone = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
+    for block in sorted(blocks, key=lambda b: -int(leaving[b.number].sum()) * b.manifold.dof):
+        candidates = leaving[block.number].copy()
+        alone[block.number] = candidates
+        for group, chosen in zip(groups, touched, strict=True):
+            if candidates.any() and chosen.any():
+                hits = [alone[c.block.number][c.rows] for c in group.connections]
+                shared = (np.sum(hits, axis=0) > 1) & chosen
+                for c in group.connections:
+                    if c.block is block:
+                        candidates[c.rows[shared]] = False
+    return alone
+
+
+def _packed(group: Group, chosen: NDArray[np.bool_], columns: Columns) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """[J, r] of the chosen residuals, one after the other, and of each: dim, the columns and dof of its slots, its landmark."""
+    rows = np.flatnonzero(chosen)
+    dofs = np.array([c.block.manifold.dof for c in group.connections])
+    data = np.empty((len(rows), group.residual.dim, int(dofs.sum()) + 1))
+    end = 0
+    for J in group.jacobians:
+        data[:, :, end : end + J.shape[2]] = J[rows]
+        end += J.shape[2]
+    data[:, :, end] = group.r[rows]
+    column = np.stack([columns.place[c.block.number][c.rows[rows]] for c in group.connections], axis=1)
+    landmark = np.max([columns.landmark[c.block.number][c.rows[rows]] for c in group.connections], axis=0)
+    return data.reshape(-1), [
+        np.full(len(rows), group.residual.dim),
+        np.full(len(rows), len(dofs)),
+        np.full(len(rows), data[0].size),
+        landmark,
+        column.reshape(-1),
+        np.tile(dofs, len(rows)),
+    ]
+
+
+def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """R (w, w + 1) of all rows without their landmarks, residuals in the last column, and (w,) the lengths of the columns."""
+    parts = [_packed(group, chosen, columns) for group, chosen in zip(groups, touched, strict=True) if chosen.any()]
+    triangle, squares = np.zeros((columns.width, columns.width + 1)), np.zeros(columns.width)
+    if parts and columns.width:
+        data = np.concatenate([part[0] for part in parts])
+        dim, slots, size, landmark, column, dof = (np.concatenate(a) for a in zip(*(part[1] for part in parts), strict=True))
+        # Residuals without a landmark follow the landmarks, each alone.
+        single = np.flatnonzero(landmark < 0)
+        landmark[single] = len(columns.own) + np.arange(len(single))
+        own = np.concatenate([columns.own, np.zeros(len(single), dtype=np.int64)])
+        slot = np.concatenate([[0], np.cumsum(slots)])
+        first = np.minimum.reduceat(np.where(column >= 0, column, columns.width), slot[:-1])
+        step = np.minimum(first * STEPS // columns.width, STEPS - 1)
+        residual = np.argsort(landmark * STEPS + (STEPS - 1 - step), kind="stable")
+        begin = np.concatenate([[0], np.cumsum(np.bincount(landmark, minlength=len(own)))])
+        rows = np.bincount(landmark, weights=dim, minlength=len(own))
+        reach = np.bincount(np.repeat(landmark, slots), weights=dof, minlength=len(own))
+        work = np.empty(int((rows * (np.minimum(reach, columns.width) + own + 1)).max()))
+        at = np.cumsum(size) - size
+        add_rows(data, at, dim, slot, column, dof, step, residual, begin, own, _RANK, work, squares, triangle)
+    return triangle, np.sqrt(squares)
+
+
+def prior_of(
+    triangle: NDArray[np.float64], lengths: NDArray[np.float64], leaving: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(J, r₀) of the staying columns after the first `leaving` are minimised over; as many rows as there is information."""
+    A = np.ascontiguousarray(triangle.T)
+    V = np.empty((TOGETHER, len(lengths)))
+    rank = eliminate_columns(A, *A.shape, leaving, lengths[:leaving].copy(), _RANK, np.empty(leaving, dtype=np.int64), V)
+    rest = np.ascontiguousarray(A[leaving:, rank:])
+    staying = len(lengths) - leaving
+    order = np.empty(staying, dtype=np.int64)
+    # Against what was measured, so that what cancelled does not come back as information.
+    rank = eliminate_columns(rest, *rest.shape, staying, lengths[leaving:].copy(), _RANK, order, V)
+    J = np.zeros((rank, staying))
+    J[:, order] = np.triu(rest[:staying, :rank].T)
+    return J, rest[staying, :rank].copy()
