@@ -64,8 +64,10 @@ def check_connections(residual: Residual, rows: Sequence[VariableRows], groups: 
     for role, connection in zip(residual.roles, rows, strict=True):
         meaning = _meaning(role)
         for name, other_role, other in used:
+            if meaning is None or other.block is not connection.block:
+                continue
             other_meaning = _meaning(other_role)
-            if other.block is not connection.block or None in (meaning, other_meaning) or meaning == other_meaning:
+            if other_meaning is None or meaning == other_meaning:
                 continue
             if len(np.intersect1d(other.rows, connection.rows)):
                 raise InputError(

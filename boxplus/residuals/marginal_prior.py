@@ -58,16 +58,19 @@ class MarginalPrior(Residual):
             )
         if not (np.isfinite(self.J).all() and np.isfinite(self.r0).all()):
             raise InputError("finite J and r0", "NaN or infinity", "marginalise where all residuals can be evaluated")
-        self.x0 = tuple(m.check(f"x0[{k}]", x)[0] for k, (m, x) in enumerate(zip(manifolds, x0, strict=True)))
         self.keeps_first_estimates = keeps_first_estimates
         ends = np.cumsum([m.dof for m in manifolds])
         self._columns = tuple(slice(int(end) - m.dof, int(end)) for end, m in zip(ends, manifolds, strict=True))
-        # Variables on one manifold are compared with their points all at once.
-        self._alike = [
-            (manifold, slots, np.stack([self.x0[k] for k in slots]), np.concatenate([np.r_[self._columns[k]] for k in slots]))
-            for manifold in dict.fromkeys(manifolds)
-            for slots in [[k for k, other in enumerate(manifolds) if other == manifold]]
-        ]
+        # Variables on one manifold are checked and compared with their points all at once.
+        points: dict[int, Array] = {}
+        self._alike = []
+        for manifold in dict.fromkeys(manifolds):
+            slots = [k for k, other in enumerate(manifolds) if other == manifold]
+            checked = manifold.check("x0", np.array([x0[k] for k in slots]))
+            points |= dict(zip(slots, checked, strict=True))
+            columns = np.concatenate([np.arange(ends[k] - manifold.dof, ends[k]) for k in slots])
+            self._alike.append((manifold, slots, checked, columns))
+        self.x0 = tuple(points[k] for k in range(len(manifolds)))
         rows = len(self.J)
         super().__init__(
             dim=rows,
