@@ -44,7 +44,7 @@ def joint(tree: BayesTree, selected: Sequence[VariableRows]) -> NDArray[np.float
 def _to_estimate(tree: BayesTree, rows: VariableRows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Numbers in the tree, and (k, dof, dof) from the tangents where variables are linearised to those at their estimates."""
     block = cast(GrowingVariables, rows.block)
-    ids, dof = block.ids[rows.rows], block.manifold.dof
+    ids, dof = block.numbers[rows.rows], block.manifold.dof
     delta = np.zeros((len(rows), dof))
     delta[ids >= 0] = tree.delta[tree.start[ids[ids >= 0]][:, None] + np.arange(dof)]
     return ids, np.asarray(block.manifold.boxplus_jacobian(block.points[rows.rows], delta))

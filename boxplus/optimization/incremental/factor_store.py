@@ -94,8 +94,8 @@ class RelativePoseStore:
         is_off = np.empty(len(rows), np.bool_)
         check_relative_poses(
             rows, self._is_spatial, self._is_exact, first.estimates, second.estimates, self._index, self._measured, self._factors,
-            self._loss.code, self._loss.scale, first.ids, second.ids, start, delta, tolerance, self._r, self._J_i, self._J_j,
-            is_off,
+            self._loss.code, self._loss.scale, first.numbers, second.numbers, start, delta, tolerance,
+            self._r, self._J_i, self._J_j, is_off,
         )  # fmt: skip
         return is_off
 
@@ -128,7 +128,7 @@ class GroupStore:
     ) -> NDArray[np.bool_]:
         self._group.evaluate([block.estimates for block in blocks], 1)
         is_off = np.empty(len(rows), np.bool_)
-        ids = tuple(blocks[c.block.number].ids for c in self._group.connections)
+        ids = tuple(blocks[c.block.number].numbers for c in self._group.connections)
         places = starts(rows, self._index, ids, start)
         errors(rows, rows, self._group.r, self._r, self._group.jacobians, places, delta, tolerance, is_off)
         return is_off

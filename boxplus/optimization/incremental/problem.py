@@ -158,7 +158,7 @@ class IncrementalProblem:
             check_connections(residual, rows, (), carry_over)
             label = name if name is not None else f"{kind.__name__}_{len(self._stores)}"
             group = Group(residual, rows, loss, label)
-            ids = np.stack([self.blocks[c.block.number].ids[c.rows] for c in group.connections], axis=1)
+            ids = np.stack([self.blocks[c.block.number].numbers[c.rows] for c in group.connections], axis=1)
             self._enter(len(self._stores), 0, ids)
             self._stores.append(GroupStore(group, ids >= 0))
 
@@ -178,7 +178,7 @@ class IncrementalProblem:
                     "select a variable for every residual",
                 )
             both[:, slot] = selected.rows
-        ids = np.stack([self.blocks[key[2]].ids[both[:, 0]], self.blocks[key[3]].ids[both[:, 1]]], axis=1)
+        ids = np.stack([self.blocks[key[2]].numbers[both[:, 0]], self.blocks[key[3]].numbers[both[:, 1]]], axis=1)
         store = self._stores[number]
         self._enter(number, store.append(residual, both, ids >= 0), ids)  # type: ignore[attr-defined]
 

@@ -21,14 +21,15 @@ class GrowingVariables(Variables):
         manifold, name, number: as of `Variables`.
         points: (capacity, size) where the variables are linearised; rows from `len(block)` on mean nothing.
         estimates: (capacity, size) points ⊞ δ.
-        ids: (capacity,) number of each variable in the tree, −1 where it is fixed.
+        numbers: (capacity,) number of each variable in the tree, −1 where it is fixed.
     """
 
     def __init__(self, number: int, name: str, manifold: Manifold) -> None:
         self.number, self.name, self.manifold = number, name, manifold
         self.points, self.estimates = np.zeros((0, manifold.size)), np.zeros((0, manifold.size))
-        self.ids = np.zeros(0, np.int64)
+        self.numbers = np.zeros(0, np.int64)
         self._count = 0
+        self.is_held, self.revision = None, 0  # nothing is held in part, and nothing ever removed
 
     def __len__(self) -> int:
         return self._count
@@ -37,9 +38,9 @@ class GrowingVariables(Variables):
         """More variables, with numbers in the tree from `first` on; None for fixed ones."""
         begin, end = self._count, self._count + len(values)
         self.points, self.estimates = grown(self.points, end), grown(self.estimates, end)
-        self.ids = grown(self.ids, end)
+        self.numbers = grown(self.numbers, end)
         self.points[begin:end] = self.estimates[begin:end] = values
-        self.ids[begin:end] = -1 if first is None else first + np.arange(len(values))
+        self.numbers[begin:end] = -1 if first is None else first + np.arange(len(values))
         self._count = end
 
     @property
@@ -50,4 +51,23 @@ class GrowingVariables(Variables):
     @property
     def is_fixed(self) -> NDArray[Any]:  # type: ignore[override]
         """(n,) bool."""
-        return np.asarray(self.ids[: self._count] < 0)
+        return np.asarray(self.numbers[: self._count] < 0)
+
+    @property
+    def ids(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """(n,) from 0 on, as nothing is ever removed."""
+        return np.arange(self._count)
+
+    @property
+    def next_id(self) -> int:  # type: ignore[override]
+        """The id of the next variable."""
+        return self._count
+
+    def rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """At which row each variable stands: its id."""
+        return ids.astype(np.uint32)
+
+    @property
+    def has_first_estimate(self) -> NDArray[np.bool_]:
+        """(n,) none: the tree is linearised at `points` as a whole."""
+        return np.zeros(self._count, dtype=np.bool_)
