@@ -24,25 +24,26 @@ STEPS = 4  # parts of the columns; rows that begin in a later one are kept apart
 @kernel(fastmath=True)
 def eliminate_columns(
     A: NDArray[np.float64],
-    columns_used: int,
+    X: NDArray[np.float64],
     rows_used: int,
-    count: int,
+    columns_used: int,
     lengths: NDArray[np.float64],
     least: float,
     order: NDArray[np.int64],
-    V: NDArray[np.float64],
+    W: NDArray[np.float64],
 ) -> np.int64:
-    """Bring the first `count` columns of a matrix to triangular form with pivoting, in place; returns their rank.
+    """Bring the columns A of [A X] to triangular form with pivoting, in place; returns their rank.
 
     Args:
-        A: (columns, rows), of which the first `columns_used` and `rows_used` are the matrix.
+        A: (count, rows), column by column, of which the first `rows_used` rows are the matrix.
+        X: (rows, columns), row by row, of which the first `rows_used` and `columns_used` are the matrix.
         lengths: (count,) of the columns as they were measured; permuted with the columns.
         least: share of its length below which what is left of a column is rounding.
         order: (count,) receives which column stands where.
-        V: (TOGETHER, rows) to work in.
+        W: (TOGETHER, columns) to work in.
     """
     columns, rows = np.uint64(columns_used), np.uint64(rows_used)
-    n, one = np.uint64(count), np.uint64(1)
+    n, one = np.uint64(A.shape[0]), np.uint64(1)
     for c in range(n):
         order[c] = c
     diagonal, factor = np.empty(min(n, rows)), np.empty(min(n, rows))
@@ -78,7 +79,7 @@ def eliminate_columns(
                 A[c, i] -= along * A[s, i]
         rank += one
     for s in range(np.uint64(0), rank, np.uint64(TOGETHER)):
-        _reflect(A, s, min(rank - s, np.uint64(TOGETHER)), n, columns, rows, factor, V)
+        _reflect(A, X, s, min(rank - s, np.uint64(TOGETHER)), rows, columns, factor, W)
     for s in range(rank):
         A[s, s] = diagonal[s]
         for i in range(s + one, rows):
@@ -89,38 +90,38 @@ def eliminate_columns(
 @kernel(fastmath=True)
 def _reflect(
     A: NDArray[np.float64],
+    X: NDArray[np.float64],
     s: np.uint64,
     count: np.uint64,
-    first: np.uint64,
-    columns: np.uint64,
     rows: np.uint64,
+    columns: np.uint64,
     factor: NDArray[np.float64],
-    V: NDArray[np.float64],
+    W: NDArray[np.float64],
 ) -> None:
-    """Apply the `count` reflections whose vectors stand in columns s … of A, three at most, to the columns from `first` on."""
-    length = rows - s
-    for k in range(np.uint64(TOGETHER)):
-        for i in range(length):
-            V[k, i] = A[s + k, s + i] if k < count and i >= k else 0.0
-    f0 = factor[s]
-    f1 = factor[s + np.uint64(1)] if count > np.uint64(1) else 0.0
-    f2 = factor[s + np.uint64(2)] if count > np.uint64(2) else 0.0
+    """Apply the `count` reflections whose vectors stand in columns s … of A, three at most, to X."""
+    two, three = count > np.uint64(1), count > np.uint64(2)
+    p, q = s + np.uint64(1), s + np.uint64(2)
+    f0, f1, f2 = factor[s], factor[p] if two else 0.0, factor[q] if three else 0.0
     c01, c02, c12 = 0.0, 0.0, 0.0
-    for i in range(length):
-        c01 += V[0, i] * V[1, i]
-        c02 += V[0, i] * V[2, i]
-        c12 += V[1, i] * V[2, i]
-    for c in range(first, columns):
-        w0, w1, w2 = 0.0, 0.0, 0.0
-        for i in range(length):
-            w0 += V[0, i] * A[c, s + i]
-            w1 += V[1, i] * A[c, s + i]
-            w2 += V[2, i] * A[c, s + i]
-        w0 *= f0
-        w1 = f1 * (w1 - w0 * c01)
-        w2 = f2 * (w2 - w0 * c02 - w1 * c12)
-        for i in range(length):
-            A[c, s + i] -= w0 * V[0, i] + w1 * V[1, i] + w2 * V[2, i]
+    for c in range(columns):
+        W[0, c], W[1, c], W[2, c] = 0.0, 0.0, 0.0
+    for i in range(s, rows):
+        v0, v1, v2 = A[s, i], A[p, i] if two and i >= p else 0.0, A[q, i] if three and i >= q else 0.0
+        c01 += v0 * v1
+        c02 += v0 * v2
+        c12 += v1 * v2
+        for c in range(columns):
+            W[0, c] += v0 * X[i, c]
+            W[1, c] += v1 * X[i, c]
+            W[2, c] += v2 * X[i, c]
+    for c in range(columns):
+        W[0, c] *= f0
+        W[1, c] = f1 * (W[1, c] - W[0, c] * c01)
+        W[2, c] = f2 * (W[2, c] - W[0, c] * c02 - W[1, c] * c12)
+    for i in range(s, rows):
+        v0, v1, v2 = A[s, i], A[p, i] if two and i >= p else 0.0, A[q, i] if three and i >= q else 0.0
+        for c in range(columns):
+            X[i, c] -= v0 * W[0, c] + v1 * W[1, c] + v2 * W[2, c]
 
 
 @kernel(fastmath=True, inline=True)
@@ -221,14 +222,8 @@ def add_rows(
     touched = np.empty(width, dtype=np.int64)
     lengths, order = np.empty(max(1, own.max())), np.empty(max(1, own.max()), dtype=np.int64)
     shares, position = np.empty_like(lengths), np.empty_like(order)
-    highest = 0
-    for landmark in range(len(own)):
-        height = 0
-        for e in range(begin[landmark], begin[landmark + 1]):
-            height += dim[residual[e]]
-        highest = max(highest, height)
-    V = np.empty((TOGETHER, highest))
-    B = np.zeros((STEPS, width + 1, BATCH))
+    W = np.empty((TOGETHER, width + 1))
+    B = np.zeros((STEPS, width + 1, BATCH + 8))  # columns apart by no power of two, which would share sets of the cache
     used = np.zeros(STEPS, dtype=np.int64)
     start = np.full(STEPS, width)
     for landmark in range(len(own)):
@@ -239,59 +234,58 @@ def add_rows(
             height += dim[n]
             for q in range(slot[n], slot[n + 1]):
                 if column[q] >= 0 and place[column[q]] < 0:
-                    place[column[q]] = k + 1 + count
+                    place[column[q]] = 1 + count
                     for j in range(dof[q]):
                         touched[count] = column[q] + j
                         count += 1
-        # Its own columns, the residuals, then the columns in the order in which they are met.
-        A = work[: (k + 1 + count) * height].reshape((k + 1 + count, height))
+        # Its own columns; the residuals, then the other columns in the order in which they are met.
+        A = work[: k * height].reshape((k, height))
+        X = work[k * height : (k + 1 + count) * height].reshape((height, 1 + count))
         lengths[:] = 0.0
         for c in range(k):
             position[c] = c
-        reach, rows, lowest = k + 1, 0, width
+        reach, rows, lowest = 1, 0, width
         e = begin[landmark]
         while e < begin[landmark + 1]:
             now = step[residual[e]]
-            kept = rows
+            kept, before = rows, reach
+            first = e
             while e < begin[landmark + 1] and step[residual[e]] == now:
                 n = residual[e]
+                rows += dim[n]
                 for q in range(slot[n], slot[n + 1]):
                     if column[q] >= 0:
                         lowest = min(lowest, column[q])
-                        end = place[column[q]] + dof[q]
-                        for c in range(reach, end):
-                            for i in range(rows):
-                                A[c, i] = 0.0
-                        reach = max(reach, end)
-                for c in range(reach):
-                    for i in range(rows, rows + dim[n]):
-                        A[c, i] = 0.0
+                        reach = max(reach, place[column[q]] + dof[q])
+                e += 1
+            A[:, kept:rows] = 0.0
+            X[:kept, before:reach] = 0.0
+            X[kept:rows, :reach] = 0.0
+            i = kept
+            for f in range(first, e):
+                n = residual[f]
                 source = at[n]
-                for i in range(rows, rows + dim[n]):
+                for _ in range(dim[n]):
                     for q in range(slot[n], slot[n + 1]):
                         if column[q] >= 0:
                             to = place[column[q]]
                             for j in range(dof[q]):
-                                A[to + j, i] += data[source + j]
+                                X[i, to + j] += data[source + j]
+                                squares[column[q] + j] += data[source + j] * data[source + j]
                         elif column[q] == OWN:
                             for j in range(k):
                                 A[position[j], i] += data[source + j]
                         source += dof[q]
-                    A[k, i] = data[source]
+                    X[i, 0] = data[source]
                     source += 1
-                rows += dim[n]
-                e += 1
-            for c in range(k):
-                for i in range(kept, rows):
-                    lengths[c] += A[c, i] * A[c, i]
-            for c in range(k + 1, reach):
-                for i in range(kept, rows):
-                    squares[touched[c - k - 1]] += A[c, i] * A[c, i]
+                    i += 1
             rank = 0
             if k > 0:
                 for c in range(k):
+                    for i in range(kept, rows):
+                        lengths[c] += A[c, i] * A[c, i]
                     shares[c] = math.sqrt(lengths[c])
-                rank = eliminate_columns(A, reach, rows, k, shares, least, order, V)
+                rank = eliminate_columns(A, X, rows, reach, shares, least, order, W)
                 for c in range(k):
                     shares[c] = lengths[order[c]]
                 lengths[:k] = shares[:k]
@@ -306,12 +300,12 @@ def add_rows(
                     merge_batch(B[now], start[now], used[now], triangle)
                     used[now] = 0
                 fresh, below = min(rows - done, BATCH - used[now]), used[now]
-                for c in range(k + 1, reach):
-                    to = touched[c - k - 1]
+                for c in range(1, reach):
+                    to = touched[c - 1]
                     for i in range(fresh):
-                        B[now, to, below + i] = A[c, done + i]
+                        B[now, to, below + i] = X[done + i, c]
                 for i in range(fresh):
-                    B[now, width, below + i] = A[k, done + i]
+                    B[now, width, below + i] = X[done + i, 0]
                 start[now] = min(start[now], lowest)
                 used[now] += fresh
                 done += fresh

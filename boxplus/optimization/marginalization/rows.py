@@ -90,24 +90,28 @@ def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: 
 
 
 def _packed(group: Group, chosen: NDArray[np.bool_], columns: Columns) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """[J, r] of the chosen residuals, one after the other, and of each: dim, the columns and dof of its slots, its landmark."""
+    """[J, r] of the chosen residuals, one after the other, and of each: dim, slots, size, landmark, first column, columns."""
     rows = np.flatnonzero(chosen)
+    count = len(rows)
     dofs = np.array([c.block.manifold.dof for c in group.connections])
     data = np.empty((len(rows), group.residual.dim, int(dofs.sum()) + 1))
     end = 0
     for J in group.jacobians:
-        data[:, :, end : end + J.shape[2]] = J[rows]
+        data[:, :, end : end + J.shape[2]] = J if count == len(chosen) else J[rows]
         end += J.shape[2]
     data[:, :, end] = group.r[rows]
     column = np.stack([columns.place[c.block.number][c.rows[rows]] for c in group.connections], axis=1)
     landmark = np.max([columns.landmark[c.block.number][c.rows[rows]] for c in group.connections], axis=0)
+    first = np.where(column >= 0, column, columns.width).min(axis=1)
     return data.reshape(-1), [
-        np.full(len(rows), group.residual.dim),
-        np.full(len(rows), len(dofs)),
-        np.full(len(rows), data[0].size),
+        np.full(count, group.residual.dim),
+        np.full(count, len(dofs)),
+        np.full(count, data[0].size),
         landmark,
+        first,
+        np.full(count, dofs.sum()),
         column.reshape(-1),
-        np.tile(dofs, len(rows)),
+        np.tile(dofs, count),
     ]
 
 
@@ -117,18 +121,19 @@ def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tu
     triangle, squares = np.zeros((columns.width, columns.width + 1)), np.zeros(columns.width)
     if parts and columns.width:
         data = np.concatenate([part[0] for part in parts])
-        dim, slots, size, landmark, column, dof = (np.concatenate(a) for a in zip(*(part[1] for part in parts), strict=True))
+        dim, slots, size, landmark, first, width, column, dof = (
+            np.concatenate(a) for a in zip(*(part[1] for part in parts), strict=True)
+        )
         # Residuals without a landmark follow the landmarks, each alone.
         single = np.flatnonzero(landmark < 0)
         landmark[single] = len(columns.own) + np.arange(len(single))
         own = np.concatenate([columns.own, np.zeros(len(single), dtype=np.int64)])
         slot = np.concatenate([[0], np.cumsum(slots)])
-        first = np.minimum.reduceat(np.where(column >= 0, column, columns.width), slot[:-1])
         step = np.minimum(first * STEPS // columns.width, STEPS - 1)
         residual = np.argsort(landmark * STEPS + (STEPS - 1 - step), kind="stable")
         begin = np.concatenate([[0], np.cumsum(np.bincount(landmark, minlength=len(own)))])
         rows = np.bincount(landmark, weights=dim, minlength=len(own))
-        reach = np.bincount(np.repeat(landmark, slots), weights=dof, minlength=len(own))
+        reach = np.bincount(landmark, weights=width, minlength=len(own))
         work = np.empty(int((rows * (np.minimum(reach, columns.width) + own + 1)).max()))
         at = np.cumsum(size) - size
         add_rows(data, at, dim, slot, column, dof, step, residual, begin, own, _RANK, work, squares, triangle)
@@ -139,14 +144,13 @@ def prior_of(
     triangle: NDArray[np.float64], lengths: NDArray[np.float64], leaving: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(J, r₀) of the staying columns after the first `leaving` are minimised over; as many rows as there is information."""
-    A = np.ascontiguousarray(triangle.T)
-    V = np.empty((TOGETHER, len(lengths)))
-    rank = eliminate_columns(A, *A.shape, leaving, lengths[:leaving].copy(), _RANK, np.empty(leaving, dtype=np.int64), V)
-    rest = np.ascontiguousarray(A[leaving:, rank:])
-    staying = len(lengths) - leaving
-    order = np.empty(staying, dtype=np.int64)
+    W = np.empty((TOGETHER, len(lengths) + 1))
+    A, X = np.ascontiguousarray(triangle[:, :leaving].T), triangle[:, leaving:].copy()
+    order = np.empty(len(lengths), dtype=np.int64)
+    rank = eliminate_columns(A, X, *X.shape, lengths[:leaving].copy(), _RANK, order, W)
+    A, r0 = np.ascontiguousarray(X[rank:, :-1].T), X[rank:, -1:].copy()
     # Against what was measured, so that what cancelled does not come back as information.
-    rank = eliminate_columns(rest, *rest.shape, staying, lengths[leaving:].copy(), _RANK, order, V)
-    J = np.zeros((rank, staying))
-    J[:, order] = np.triu(rest[:staying, :rank].T)
-    return J, rest[staying, :rank].copy()
+    rank = eliminate_columns(A, r0, *r0.shape, lengths[leaving:].copy(), _RANK, order, W)
+    J = np.zeros((rank, len(A)))
+    J[:, order[: len(A)]] = np.triu(A[:, :rank].T)
+    return J, r0[:rank, 0].copy()
