@@ -79,6 +79,35 @@ def _touched(mark: int, variables: Indices, first: int, end: int, adjacency: Ind
 
 
 @kernel
+def _near(mark: int, first: int, end: int, steps: int, adjacency: Indices, next_entry: Indices, factor_of: Indices,
+          factor_start: Indices, factor_variables: Indices, variable_mark: Indices, found: Indices) -> int:  # fmt: skip
+    """Variables of the factors from `first` on, and those that are up to `steps` factors away; returns their number."""
+    count = 0
+    for k in range(factor_start[first], factor_start[end]):
+        v = factor_variables[k]
+        if variable_mark[v] != mark:
+            variable_mark[v] = mark
+            found[count] = v
+            count += 1
+    begin = 0
+    for _ in range(steps):
+        reached = count
+        for n in range(begin, reached):
+            entry = adjacency[found[n]]
+            while entry != NONE:
+                f = factor_of[entry]
+                for k in range(factor_start[f], factor_start[f + 1]):
+                    v = factor_variables[k]
+                    if variable_mark[v] != mark:
+                        variable_mark[v] = mark
+                        found[count] = v
+                        count += 1
+                entry = next_entry[entry]
+        begin = reached
+    return count
+
+
+@kernel
 def _variables_of(factors: Indices, factor_start: Indices, factor_variables: Indices, seeds: Indices) -> None:
     used = 0
     for f in factors:
@@ -188,6 +217,15 @@ class BayesTree:
         found = np.empty(int((self._factor_start[factors + 1] - self._factor_start[factors]).sum()), np.int64)
         _variables_of(factors, self._factor_start, self._factor_variables, found)
         return found
+
+    def near_factors(self, first: int, steps: int) -> Indices:
+        """The variables of the factors from number `first` on, and those that are up to `steps` factors away from them."""
+        self._mark += 1
+        count = _near(
+            self._mark, first, self.factors, steps, self._adjacency, self._next_entry, self._factor_of, self._factor_start,
+            self._factor_variables, self._variable_mark, self._changed,
+        )  # fmt: skip
+        return self._changed[:count].copy()
 
     def is_touched(self, variables: Indices) -> NDArray[np.bool_]:
         """Whether variables have any factor."""
