@@ -42,11 +42,15 @@ from .optimization.marginalization.marginalize import marginalize as marginalize
 from .optimization.problem import Problem as Problem
 from .optimization.solution import Solution as Solution
 from .optimization.solver_options import SolverOptions as SolverOptions
+from .recordings.cameras.events import CameraRecording as CameraRecording
+from .recordings.cameras.open import open_camera_recording as open_camera_recording
+from .recordings.cameras.options import CameraRecordingOptions as CameraRecordingOptions
 from .recordings.open import open_recording as open_recording
 from .recordings.options import RecordingOptions as RecordingOptions
 from .recordings.recording import Recording as Recording
 from .runs.inspection.diagnosis import Diagnosis as Diagnosis
 from .runs.inspection.diagnosis import diagnose as diagnose
+from .sensors.camera_image import CameraImage as CameraImage
 from .sensors.image import Image as Image
 from .sensors.imu import ImuSamples as ImuSamples
 from .sensors.scan import Scan as Scan

@@ -1,3 +1,11 @@
+from .cameras.events import CameraEvent as CameraEvent
+from .cameras.events import CameraRecording as CameraRecording
+from .cameras.info import CalibratedCamera as CalibratedCamera
+from .cameras.info import CameraRecordingInfo as CameraRecordingInfo
+from .cameras.info import CameraStream as CameraStream
+from .cameras.info import ImuStream as ImuStream
+from .cameras.open import open_camera_recording as open_camera_recording
+from .cameras.options import CameraRecordingOptions as CameraRecordingOptions
 from .info import Evidence as Evidence
 from .info import PointTimeReading as PointTimeReading
 from .info import RecordingInfo as RecordingInfo

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from boxplus.recordings import point_time
-from boxplus.recordings.bag_probe import CLOUD_PARSERS, find_out, interval
+from boxplus.recordings.bag_probe import CLOUD_PARSERS, find_out
 from boxplus.recordings.clouds import coordinates, view_points
-from boxplus.recordings.container import Container
+from boxplus.recordings.container import Container, interval
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
 from boxplus.recordings.info import PointTimeReading, RecordingInfo
 from boxplus.recordings.messages import (
@@ -37,7 +37,7 @@ def open_bag(path: Path, options: RecordingOptions) -> Recording:
     except BaseException:
         container.close()
         raise
-    start_ns, stop_ns = interval(container, options)
+    start_ns, stop_ns = interval(container, options.start_s, options.duration_s)
 
     def read(tally: Tally) -> Iterator[Event]:
         return _events(container, info, options, start_ns, stop_ns, tally)

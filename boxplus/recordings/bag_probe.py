@@ -10,7 +10,7 @@ import numpy as np
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import point_time
 from boxplus.recordings.clouds import cloud_layout, view_points
-from boxplus.recordings.container import Channel, Container
+from boxplus.recordings.container import Channel, Container, interval, share
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
 from boxplus.recordings.messages import (
@@ -36,20 +36,6 @@ _PROBE_NS = 6_000_000_000
 _PROBE_SCANS = 30
 _SAME_CLOCK_S = 2.0
 _MOST_TRANSFORM_MESSAGES = 1000
-
-
-def interval(container: Container, options: RecordingOptions) -> tuple[int, int]:
-    """Reception times [start, stop) that the options ask for."""
-    start_ns = container.start_ns + round(options.start_s * 1e9)
-    if options.duration_s is None:
-        return start_ns, container.end_ns + 1
-    return start_ns, start_ns + round(options.duration_s * 1e9)
-
-
-def _share(container: Container, options: RecordingOptions) -> float:
-    """How much of the recording the options ask for, by time."""
-    start_ns, stop_ns = interval(container, options)
-    return max(min(stop_ns, container.end_ns) - start_ns, 0) / max(container.end_ns - container.start_ns, 1)
 
 
 @dataclass(slots=True)
@@ -82,7 +68,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
     evidence = [Evidence("file", "damaged", "warning", text) for text in container.damage]
     imu = _choose_imu(channels, options)
     clouds = _cloud_candidates(channels, options)
-    check_start(options, (container.end_ns - container.start_ns) * 1e-9)
+    check_start(options.start_s, (container.end_ns - container.start_ns) * 1e-9)
     cloud_probes, imu_probe, transforms = _probe(container, clouds, imu, options)
     lidar = _choose_lidar(clouds, cloud_probes, options)
     probe = cloud_probes[lidar.topic]
@@ -120,7 +106,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         format=container.format,
         topics=[Topic(channel.topic, channel.type, channel.count) for channel in container.channels],
         duration_s=(container.end_ns - container.start_ns) * 1e-9,
-        message_count=round((lidar.count + imu.count) * _share(container, options)),
+        message_count=round((lidar.count + imu.count) * share(container, options.start_s, options.duration_s)),
         lidar_topic=lidar.topic,
         imu_topic=imu.topic,
         lidar_frame=probe.frame,
@@ -190,7 +176,8 @@ def _cloud_candidates(channels: list[Channel], options: RecordingOptions) -> lis
         raise RecordingError(
             f"a LiDAR topic ({', '.join(CLOUD_PARSERS)})",
             f"topics {_listed(channels)}",
-            "raw packet topics must be converted to clouds by the LiDAR's driver first",
+            "raw packet topics must be converted to clouds by the LiDAR's driver first; "
+            "a recording of cameras without LiDAR is read by open_camera_recording",
         )
     return found
 
@@ -222,7 +209,7 @@ def _probe(
     samples = _ImuProbe()
     transforms: list[Transform] = []
     static = frozenset(c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static"))
-    start_ns, stop_ns = interval(container, options)
+    start_ns, stop_ns = interval(container, options.start_s, options.duration_s)
     first_ns: int | None = None
     for channel, received_ns, data in container.messages(frozenset(probes) | {imu.topic} | static, start_ns, stop_ns):
         first_ns = received_ns if first_ns is None else first_ns

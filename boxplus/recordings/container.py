@@ -58,3 +58,17 @@ def foreign_errors() -> tuple[type[Exception], ...]:
         except ImportError:
             continue
     return tuple(errors)
+
+
+def interval(container: Container, start_s: float, duration_s: float | None) -> tuple[int, int]:
+    """Reception times [start, stop) of a stretch that begins `start_s` after the start; without a duration up to the end."""
+    start_ns = container.start_ns + round(start_s * 1e9)
+    if duration_s is None:
+        return start_ns, container.end_ns + 1
+    return start_ns, start_ns + round(duration_s * 1e9)
+
+
+def share(container: Container, start_s: float, duration_s: float | None) -> float:
+    """How much of the recording such a stretch is, by time."""
+    start_ns, stop_ns = interval(container, start_s, duration_s)
+    return max(min(stop_ns, container.end_ns) - start_ns, 0) / max(container.end_ns - container.start_ns, 1)

@@ -61,10 +61,10 @@ def read_gyro_unit(gyro: NDArray[np.float64], options: RecordingOptions) -> tupl
     if given is not None:
         if given == "rad/s" and beyond:
             return given, Evidence("gyro_unit", given, "warning", f"given, but {seen}: check --gyro-unit")
-        return given, Evidence("gyro_unit", given, "ok", "given; 'boxplus inspect' compares with the LiDAR")
+        return given, Evidence("gyro_unit", given, "ok", "given; 'boxplus inspect' compares with the LiDAR or the cameras")
     if beyond:
         return "deg/s", Evidence("gyro_unit", "deg/s", "ok", seen)
-    text = "by the message's definition; 'boxplus inspect' compares with the LiDAR"
+    text = "by the message's definition; 'boxplus inspect' compares with the LiDAR or the cameras"
     return "rad/s", Evidence("gyro_unit", "rad/s", "ok", text)
 
 

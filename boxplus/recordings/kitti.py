@@ -51,7 +51,7 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
     imu = _sensor_files(path / "oxts", ".txt")
     first = int(min(scans.start_ns.min(), imu.time_ns.min()))
     last = int(max(scans.end_ns.max(), imu.time_ns.max()))
-    check_start(options, (last - first) * 1e-9)
+    check_start(options.start_s, (last - first) * 1e-9)
     T_imu_lidar, source = _calibration(path)
     evidence = [_point_time_evidence(scans, options, path / "velodyne_points")]
     for name, files in (("velodyne_points", scans), ("oxts", imu)):

@@ -20,7 +20,7 @@ class MalformedMessageError(ValueError):
     """The bytes of a message do not have the form its type declares."""
 
 
-class _Cursor:
+class Cursor:
     """Reads the primitive values of a serialised message one after the other.
 
     CDR aligns each value to its own size, counted from the end of the 4-byte encapsulation header, and has either byte
@@ -127,7 +127,7 @@ _LIVOX_POINT_BYTES = 19
 
 def parse_point_cloud(data: bytes, encoding: Encoding) -> CloudMessage:
     """sensor_msgs/PointCloud2. Raises MalformedMessageError."""
-    cursor = _Cursor(data, encoding)
+    cursor = Cursor(data, encoding)
     stamp_ns, frame = cursor.header()
     height, width = cursor.values("I", 2)
     field_count = cursor.value("I")
@@ -150,7 +150,7 @@ def parse_livox(data: bytes, encoding: Encoding) -> CloudMessage:
 
     ROS 1 packs a point into 19 bytes; CDR aligns every point to 4 bytes, so it takes 20, the last one 19.
     """
-    cursor = _Cursor(data, encoding)
+    cursor = Cursor(data, encoding)
     stamp_ns, frame = cursor.header()
     cursor.values("Q")  # timebase: the sensor's own clock; header.stamp is the same instant in the clock of the IMU
     declared = cursor.value("I")
@@ -165,7 +165,7 @@ def parse_livox(data: bytes, encoding: Encoding) -> CloudMessage:
 
 def parse_imu(data: bytes, encoding: Encoding) -> tuple[int, str, tuple[float, ...], tuple[float, ...]]:
     """sensor_msgs/Imu: (stamp [ns], frame, angular velocity, linear acceleration). Raises MalformedMessageError."""
-    cursor = _Cursor(data, encoding)
+    cursor = Cursor(data, encoding)
     stamp_ns, frame = cursor.header()
     numbers = cursor.values("d", 4 + 9 + 3 + 9 + 3)  # orientation, its covariance, gyro, its covariance, acceleration
     return stamp_ns, frame, numbers[13:16], numbers[25:28]
@@ -173,7 +173,7 @@ def parse_imu(data: bytes, encoding: Encoding) -> tuple[int, str, tuple[float, .
 
 def parse_transforms(data: bytes, encoding: Encoding) -> list[tuple[str, str, NDArray[np.float64]]]:
     """tf2_msgs/TFMessage: (parent, child, translation and xyzw quaternion (7,)) each. Raises MalformedMessageError."""
-    cursor = _Cursor(data, encoding)
+    cursor = Cursor(data, encoding)
     transforms = []
     for _ in range(cursor.value("I")):
         _, parent = cursor.header()

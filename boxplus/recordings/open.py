@@ -44,5 +44,5 @@ def _open(path: Path, options: RecordingOptions) -> Recording:
     raise RecordingError(
         "a ROS 1 bag (.bag), a ROS 2 folder or file (.mcap, .db3), a KITTI raw folder (velodyne_points/, oxts/) or a pcap",
         f"{path.name}",
-        "convert the recording, or push arrays from Python (boxplus.sensors)",
+        "convert the recording, or push arrays from Python (boxplus.sensors); cameras are read by open_camera_recording",
     )

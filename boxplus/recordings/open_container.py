@@ -29,7 +29,7 @@ def open_container(path: Path) -> Container:
             raise RecordingError(
                 "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
                 f"{path.name} with {', '.join(sorted(file.name for file in path.iterdir())[:5]) or 'nothing in it'}",
-                "give the folder that holds them; of ROS 1 bags give one file",
+                "give the folder that holds them; of ROS 1 bags give one file; folders of images are for open_camera_recording",
             )
     try:
         return IndexedContainer(path, files)

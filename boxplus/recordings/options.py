@@ -50,11 +50,11 @@ class RecordingOptions(BaseModel):
     duration_s: float | None = Field(default=None, gt=0.0, description="read at most this much [s]")
 
 
-def check_start(options: RecordingOptions, duration_s: float) -> None:
-    """Raise RecordingError when the options skip a whole recording of this duration."""
-    if options.start_s >= duration_s > 0.0:
+def check_start(start_s: float, duration_s: float) -> None:
+    """Raise RecordingError when the start skips a whole recording of this duration."""
+    if start_s >= duration_s > 0.0:
         raise RecordingError(
             f"a start within the recording, which ends after {duration_s:.3f} s",
-            f"--start {options.start_s:g}",
+            f"--start {start_s:g}",
             "skip less of it",
         )

@@ -121,7 +121,7 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
             f"{path.name}: {reason}",
             f"check that {metadata.name} is whole and belongs to it",
         ) from error
-    check_start(options, (last_ns - first_ns) * 1e-9)
+    check_start(options.start_s, (last_ns - first_ns) * 1e-9)
     T_sensor_imu = np.array(sensor.imu_to_sensor_transform, dtype=np.float64)
     T_imu_lidar = np.eye(4)
     T_imu_lidar[:3, :3] = T_sensor_imu[:3, :3].T
@@ -208,7 +208,7 @@ def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
             f"neither with {path.name}",
             "put the sensor's metadata beside an Ouster capture, under a name the capture's begins with; convert others to a bag",
         )
-    check_start(options, stamps[1] - stamps[0])
+    check_start(options.start_s, stamps[1] - stamps[0])
     evidence = [
         Evidence("imu_topic", "none", "error", "a Velodyne capture holds no IMU: for odometry, record both in one bag"),
         Evidence(

@@ -6,7 +6,9 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
+from typing import Generic, Protocol, Self, TypeVar
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, RecordingInfo
@@ -38,32 +40,40 @@ class Tally:
             self.rejected[f"points: {reason}"] += count
 
 
-class Recording:
-    """An opened recording. Iterating yields its scans and IMU samples in the order of the file, in constant memory.
+class _Info(Protocol):
+    """What any recording says of itself."""
 
-    Every iteration starts at the beginning and resets the counters. Times are those of the messages' stamps; neither their
-    order nor gaps are touched, that is the sequencer's business.
+    path: Path
+    message_count: int
+    evidence: list[Evidence]
+
+
+InfoT = TypeVar("InfoT", bound=_Info)
+EventT = TypeVar("EventT")
+
+
+class EventStream(Generic[InfoT, EventT]):
+    """An opened file or folder that yields events in constant memory; every iteration starts at the beginning.
 
     Attributes:
         info: what the recording contains, how it is read, and why.
     """
 
-    def __init__(self, info: RecordingInfo, read: Callable[[Tally], Iterator[Event]], close: Callable[[], None]) -> None:
+    delivers = "events"
+
+    def __init__(self, info: InfoT, read: Callable[[Tally], Iterator[EventT]], close: Callable[[], None]) -> None:
         self.info = info
         self._read = read
         self._close = close
         self._tally = Tally()
         self._finished = False
-        self._lidar_shift_ns = 0
 
-    def shift_lidar(self, offset_s: float) -> None:
-        """Add this to all times of the LiDAR from the next iteration on [s]; `info.evidence` says so."""
-        self._lidar_shift_ns = round(offset_s * 1e9)
-        text = "given; added to all times of the LiDAR, to bring them to the IMU's clock"
-        self.info.evidence.append(Evidence("lidar_time_offset", f"{offset_s * 1e3:+.1f} ms", "ok", text))
+    def _taken(self, event: EventT, tally: Tally) -> EventT:
+        """The event as it is handed on; what is counted of it is."""
+        return event
 
-    def events(self) -> Iterator[Event]:
-        """Scans and blocks of IMU samples in file order. What cannot be read is counted in `rejected` and logged.
+    def events(self) -> Iterator[EventT]:
+        """The events. What cannot be read is counted in `rejected` and logged.
 
         Raises:
             RecordingError: nothing at all could be read.
@@ -73,22 +83,18 @@ class Recording:
         seen = 0
         for event in self._read(tally):
             seen += 1
-            if isinstance(event, Scan):
-                tally.count_scan(event)
-                if self._lidar_shift_ns:
-                    event = event.shifted(self._lidar_shift_ns)
-            yield event
+            yield self._taken(event, tally)
         self._finished = True
         self._report_damage(tally)
         if not seen:
             reasons = ", ".join(f"{count} {reason}" for reason, count in tally.rejected.items()) or "; ".join(tally.damage)
             raise RecordingError(
-                "scans and IMU samples",
+                self.delivers,
                 f"none in {self.info.path.name} ({reasons or 'no messages'})",
                 "inspect the file with 'boxplus inspect'",
             )
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[EventT]:
         return self.events()
 
     @property
@@ -115,8 +121,35 @@ class Recording:
         """Release the files."""
         self._close()
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+class Recording(EventStream[RecordingInfo, Event]):
+    """An opened recording. Iterating yields its scans and blocks of IMU samples in the order of the file, in constant memory.
+
+    Every iteration starts at the beginning and resets the counters. Times are those of the messages' stamps; neither their
+    order nor gaps are touched, that is the sequencer's business.
+    """
+
+    delivers = "scans and IMU samples"
+
+    def __init__(self, info: RecordingInfo, read: Callable[[Tally], Iterator[Event]], close: Callable[[], None]) -> None:
+        super().__init__(info, read, close)
+        self._lidar_shift_ns = 0
+
+    def shift_lidar(self, offset_s: float) -> None:
+        """Add this to all times of the LiDAR from the next iteration on [s]; `info.evidence` says so."""
+        self._lidar_shift_ns = round(offset_s * 1e9)
+        text = "given; added to all times of the LiDAR, to bring them to the IMU's clock"
+        self.info.evidence.append(Evidence("lidar_time_offset", f"{offset_s * 1e3:+.1f} ms", "ok", text))
+
+    def _taken(self, event: Event, tally: Tally) -> Event:
+        if isinstance(event, Scan):
+            tally.count_scan(event)
+            if self._lidar_shift_ns:
+                return event.shifted(self._lidar_shift_ns)
+        return event

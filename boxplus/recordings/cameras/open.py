@@ -1,0 +1,48 @@
+"""Which reader a camera recording goes to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.cameras.bag import open_camera_bag
+from boxplus.recordings.cameras.euroc import is_euroc, open_euroc
+from boxplus.recordings.cameras.events import CameraRecording
+from boxplus.recordings.cameras.options import CameraRecordingOptions
+
+
+def open_camera_recording(path: str | Path, options: CameraRecordingOptions | None = None) -> CameraRecording:
+    """Open a recording of cameras: a bag, a EuRoC folder, or a folder of images named by their time.
+
+    The format is found from the content. Calibration is taken from the recording and from `options.calibration`; the source
+    of each number is in `info`, and what is not known is None there, with the reason, never guessed.
+
+    Args:
+        path: file or folder.
+        options: what is decided by the user; the rest is found.
+
+    Raises:
+        RecordingError: no such file, unknown format, no images, OpenCV is needed and not installed, unreadable.
+        AmbiguityError: two readings fit; the message names the option that decides.
+
+    Example:
+        >>> with open_camera_recording("MH_01_easy") as recording:   # doctest: +SKIP
+        ...     camera = recording.info.cameras[0].calibrated()
+        ...     for event in recording:
+        ...         if isinstance(event, CameraImage): ...
+    """
+    options = options or CameraRecordingOptions()
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError("a recording", f"no file or folder {path}", "check the path")
+    if path.is_dir() and is_euroc(path):
+        return open_euroc(path, options)
+    if path.suffix.lower() in (".bag", ".mcap", ".db3", ".active") or (
+        path.is_dir() and any(file.suffix in (".mcap", ".db3") for file in path.iterdir())
+    ):
+        return open_camera_bag(path, options)
+    raise RecordingError(
+        "a ROS bag or MCAP, a EuRoC folder (mav0/cam0), or a folder with cam0/<time [ns]>.png",
+        f"{path.name}",
+        "convert the recording",
+    )
