@@ -130,7 +130,7 @@ def camera_model(
     Raises:
         RecordingError: numbers that do not fit the model.
     """
-    coefficients = list(coefficients)
+    intrinsics, coefficients = [float(value) for value in intrinsics], [float(value) for value in coefficients]
     try:
         if projection == "pinhole" and len(intrinsics) == 4:
             fx, fy, cx, cy = intrinsics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
@@ -41,6 +41,7 @@ class ImageFiles:
         stated: what the format's files say of the calibration.
         depth_unit_m, depth_unit_source: of depth images.
         convert: applied to the pixels after decoding.
+        registered_to: the intensity camera in whose pixels the depths lie; its calibration is theirs.
     """
 
     name: str
@@ -52,6 +53,7 @@ class ImageFiles:
     depth_unit_m: float | None = None
     depth_unit_source: str = ""
     convert: Callable[[Pixels], Pixels] | None = None
+    registered_to: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,10 +142,12 @@ def _found(layout: Layout, options: CameraRecordingOptions) -> tuple[list[FoundC
         if rig.noise is not None:
             noise, noise_source = rig.noise, options.calibration.name
     count = sum(images.kind == "intensity" for images in layout.images)
-    found = []
+    found: list[FoundCamera] = []
     for images in layout.images:
         stated = [*images.stated]
-        if options.calibration is not None and (images.kind == "intensity" or images.name in given):
+        if images.registered_to:
+            stated += _of_registered(images.registered_to, found, layout.imu is not None)
+        elif options.calibration is not None and (images.kind == "intensity" or images.name in given):
             stated = stated_for(given, images.name, count, options.calibration.name) + stated
         unit, unit_source = images.depth_unit_m, images.depth_unit_source
         if images.kind == "depth" and options.depth_unit_m is not None:
@@ -162,6 +166,14 @@ def _found(layout: Layout, options: CameraRecordingOptions) -> tuple[list[FoundC
             )
         )
     return found, noise, noise_source
+
+
+def _of_registered(name: str, found: Sequence[FoundCamera], has_imu: bool) -> list[StatedCamera]:
+    """The calibration of the camera `name` for depths that are registered to it."""
+    same = [replace(c, source=f"{c.source} (of {name})") for camera in found if camera.name == name for c in camera.stated]
+    if not has_imu and found and found[0].name == name and all(camera.T_body_camera is None for camera in same):
+        same.append(StatedCamera(f"the format's definition, registered to {name}", T_body_camera=np.eye(4)))
+    return same
 
 
 def _first_size(images: ImageFiles) -> tuple[int, int]:

@@ -8,11 +8,13 @@ from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.bag import open_camera_bag
 from boxplus.recordings.cameras.euroc import is_euroc, open_euroc
 from boxplus.recordings.cameras.events import CameraRecording
+from boxplus.recordings.cameras.numbered import is_kitti_odometry, is_seven_scenes, open_kitti_odometry, open_seven_scenes
 from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.recordings.cameras.tum import is_tum, open_tum
 
 
 def open_camera_recording(path: str | Path, options: CameraRecordingOptions | None = None) -> CameraRecording:
-    """Open a recording of cameras: a bag, a EuRoC folder, or a folder of images named by their time.
+    """Open a recording of cameras: a bag, a folder of EuRoC, TUM RGB-D, KITTI odometry or 7-Scenes.
 
     The format is found from the content. Calibration is taken from the recording and from `options.calibration`; the source
     of each number is in `info`, and what is not known is None there, with the reason, never guessed.
@@ -37,12 +39,19 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         raise RecordingError("a recording", f"no file or folder {path}", "check the path")
     if path.is_dir() and is_euroc(path):
         return open_euroc(path, options)
+    if path.is_dir() and is_tum(path):
+        return open_tum(path, options)
+    if path.is_dir() and is_kitti_odometry(path):
+        return open_kitti_odometry(path, options)
+    if path.is_dir() and is_seven_scenes(path):
+        return open_seven_scenes(path, options)
     if path.suffix.lower() in (".bag", ".mcap", ".db3", ".active") or (
         path.is_dir() and any(file.suffix in (".mcap", ".db3") for file in path.iterdir())
     ):
         return open_camera_bag(path, options)
     raise RecordingError(
-        "a ROS bag or MCAP, a EuRoC folder (mav0/cam0), or a folder with cam0/<time [ns]>.png",
+        "a ROS bag or MCAP, a EuRoC folder (mav0/cam0), a folder with cam0/<time [ns]>.png, a TUM RGB-D folder (rgb.txt), a "
+        "KITTI odometry sequence (image_0, calib.txt), or a 7-Scenes sequence (frame-000000.color.png)",
         f"{path.name}",
         "convert the recording",
     )
