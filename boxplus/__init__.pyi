@@ -5,6 +5,8 @@ from . import residuals as residuals
 from .cameras.distortion import Radial as Radial
 from .cameras.distortion import RadialTangential as RadialTangential
 from .cameras.pinhole import Pinhole as Pinhole
+from .cameras.wide_angle import DoubleSphere as DoubleSphere
+from .cameras.wide_angle import Equidistant as Equidistant
 from .errors import AmbiguityError as AmbiguityError
 from .errors import BoxplusError as BoxplusError
 from .errors import InputError as InputError

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds._batch import as_batch
 
 INTRINSICS = 9  # numbers of the longest model
+PINHOLE = 0
+"""Code of this model; those of others are in `projection`."""
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
@@ -136,6 +139,8 @@ class Pinhole:
         InputError: a number is not finite, a focal length not positive, `z_min` negative.
     """
 
+    code: ClassVar[int] = PINHOLE
+
     fx: float
     fy: float
     cx: float
@@ -161,6 +166,11 @@ class Pinhole:
         """The intrinsics as a vector: [fx, fy, cx, cy] and the coefficients of the distortion, (4,), (6,), (8,) or (9,)."""
         coefficients = () if self.distortion is None else self.distortion.coefficients
         return np.array([self.fx, self.fy, self.cx, self.cy, *coefficients])
+
+    @property
+    def nearest(self) -> float:
+        """`z_min`: how near a point may be; other models measure it by distance [m]."""
+        return self.z_min
 
     @property
     def padded_parameters(self) -> NDArray[np.float64]:
@@ -238,6 +248,14 @@ class Pinhole:
         rays[valid, 2] = 1.0
         points = rays.reshape((*lead, 3)) * np.asarray(depth, dtype=np.float64)[..., None]
         return points, valid.reshape(lead)
+
+    def bearings(self, pixels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Unit vectors (..., 3) in the camera frame that are seen at pixels (..., 2), and whether each was found (...).
+
+        As `unproject`.
+        """
+        rays, valid = self.unproject(pixels)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True), valid
 
     def undistort(self, pixels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Pixels (..., 2) as the same camera without distortion sees them, and whether each was found, as `unproject`."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.cameras import CameraModel
 from boxplus.recordings.cameras.calibration import THIS_IS_THE_BODY, StatedCamera, camera_model
-from boxplus.recordings.cameras.info import CameraModel
 from boxplus.recordings.cameras.messages import INFO_TYPE, InfoMessage, parse_camera_info
 from boxplus.recordings.container import Channel, Container
 from boxplus.recordings.messages import MalformedMessageError, parse_transforms

@@ -16,9 +16,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from boxplus.cameras import Pinhole, RadialTangential
+from boxplus.cameras import CameraModel, DoubleSphere, Equidistant, Pinhole, RadialTangential
 from boxplus.errors import InputError, RecordingError
-from boxplus.recordings.cameras.info import CameraModel
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 
 _ROTATION_ERROR = 1e-3
@@ -141,6 +140,11 @@ def camera_model(
                     k1, k2, p1, p2 = coefficients[:4]
                     k3 = coefficients[4] if len(coefficients) == 5 and coefficients[4] else None
                     return Pinhole(fx, fy, cx, cy, RadialTangential(k1, k2, p1, p2, k3)), ""
+            if distortion in ("equidistant", "fisheye", "kannala-brandt") and len(coefficients) == 4:
+                return Equidistant(fx, fy, cx, cy, *coefficients), ""
+        if projection == "ds" and len(intrinsics) == 6 and distortion in ("none", "None", "") and not any(coefficients):
+            xi, alpha, fx, fy, cx, cy = intrinsics
+            return DoubleSphere(fx, fy, cx, cy, xi, alpha), ""
     except InputError as error:
         raise RecordingError(error.expected, error.got, "check the calibration") from None
     text = f"{len(intrinsics)} intrinsics of {projection!r} with {len(coefficients)} coefficients of {distortion!r}"

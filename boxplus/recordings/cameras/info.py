@@ -10,13 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.cameras import Pinhole
+from boxplus.cameras import CameraModel
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, Topic
 from boxplus.recordings.options import AccelUnit, GyroUnit
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 
-CameraModel = Pinhole
 ImageKind = Literal["intensity", "depth"]
 
 

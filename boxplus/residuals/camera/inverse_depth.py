@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
-from boxplus.cameras.pinhole import Pinhole, project_point
+from boxplus.cameras.model import CameraModel
+from boxplus.cameras.projection import project_any
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
@@ -104,8 +105,9 @@ def _inverse_depth(
     points: NDArray[np.float64],
     point_of: NDArray[np.uint32],
     pixels: NDArray[np.float64],
+    code: int,
     c: NDArray[np.float64],
-    z_min: float,
+    nearest: float,
     r: NDArray[np.float64],
     J_anchor: NDArray[np.float64],
     J_observer: NDArray[np.float64],
@@ -122,9 +124,12 @@ def _inverse_depth(
         x = R[0] * m0 + R[1] * m1 + R[2] + rho * tx
         y = R[3] * m0 + R[4] * m1 + R[5] + rho * ty
         z = R[6] * m0 + R[7] * m1 + R[8] + rho * tz
-        # Written so that a NaN passes on into the residual, where it is seen and named.
-        valid[n] = not z <= z_min * rho
-        if z <= z_min * rho:
+        # A NaN passes on into the residual, where it is seen and named.
+        seen, u, v, p00, p01, p02, p10, p11, p12 = project_any(
+            code, with_jacobians, x, y, z, nearest * rho, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+        )
+        valid[n] = seen
+        if not seen:
             r[n, 0] = 0.0
             r[n, 1] = 0.0
             if with_jacobians:
@@ -132,7 +137,6 @@ def _inverse_depth(
                 J_observer[n] = 0.0
                 J_point[n] = 0.0
             continue
-        u, v, p00, p01, p02, p10, p11, p12 = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
         r[n, 0] = pixels[n, 0] - u
         r[n, 1] = pixels[n, 1] - v
         if with_jacobians:
@@ -146,7 +150,7 @@ class InverseDepthReprojection(ImageResidual):
     """Points by bearing and inverse depth in an anchor camera, seen in cameras, as derived in the head of this file.
 
     Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera; `bearing_rho` on `Euclidean(3)`,
-    [X/Z, Y/Z, 1/Z] of the point in the anchor [1, 1, 1/m], which `Pinhole.unproject` gives from the anchor's pixel.
+    [X/Z, Y/Z, 1/Z] of the point in the anchor [1, 1, 1/m], which `camera.unproject` gives from the anchor's pixel.
 
     Every point wants the pixel in its anchor as well, as an observation in which both poses are the anchor's: without it
     nothing ties the bearing to what the anchor saw.
@@ -162,7 +166,7 @@ class InverseDepthReprojection(ImageResidual):
 
     def __init__(
         self,
-        camera: Pinhole,
+        camera: CameraModel,
         pixels: ArrayLike,
         *,
         sigma: ArrayLike | None = None,
@@ -192,6 +196,6 @@ class InverseDepthReprojection(ImageResidual):
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _inverse_depth(
-            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self._parameters, self.camera.z_min,
-            r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.camera.code,
+            self._parameters, self.camera.nearest, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
         )  # fmt: skip

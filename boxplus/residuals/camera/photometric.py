@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats
+from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
@@ -64,7 +65,7 @@ class Photometric(Residual):
 
     Raises:
         InputError: wrong shapes or values that are not finite; a pixel of a patch outside of image 1; a depth that is not
-            positive; intrinsics as variables of a camera with distortion.
+            positive; intrinsics as variables of a camera with distortion; a camera that is no pinhole.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Photometric(Residual):
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
-        self.camera = camera
+        self.camera = camera = check_pinhole(camera, "photometric residuals")
         self.image_2 = checked_image("image_2", image_2)
         self.pixels_1 = _checked_patches(pixels_1, pattern)
         count, dim = self.pixels_1.shape[:2]

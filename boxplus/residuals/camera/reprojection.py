@@ -9,7 +9,8 @@ Jacobians, with P = ∂π/∂X' and R = R_camera_world:
     ∂e/∂[w, v] = −P [−[X']× I]   T_camera_world on the left, T ← Exp([w, v]) T
     ∂e/∂p_world = −P R
 
-Singular: a depth X'_z ≤ z_min of the camera (0.05 m) is invalid and never projected.
+Singular: a depth X'_z ≤ z_min of the camera (0.05 m) is invalid and never projected; in a camera of wide angle, a distance up
+to `nearest` and a direction in which its formula does not hold.
 
 Source: SPEC.md 3.1 to 3.3.
 """
@@ -21,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus._numbers import as_floats
-from boxplus.cameras.pinhole import Pinhole, project_point
+from boxplus.cameras.model import CameraModel
+from boxplus.cameras.projection import project_any
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
@@ -76,8 +78,9 @@ def _reprojection(
     points: NDArray[np.float64],
     point_of: NDArray[np.uint32],
     pixels: NDArray[np.float64],
+    code: int,
     c: NDArray[np.float64],
-    z_min: float,
+    nearest: float,
     r: NDArray[np.float64],
     J_pose: NDArray[np.float64],
     J_point: NDArray[np.float64],
@@ -91,16 +94,18 @@ def _reprojection(
         x = R[0] * px + R[1] * py + R[2] * pz + poses[i, 4]
         y = R[3] * px + R[4] * py + R[5] * pz + poses[i, 5]
         z = R[6] * px + R[7] * py + R[8] * pz + poses[i, 6]
-        # Written so that a NaN passes on into the residual, where it is seen and named.
-        valid[n] = not z <= z_min
-        if z <= z_min:
+        # A NaN passes on into the residual, where it is seen and named.
+        seen, u, v, p00, p01, p02, p10, p11, p12 = project_any(
+            code, with_jacobians, x, y, z, nearest, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+        )
+        valid[n] = seen
+        if not seen:
             r[n, 0] = 0.0
             r[n, 1] = 0.0
             if with_jacobians:
                 J_pose[n] = 0.0
                 J_point[n] = 0.0
             continue
-        u, v, p00, p01, p02, p10, p11, p12 = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
         r[n, 0] = pixels[n, 0] - u
         r[n, 1] = pixels[n, 1] - v
         if with_jacobians:
@@ -140,7 +145,7 @@ class Reprojection(ImageResidual):
 
     def __init__(
         self,
-        camera: Pinhole,
+        camera: CameraModel,
         pixels: ArrayLike,
         *,
         sigma: ArrayLike | None = None,
@@ -170,6 +175,6 @@ class Reprojection(ImageResidual):
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _reprojection(
-            begin, end, x[0], index[0], x[1], index[1], self.pixels, self._parameters, self.camera.z_min,
-            r, jacobians[0], jacobians[1], valid, with_jacobians,
+            begin, end, x[0], index[0], x[1], index[1], self.pixels, self.camera.code,
+            self._parameters, self.camera.nearest, r, jacobians[0], jacobians[1], valid, with_jacobians,
         )  # fmt: skip

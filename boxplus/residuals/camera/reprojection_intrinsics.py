@@ -8,9 +8,9 @@ Jacobians: those of `reprojection` by pose and point, and with the distorted nor
 
     ∂e/∂[fx, fy, cx, cy] = −[[ũ, 0, 1, 0], [0, ṽ, 0, 1]]
 
-and −∂π/∂k likewise, as `boxplus.cameras.pinhole.intrinsics_jacobian` writes them out.
+and −∂π/∂k likewise, as `boxplus.cameras.projection.intrinsics_jacobian_any` writes them out, for cameras of wide angle too.
 
-Singular: a depth X'_z ≤ z_min of the camera (0.05 m) is invalid and never projected.
+Singular: as `reprojection`.
 
 Source: SPEC.md 3.1 to 3.4.
 """
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
-from boxplus.cameras.distortion import distort
-from boxplus.cameras.pinhole import Pinhole, intrinsics_jacobian, project_point
+from boxplus.cameras.model import CameraModel
+from boxplus.cameras.projection import intrinsics_jacobian_any, project_any
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
@@ -45,7 +45,8 @@ def _reprojection_intrinsics(
     intrinsics: NDArray[np.float64],
     intrinsics_of: NDArray[np.uint32],
     pixels: NDArray[np.float64],
-    z_min: float,
+    code: int,
+    nearest: float,
     r: NDArray[np.float64],
     J_pose: NDArray[np.float64],
     J_point: NDArray[np.float64],
@@ -61,9 +62,18 @@ def _reprojection_intrinsics(
         x = R[0] * px + R[1] * py + R[2] * pz + poses[i, 4]
         y = R[3] * px + R[4] * py + R[5] * pz + poses[i, 5]
         z = R[6] * px + R[7] * py + R[8] * pz + poses[i, 6]
-        # Written so that a NaN passes on into the residual, where it is seen and named.
-        valid[n] = not z <= z_min
-        if z <= z_min:
+        c4 = intrinsics[c, 4] if count > 4 else 0.0
+        c5 = intrinsics[c, 5] if count > 4 else 0.0
+        c6 = intrinsics[c, 6] if count > 6 else 0.0
+        c7 = intrinsics[c, 7] if count > 6 else 0.0
+        c8 = intrinsics[c, 8] if count > 8 else 0.0
+        c0, c1, c2, c3 = intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3]
+        # A NaN passes on into the residual, where it is seen and named.
+        seen, u, v, p00, p01, p02, p10, p11, p12 = project_any(
+            code, with_jacobians, x, y, z, nearest, c0, c1, c2, c3, c4, c5, c6, c7, c8
+        )
+        valid[n] = seen
+        if not seen:
             r[n, 0] = 0.0
             r[n, 1] = 0.0
             if with_jacobians:
@@ -71,32 +81,21 @@ def _reprojection_intrinsics(
                 J_point[n] = 0.0
                 J_intrinsics[n] = 0.0
             continue
-        k1 = intrinsics[c, 4] if count > 4 else 0.0
-        k2 = intrinsics[c, 5] if count > 4 else 0.0
-        p1 = intrinsics[c, 6] if count > 6 else 0.0
-        p2 = intrinsics[c, 7] if count > 6 else 0.0
-        k3 = intrinsics[c, 8] if count > 8 else 0.0
-        fx, fy = intrinsics[c, 0], intrinsics[c, 1]
-        u, v, p00, p01, p02, p10, p11, p12 = project_point(
-            x, y, z, fx, fy, intrinsics[c, 2], intrinsics[c, 3], k1, k2, p1, p2, k3
-        )
         r[n, 0] = pixels[n, 0] - u
         r[n, 1] = pixels[n, 1] - v
         if with_jacobians:
             write_pose_point(n, x, y, z, (p00, p01, p02, p10, p11, p12), R, J_pose, J_point)
-            a, b = x / z, y / z
-            xd, yd, _, _, _ = distort(a, b, k1, k2, p1, p2, k3)
-            intrinsics_jacobian(a, b, fx, fy, xd, yd, -1.0, J_intrinsics[n])
+            intrinsics_jacobian_any(code, x, y, z, c0, c1, c2, c3, c4, c5, c6, c7, c8, -1.0, J_intrinsics[n])
 
 
 class ReprojectionIntrinsics(ImageResidual):
     """Points seen in a camera that is calibrated along: pixel − π(T_camera_world p_world; intrinsics), as derived above.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `intrinsics` on `Euclidean(4)`, 6, 8
-    or 9, laid out as `Pinhole.parameters`.
+    or 9, laid out as `camera.parameters`.
 
     Args:
-        camera: its distortion model and `z_min` are used; its numbers are a start value, `camera.parameters`, no more.
+        camera: its model and `nearest` (`z_min` of a pinhole) are used; its numbers, `camera.parameters`, are a start value.
         pixels: (N, 2) measured, distorted as the camera distorts [px].
         sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
 
@@ -106,14 +105,14 @@ class ReprojectionIntrinsics(ImageResidual):
 
     def __init__(
         self,
-        camera: Pinhole,
+        camera: CameraModel,
         pixels: ArrayLike,
         *,
         sigma: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
-        self.z_min, self.pixels = camera.z_min, check_pixels("pixels", pixels)
+        self.code, self.nearest, self.pixels = camera.code, camera.nearest, check_pixels("pixels", pixels)
         count = len(self.pixels)
         super().__init__(
             dim=2,
@@ -135,6 +134,6 @@ class ReprojectionIntrinsics(ImageResidual):
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _reprojection_intrinsics(
-            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.z_min,
-            r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.code,
+            self.nearest, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
         )  # fmt: skip

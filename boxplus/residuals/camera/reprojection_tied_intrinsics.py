@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats
-from boxplus.cameras.pinhole import Pinhole
+from boxplus.cameras.model import CameraModel
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.residuals.camera.image_residual import ImageResidual
@@ -32,9 +32,9 @@ class ReprojectionTiedIntrinsics(ImageResidual):
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `q` on `Euclidean(m)`.
 
     Args:
-        camera: its distortion model and `z_min` are used.
+        camera: its model and `nearest` (`z_min` of a pinhole) are used.
         pixels: (N, 2) measured, distorted as the camera distorts [px].
-        offset: c₀ (n,), laid out as `Pinhole.parameters`.
+        offset: c₀ (n,), laid out as `camera.parameters`.
         basis: B (n, m) with m ≤ n, of full rank.
         sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
 
@@ -44,7 +44,7 @@ class ReprojectionTiedIntrinsics(ImageResidual):
 
     def __init__(
         self,
-        camera: Pinhole,
+        camera: CameraModel,
         pixels: ArrayLike,
         offset: ArrayLike,
         basis: ArrayLike,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats, as_numbers
-from boxplus.cameras.pinhole import Pinhole
+from boxplus.cameras.model import CameraModel
 from boxplus.errors import InputError
 from boxplus.residuals.camera.image_residual import ImageResidual
 from boxplus.residuals.camera.on_body import OnBody
@@ -16,8 +16,8 @@ from boxplus.residuals.whitening import Whitening
 
 
 def on_rig(
-    kind: Callable[[Pinhole, NDArray[np.float64]], ImageResidual],
-    cameras: Sequence[Pinhole],
+    kind: Callable[[CameraModel, NDArray[np.float64]], ImageResidual],
+    cameras: Sequence[CameraModel],
     camera_of: ArrayLike,
     measured: ArrayLike,
     *,

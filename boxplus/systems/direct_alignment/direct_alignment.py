@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
@@ -168,6 +169,7 @@ def align_rgbd(
     Raises:
         InputError: images or depth of another shape or not finite, too many levels, fewer than 100 pixels with depth.
     """
+    camera = check_pinhole(camera, "direct alignment")
     first, second = (image if isinstance(image, Image) else Image.from_array(image) for image in (image_1, image_2))
     if first.shape != second.shape:
         raise InputError("two images of the same shape", f"{first.shape} and {second.shape}", "resize one of them and its camera")

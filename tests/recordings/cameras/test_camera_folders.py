@@ -10,6 +10,8 @@ from camera_recordings import FRAME_NS, IMU_NS, START_NS, D, K, mounting, pgm, p
 from boxplus import (
     CameraImage,
     CameraRecordingOptions,
+    DoubleSphere,
+    Equidistant,
     ImuSamples,
     Pinhole,
     RadialTangential,
@@ -227,3 +229,30 @@ def test_recordings_of_euroc(shared_data: Path, name: str, frames: tuple[int, in
         assert np.linalg.norm(between[:3, 3]) == pytest.approx(0.110, abs=1e-3)  # EuRoC's baseline
         times = [event.time_ns for _, event in zip(range(30), recording, strict=False) if isinstance(event, CameraImage)]
         assert times == sorted(times) and recording.rejected == {}
+
+
+@pytest.mark.parametrize(
+    ("stated", "model"),
+    [
+        ("pinhole, intrinsics: [10, 11, 5, 4], distortion_model: equidistant, distortion_coeffs: [0.1, 0.2, 0.3, 0.4]",
+         Equidistant(10, 11, 5, 4, 0.1, 0.2, 0.3, 0.4)),
+        ("ds, intrinsics: [-0.2, 0.6, 10, 11, 5, 4], distortion_model: none, distortion_coeffs: []",
+         DoubleSphere(10, 11, 5, 4, -0.2, 0.6)),
+        ("pinhole, intrinsics: [10, 11, 5, 4], distortion_model: radtan, distortion_coeffs: [0.1, 0.2, 0.3, 0.4, 0.5]",
+         Pinhole(10, 11, 5, 4, RadialTangential(0.1, 0.2, 0.3, 0.4, 0.5))),
+        ("eucm, intrinsics: [0.5, 1.0, 10, 11, 5, 4], distortion_model: none, distortion_coeffs: []", None),
+        ("pinhole, intrinsics: [10, 11, 5, 4], distortion_model: fov, distortion_coeffs: [0.9]", None),
+        ("pinhole, intrinsics: [10, 11, 5, 4], distortion_model: none, distortion_coeffs: [0.9]", None),
+    ],
+)  # fmt: skip
+def test_models_of_kalibr(tmp_path: Path, stated: str, model: Pinhole | Equidistant | DoubleSphere | None) -> None:
+    camchain = tmp_path / "camchain.yaml"
+    camchain.write_text(f"cam0: {{camera_model: {stated}, T_cam_imu: {np.eye(4).tolist()}}}\n")
+    path = write_euroc(tmp_path, cameras=1)
+    (path / "mav0" / "cam0" / "sensor.yaml").unlink()
+    with open_camera_recording(path, CameraRecordingOptions(calibration=camchain)) as recording:
+        camera = recording.info.cameras[0]
+        assert camera.model == model
+        if model is None:
+            with pytest.raises(RecordingError, match="no model \\(no camera model for"):
+                camera.calibrated()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.cameras import Pinhole, Radial, RadialTangential
+from boxplus.cameras import CameraModel, DoubleSphere, Equidistant, Pinhole, Radial, RadialTangential
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
@@ -27,8 +27,10 @@ CAMERAS = [
     Pinhole(420.0, 430.0, 310.0, 245.0, Radial(-0.21, 0.06)),
     Pinhole(420.0, 430.0, 310.0, 245.0, RadialTangential(-0.21, 0.06, 1e-3, -2e-3)),
     Pinhole(420.0, 430.0, 310.0, 245.0, RadialTangential(-0.21, 0.06, 1e-3, -2e-3, 0.02)),
+    Equidistant(420.0, 430.0, 310.0, 245.0, -0.02, 0.03, -0.05, 0.02),
+    DoubleSphere(420.0, 430.0, 310.0, 245.0, -0.24, 0.57),
 ]
-by_model = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{len(c.parameters)} intrinsics")
+by_model = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{type(c).__name__}, {len(c.parameters)} intrinsics")
 
 
 def assert_jacobians(residual: Residual, *x: NDArray[np.float64]) -> None:
@@ -60,7 +62,7 @@ def random_pixels(seed: int, count: int) -> NDArray[np.float64]:
 
 class TestReprojection:
     @by_model
-    def test_residual_is_measured_minus_projected(self, camera: Pinhole) -> None:
+    def test_residual_is_measured_minus_projected(self, camera: CameraModel) -> None:
         poses, points = poses_and_points(1, 30)
         pixels = random_pixels(2, 30)
         residual = Reprojection(camera, pixels, sigma=0.5)
@@ -70,7 +72,7 @@ class TestReprojection:
         np.testing.assert_array_equal(residual.whitening.factors[0], 2.0 * np.eye(2))
 
     @by_model
-    def test_jacobians(self, camera: Pinhole) -> None:
+    def test_jacobians(self, camera: CameraModel) -> None:
         assert_jacobians(Reprojection(camera, random_pixels(3, 40)), *poses_and_points(4, 40))
 
     def test_pose_jacobian_is_that_of_the_specification(self) -> None:
@@ -126,7 +128,7 @@ class TestReprojection:
 
 class TestReprojectionIntrinsics:
     @by_model
-    def test_equals_the_calibrated_residual_at_the_same_intrinsics(self, camera: Pinhole) -> None:
+    def test_equals_the_calibrated_residual_at_the_same_intrinsics(self, camera: CameraModel) -> None:
         poses, points = poses_and_points(12, 25)
         pixels = random_pixels(13, 25)
         expected = Reprojection(camera, pixels).linearize(poses, points)
@@ -136,7 +138,7 @@ class TestReprojectionIntrinsics:
         np.testing.assert_array_equal(got.jacobians[1], expected.jacobians[1])
 
     @by_model
-    def test_jacobians(self, camera: Pinhole) -> None:
+    def test_jacobians(self, camera: CameraModel) -> None:
         poses, points = poses_and_points(14, 40)
         intrinsics = camera.parameters * np.random.default_rng(15).uniform(0.9, 1.1, (40, len(camera.parameters)))
         assert_jacobians(ReprojectionIntrinsics(camera, random_pixels(16, 40)), poses, points, intrinsics)
