@@ -18,13 +18,21 @@ _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
 @takes_recording_options
 def inspect(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    recording: Annotated[
+        Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, pcap, or a recording of cameras.")
+    ],
     T_imu_lidar: Annotated[
         str | None,
         typer.Option(
             "--T-imu-lidar",
             help="A mounting to check: pose of the LiDAR in the IMU frame, in the forms that 'boxplus lio' takes.",
         ),
+    ] = None,
+    camchain: Annotated[
+        Path | None, typer.Option("--camchain", help="Kalibr camchain of a recording of cameras; it overrules the recording's.")
+    ] = None,
+    frame_rate: Annotated[
+        float | None, typer.Option("--frame-rate", help="Images a second, where a recording of cameras has no times [Hz].")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the findings as JSON to this file too.")] = None,
@@ -42,7 +50,12 @@ def inspect(
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)
         diagnosis = diagnose(
-            recording, options, on_progress=lambda done: progress.update(task, completed=done), T_imu_lidar=T_given
+            recording,
+            options,
+            on_progress=lambda done: progress.update(task, completed=done),
+            T_imu_lidar=T_given,
+            camchain=camchain,
+            frame_rate_hz=frame_rate,
         )
     if output is not None:
         _write(output, diagnosis)

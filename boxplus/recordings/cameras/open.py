@@ -5,12 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from boxplus.errors import RecordingError
+from boxplus.recordings.bag_probe import CLOUD_PARSERS
 from boxplus.recordings.cameras.bag import open_camera_bag
+from boxplus.recordings.cameras.bag_probe import IMAGE_PARSERS
 from boxplus.recordings.cameras.euroc import is_euroc, open_euroc
 from boxplus.recordings.cameras.events import CameraRecording
 from boxplus.recordings.cameras.numbered import is_kitti_odometry, is_seven_scenes, open_kitti_odometry, open_seven_scenes
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.cameras.tum import is_tum, open_tum
+from boxplus.recordings.open_container import open_container
+
+
+def has_cameras_only(path: Path) -> bool:
+    """Whether this is a recording of cameras in which no LiDAR is found, as far as can be told without reading images."""
+    if path.is_dir() and (is_euroc(path) or is_tum(path) or is_kitti_odometry(path) or is_seven_scenes(path)):
+        return True
+    try:
+        container = open_container(path)
+    except (RecordingError, OSError):
+        return False
+    kinds = {channel.type for channel in container.channels if channel.count}
+    container.close()
+    return bool(kinds & set(IMAGE_PARSERS)) and not kinds & set(CLOUD_PARSERS)
 
 
 def open_camera_recording(path: str | Path, options: CameraRecordingOptions | None = None) -> CameraRecording:

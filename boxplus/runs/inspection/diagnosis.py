@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
+from boxplus.recordings.cameras.open import has_cameras_only, open_camera_recording
+from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.info import Evidence, Topic, Verdict
 from boxplus.recordings.open import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_cover, check_points, check_rate, check_rejected
 from boxplus.runs.inspection.agreement_checks import Compared, check_agreement
+from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.imu_checks import check_finite, check_rest, check_saturation, first_second, quiet_stretch
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
 from boxplus.sensors.imu import ImuSamples
@@ -84,19 +87,27 @@ def diagnose(
     on_progress: Callable[[float], None] | None = None,
     *,
     T_imu_lidar: NDArray[np.float64] | None = None,
+    camchain: Path | None = None,
+    frame_rate_hz: float | None = None,
 ) -> Diagnosis:
     """Examine a recording. Whatever is wrong with it becomes a finding; nothing is raised for bad data.
 
     Args:
-        path: a recording that `open_recording` takes.
+        path: a recording that `open_recording` takes, or, of cameras without a LiDAR, `open_camera_recording`.
         options: what is decided by the user.
         on_progress: called with the fraction done, in [0, 1].
         T_imu_lidar: (4, 4) a mounting to check, LiDAR coordinates to IMU coordinates; the recording's own when None.
+        camchain: Kalibr camchain of a recording of cameras.
+        frame_rate_hz: of a recording of cameras without times of its images [Hz].
     """
     path = Path(path)
     diagnosis = Diagnosis(path)
     report = on_progress or (lambda _: None)
     options = options or RecordingOptions()
+    if options.lidar_topic is None and T_imu_lidar is None and path.exists() and has_cameras_only(path):
+        _examine_cameras(path, options, camchain, frame_rate_hz, diagnosis, report)
+        report(1.0)
+        return diagnosis
     try:
         recording = open_recording(path, options)
     except RecordingError as error:
@@ -106,6 +117,37 @@ def diagnose(
         _examine(recording, options, T_imu_lidar, diagnosis, report)
     report(1.0)
     return diagnosis
+
+
+def _examine_cameras(
+    path: Path,
+    options: RecordingOptions,
+    camchain: Path | None,
+    frame_rate_hz: float | None,
+    diagnosis: Diagnosis,
+    report: Callable[[float], None],
+) -> None:
+    asked = CameraRecordingOptions(
+        imu_topic=options.imu_topic,
+        calibration=camchain,
+        frame_rate_hz=frame_rate_hz,
+        gyro_unit=options.gyro_unit,
+        accel_unit=options.accel_unit,
+        start_s=options.start_s,
+        duration_s=options.duration_s,
+    )
+    found = diagnosis.evidence
+    try:
+        recording = open_camera_recording(path, asked)
+    except RecordingError as error:
+        found.append(Evidence("recording", "cannot be read", "error", str(error)))
+        return
+    with recording:
+        info = recording.info
+        diagnosis.format, diagnosis.topics, diagnosis.duration_s = info.format, info.topics, info.duration_s
+        listed = ", ".join(f"{topic.name} [{topic.type}] {topic.count}" for topic in info.topics)
+        found.append(Evidence("topics", str(len(info.topics)), "ok", f"{info.duration_s:.2f} s: {listed}"))
+        found += examine_cameras(recording, report)
 
 
 def _examine(

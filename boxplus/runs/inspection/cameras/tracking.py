@@ -1,0 +1,56 @@
+"""Corners followed from image to image, through OpenCV, as bearings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.cameras import CameraModel
+from boxplus.recordings.cameras.decode import opencv
+
+_CORNERS = 300
+_WINDOW = (21, 21)
+_LEVELS = 4
+_THERE_AND_BACK_PX = 0.5
+_FEWEST = 50
+
+
+def grey_8_bit(grey: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey values in 8 bits; 16-bit ones are scaled by their largest."""
+    if grey.dtype == np.uint8:
+        return grey
+    scaled: NDArray[np.uint8] = (grey * (255.0 / max(float(grey.max()), 1.0))).astype(np.uint8)
+    return scaled
+
+
+def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (N, 2) of corners in the first image, and where they are in the second, those that are found again both ways."""
+    cv2 = opencv("corners of images")
+    none = np.zeros((0, 2))
+    corners = cv2.goodFeaturesToTrack(first, _CORNERS, 0.01, 12.0)
+    if corners is None:
+        return none, none
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=_WINDOW, maxLevel=_LEVELS)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=_WINDOW, maxLevel=_LEVELS)
+    close = np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < _THERE_AND_BACK_PX
+    kept = (found.ravel() == 1) & (returned.ravel() == 1) & close
+    return corners.reshape(-1, 2)[kept].astype(np.float64), there.reshape(-1, 2)[kept].astype(np.float64)
+
+
+def rotation_between(model: CameraModel, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    """R_2_1 (3, 3) of a camera between two images, from the essential matrix; None where too few corners agree on one."""
+    cv2 = opencv("corners of images")
+    before, after = follow(first, second)
+    rays_1, found_1 = model.unproject(before)
+    rays_2, found_2 = model.unproject(after)
+    found = found_1 & found_2
+    if found.sum() < _FEWEST:
+        return None
+    a, b = np.ascontiguousarray(rays_1[found, :2]), np.ascontiguousarray(rays_2[found, :2])
+    E, inliers = cv2.findEssentialMat(a, b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=1.0 / model.fx)
+    if E is None or E.shape != (3, 3) or inliers.sum() < 0.7 * found.sum():
+        return None
+    _, R, _, _ = cv2.recoverPose(E, a, b, np.eye(3), mask=inliers)
+    return np.asarray(R, np.float64)
