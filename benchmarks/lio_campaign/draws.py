@@ -16,7 +16,9 @@ from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Sett
 SENSORS = ("spinning16", "spinning32", "spinning64", "spinning128", "rosette")
 EXTRINSICS = ("given", "recorded", "absent")
 
-_POINTS = 8000
+# What sensors of these kinds deliver: columns a turn by channels (the common modes of such sensors), points a second.
+_COLUMNS = {16: 900, 32: 512, 64: 512, 128: 512}
+_ROSETTE_POINTS_S = 200_000.0
 FAULTY_SHARE = 0.5
 _BAG_SHARE = 0.25
 # density of gyro [rad/s/√Hz] and accelerometer [m/s²/√Hz], walks of both biases, largest biases [rad/s], [m/s²]
@@ -153,11 +155,12 @@ def _lidar(sensor: str, random: np.random.Generator) -> tuple[LidarModel, float]
     sigma, reach = float(random.uniform(0.01, 0.03)), float(random.uniform(60.0, 120.0))
     if sensor == "rosette":
         fov = float(random.uniform(60.0, 90.0))
-        rosette = RosetteLidar(rate_hz=rate, range_sigma_m=sigma, max_range=reach, points_per_scan=_POINTS, fov_deg=fov)
+        count = int(_ROSETTE_POINTS_S / rate)
+        rosette = RosetteLidar(rate_hz=rate, range_sigma_m=sigma, max_range=reach, points_per_scan=count, fov_deg=fov)
         return rosette, duration_s
     channels = int(sensor.removeprefix("spinning"))
     fov = {16: (-15.0, 15.0), 32: (-25.0, 15.0), 64: (-22.5, 22.5), 128: (-45.0, 45.0)}[channels]
-    steps = _POINTS // channels
+    steps = _COLUMNS[channels]
     spinning = SpinningLidar(
         rate_hz=rate, range_sigma_m=sigma, max_range=reach, channels=channels, azimuth_steps=steps, vertical_fov_deg=fov
     )

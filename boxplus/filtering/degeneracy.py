@@ -44,6 +44,14 @@ class PoseDirections:
     weak: NDArray[np.bool_]
     basis: NDArray[np.float64]
 
+    def closest_to(self, axis: NDArray[np.float64]) -> int:
+        """The direction closest to a shift along a unit `axis` (3,)."""
+        return int(np.argmax(np.abs(axis @ self.vectors[3:])))
+
+    def ratio_along(self, axis: NDArray[np.float64]) -> float:
+        """The ratio of the direction closest to a shift along a unit `axis` (3,)."""
+        return float(self.ratios[self.closest_to(axis)])
+
 
 def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: float, threshold: float) -> PoseDirections:
     """The directions of the pose that a scan's information distinguishes.
@@ -69,7 +77,7 @@ def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: f
 def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> PoseDirections:
     """The same directions, the one closest to a shift along a unit `axis` (3,) of the position weak, whatever its ratio."""
     weak = directions.weak.copy()
-    weak[int(np.argmax(np.abs(axis @ directions.vectors[3:])))] = True
+    weak[directions.closest_to(axis)] = True
     return replace(directions, weak=weak)
 
 

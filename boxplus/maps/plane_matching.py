@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
-from boxplus.maps.ikd_tree.search import IkdView, knn5
+from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn, knn5
 from boxplus.maps.plane_fit import fit_plane_into
 
 NEIGHBOURS = 5
@@ -20,12 +20,17 @@ NEIGHBOURS = 5
 PLANE = 14
 # Where one ring of the LiDAR alone has seen a surface, the five points lie on a line, and range noise makes them span the
 # plane of the beams: it would tie the sensor to its own scan pattern. Far away, where such a plane has the longest lever and
-# the rings lie far apart, the neighbours must spread across their longest extent by this sum of squares [m²].
-_MIN_SPREAD = 0.1
+# the rings lie far apart, the neighbours must spread across their longest extent by this variance [m²].
+_MIN_SPREAD = 0.02
 _FAR = 15.0  # m
 # Where such a line turns a corner its points do spread, still within the plane of the beams. No beam comes back from a surface
-# it lies in: the sine of the angle between a point's ray and its plane must exceed this.
+# it lies in: the sine of the angle between a point's ray and its plane must exceed this, and so many of its standard deviations.
 _GRAZING = 0.04
+_DEVIATIONS = 2.0
+# Five points of one line say nothing across it; among so many neighbours are points of the next line.
+MANY = 15
+# Degrees of freedom that what a scan's neighbourhoods are like counts for; the five points of a plane leave two.
+_PRIOR_DOF, _OWN_DOF = 1.0, 2.0
 # A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
 _SLACK = 1.0 + 1e-5
 
@@ -47,7 +52,7 @@ def match_planes(
     found_sq: NDArray[np.float32],
     stack: NDArray[np.void],
 ) -> None:
-    """Match the points [begin, end): five nearest map points, then the plane through them.
+    """Match the points [begin, end): five nearest map points, then the plane through them, or, where they lie on a line, fifteen.
 
     Args:
         view, origin: the map; its coordinates are relative to `origin` (3,).
@@ -59,9 +64,11 @@ def match_planes(
         neighbours: (n, 5, 3), relative to `origin`.
         planes: (n, PLANE) receives the planes.
         fate: (n,) receives USED, FEW_NEIGHBOURS, NOT_A_PLANE or ONE_LINE.
-        found_sq, stack: scratch of the calling thread.
+        found_sq: (NEIGHBOURS,), stack: (STACK_DEPTH + MANY,), scratch of the calling thread.
     """
     fit = np.empty(9)
+    many = np.empty((MANY, 3), dtype=np.float32)
+    many_sq = np.empty(MANY, dtype=np.float32)
     for n in range(begin, end):
         lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
         sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
@@ -88,26 +95,88 @@ def match_planes(
         if not fit_plane_into(near, NEIGHBOURS, plane_threshold, fit):
             fate[n] = NOT_A_PLANE
             continue
-        ux, uy, uz = fit[0], fit[1], fit[2]
         rx = x[R] * (sx - x[PL]) + x[R + 1] * (sy - x[PL + 1]) + x[R + 2] * (sz - x[PL + 2])
         ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
         rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
-        range_sq = rx * rx + ry * ry + rz * rz
-        along_normal = ux * rx + uy * ry + uz * rz
-        too_thin = fit[8] < _MIN_SPREAD * min(1.0, range_sq * range_sq / _FAR**4)
-        if too_thin or along_normal * along_normal < _GRAZING * _GRAZING * range_sq:
+        on_line = _lies_on_line(fit, NEIGHBOURS, rx, ry, rz)
+        fitted = near
+        if on_line:
+            found = knn(view, qx, qy, qz, np.float32(max_distance_sq), many_sq, stack)
+            if found == MANY:
+                copy_found(view, stack, MANY, MANY, many)
+                on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(fit, MANY, rx, ry, rz)
+                fitted = many
+        if on_line:
             fate[n] = ONE_LINE
             continue
         fate[n] = USED
         plane = planes[n]
-        plane[0], plane[1], plane[2] = ux, uy, uz
-        plane[3] = fit[3] + ux * origin[0] + uy * origin[1] + uz * origin[2]
+        plane[0], plane[1], plane[2] = fit[0], fit[1], fit[2]
+        plane[3] = fit[3] + fit[0] * origin[0] + fit[1] * origin[1] + fit[2] * origin[2]
         plane[4] = plane[13] = fit[7]
-        _normal_uncertainty(near, fit, plane)
+        _normal_uncertainty(fitted, fit, plane)
         for g in (5, 9):
             plane[g + 3] = (
                 plane[g] * (fit[4] + origin[0]) + plane[g + 1] * (fit[5] + origin[1]) + plane[g + 2] * (fit[6] + origin[2])
             )
+
+
+@kernel(inline=True)
+def _lies_on_line(fit: NDArray[np.float64], count: int, rx: float, ry: float, rz: float) -> bool:
+    """Whether the points of a plane are those of one scan line, given the ray (3,) from the sensor to it."""
+    range_sq = rx * rx + ry * ry + rz * rz
+    along_normal = fit[0] * rx + fit[1] * ry + fit[2] * rz
+    too_thin = fit[8] < _MIN_SPREAD * count * min(1.0, range_sq * range_sq / _FAR**4)
+    return bool(too_thin or along_normal * along_normal < _GRAZING * _GRAZING * range_sq)
+
+
+@kernel
+def settle_normals(
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    plane_threshold: float,
+    planes: NDArray[np.float64],
+    fate: NDArray[np.uint8],
+) -> None:
+    """Say how uncertain the normals of a scan's planes are (column 13), and refuse those that may as well contain their ray.
+
+    Two degrees of freedom say little: where surfaces are smaller than the distance of the points, five lie on a plane by chance
+    every so often, and the better they do, the more the chance would count. What is known of all the neighbourhoods, those that
+    are no planes included, tells how likely that is (empirical Bayes: Efron and Morris, 1973).
+
+    Args:
+        x, p_lidar, plane_threshold: of `match_planes`, which has matched all points.
+        planes: (n, PLANE); column 13 is drawn from the plane's own variance towards that of all neighbourhoods.
+        fate: (n,); planes that are refused change from USED to ONE_LINE.
+    """
+    total, count = 0.0, 0
+    for n in range(len(fate)):
+        if fate[n] == USED:
+            total += planes[n, 4]
+            count += 1
+        elif fate[n] == NOT_A_PLANE:
+            total += plane_threshold * plane_threshold
+            count += 1
+    common = total / max(count, 1)
+    for n in range(len(fate)):
+        if fate[n] != USED:
+            continue
+        plane = planes[n]
+        plane[13] = (_OWN_DOF * plane[4] + _PRIOR_DOF * common) / (_OWN_DOF + _PRIOR_DOF)
+        lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
+        ix, iy, iz = (
+            x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz,
+            x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz,
+            x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz,
+        )
+        rx = x[R] * ix + x[R + 1] * iy + x[R + 2] * iz
+        ry = x[R + 3] * ix + x[R + 4] * iy + x[R + 5] * iz
+        rz = x[R + 6] * ix + x[R + 7] * iy + x[R + 8] * iz
+        across = plane[0] * rx + plane[1] * ry + plane[2] * rz
+        first = plane[5] * rx + plane[6] * ry + plane[7] * rz
+        second = plane[9] * rx + plane[10] * ry + plane[11] * rz
+        if across * across < _DEVIATIONS * _DEVIATIONS * plane[13] * (first * first + second * second):
+            fate[n] = ONE_LINE
 
 
 @kernel(inline=True)
@@ -125,7 +194,7 @@ def _normal_uncertainty(near: NDArray[np.float32], fit: NDArray[np.float64], pla
         ex, ey, ez = -uz * norm, 0.0, ux * norm
     fx, fy, fz = uy * ez - uz * ey, uz * ex - ux * ez, ux * ey - uy * ex
     ee, ef, ff = 0.0, 0.0, 0.0
-    for i in range(NEIGHBOURS):
+    for i in range(len(near)):
         dx, dy, dz = near[i, 0] - fit[4], near[i, 1] - fit[5], near[i, 2] - fit[6]
         e = ex * dx + ey * dy + ez * dz
         f = fx * dx + fy * dy + fz * dz

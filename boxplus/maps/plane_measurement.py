@@ -22,12 +22,10 @@ from boxplus.filtering.plane_information import (
 )
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
-from boxplus.maps.plane_matching import NEIGHBOURS, PLANE, match_planes
+from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, settle_normals
 from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 512
-# Degrees of freedom that what a scan's neighbourhoods are like counts for; the five points of a plane leave two.
-_PRIOR_DOF, _OWN_DOF = 1.0, 2.0
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
@@ -147,23 +145,10 @@ class PlaneMeasurement:
                 self._planes,
                 self._fate,
                 np.zeros(NEIGHBOURS, dtype=np.float32),
-                np.zeros(STACK_DEPTH, dtype=STACK),
+                np.zeros(STACK_DEPTH + MANY, dtype=STACK),
             )
 
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
-        self._share_variance()
+        settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
         self._matched_at = x.copy()
-
-    def _share_variance(self) -> None:
-        """Draw the variance that makes a plane's normal uncertain towards that of all neighbourhoods of the scan.
-
-        Two degrees of freedom say little: where surfaces are smaller than the distance of the points, five lie on a plane
-        by chance every so often, and the better they do, the more the chance would count. What is known of all the
-        neighbourhoods, those that are no planes included, tells how likely that is (empirical Bayes: Efron and Morris, 1973).
-        """
-        used = self._fate == USED
-        own = self._planes[used, 4]
-        rough = int(np.count_nonzero(self._fate == NOT_A_PLANE))
-        common = (own.sum() + rough * self._config.plane_threshold**2) / max(len(own) + rough, 1)
-        self._planes[used, 13] = (_OWN_DOF * own + _PRIOR_DOF * common) / (_OWN_DOF + _PRIOR_DOF)

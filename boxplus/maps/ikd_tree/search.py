@@ -210,6 +210,19 @@ def knn(
 
 
 @kernel(inline=True, borrow=True)
+def copy_found(view: IkdView, stack: NDArray[np.void], k: int, found: int, out_xyz: NDArray[np.float32]) -> None:
+    """Copy the `found` points of a search for k, which it left in the last rows of `stack`, to `out_xyz` (k, 3)."""
+    first = len(stack) - k
+    for i in range(found):
+        point = np.uint32(stack[first + i]["ref"])
+        record = view.leaf[point // np.uint32(BUCKET)]
+        j = np.uint32(point % np.uint32(BUCKET))
+        out_xyz[i, 0] = record["x"][j]
+        out_xyz[i, 1] = record["y"][j]
+        out_xyz[i, 2] = record["z"][j]
+
+
+@kernel(inline=True, borrow=True)
 def pack(sq: np.float32, point: np.uint32) -> np.uint64:
     """A squared distance and a point as one number, which is ordered like them."""
     return np.uint64(np.uint64(np.float32(sq).view(np.uint32)) << _POINT_BITS | np.uint64(point))
@@ -298,12 +311,5 @@ def knn5(
         stack: (STACK_DEPTH,) of STACK, scratch of the calling thread.
     """
     found = five_nearest(view, qx, qy, qz, max_sq, out_sq, stack)
-    first = len(stack) - 5
-    for i in range(found):
-        point = np.uint32(stack[first + i]["ref"])
-        record = view.leaf[point // np.uint32(BUCKET)]
-        j = np.uint32(point % np.uint32(BUCKET))
-        out_xyz[i, 0] = record["x"][j]
-        out_xyz[i, 1] = record["y"][j]
-        out_xyz[i, 2] = record["z"][j]
+    copy_found(view, stack, 5, found, out_xyz)
     return np.int64(found)

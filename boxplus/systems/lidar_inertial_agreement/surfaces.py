@@ -11,7 +11,9 @@ _MANY = 15
 _THICKEST_M, _FLAT = 0.06, 0.05
 _NEAR_M = 1.5
 _ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
-_ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and share of all
+_ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and their share of all
+# Where the information along the axis is not this many times that of noise: their share within so many metres.
+_TELLING, _NEAR_SHARE_ACROSS, _NEAR_SENSOR_M = 8.0, 0.02, 10.0
 
 
 def surface_distances(
@@ -47,8 +49,25 @@ def surface_distances(
     return near, surface, distances, normals
 
 
-def surfaces_across(tree: IkdTree, points: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
-    """Whether `points` (N, 3) lie on surfaces of the map that face a unit `axis` (3,) and would show a motion along it."""
+def surfaces_across(
+    tree: IkdTree, points: NDArray[np.float64], sensor: NDArray[np.float64], axis: NDArray[np.float64], ratio: float
+) -> bool:
+    """Whether surfaces face an axis and would show a motion along it.
+
+    Where walls, floor and ceiling of a smooth corridor meet, far rings span planes across it even through many neighbours, though
+    they say hardly more than noise. So either what the scan says must be much, or many of the surfaces must be near.
+
+    Args:
+        tree: the map.
+        points: (N, 3) of a scan, in its frame [m].
+        sensor: (3,) where they were seen from.
+        axis: (3,) unit vector there.
+        ratio: how many times what noise would the scan says about a motion along it (`PoseDirections.ratio_along`).
+    """
     _, _, _, normals = surface_distances(tree, points)
     across = (normals @ axis) ** 2
-    return float(across[across > _ACROSS].sum()) > max(_ENOUGH_ACROSS, _SHARE_ACROSS * len(points))
+    facing = across > _ACROSS
+    if ratio < _TELLING:
+        facing &= np.linalg.norm(points - sensor, axis=1) < _NEAR_SENSOR_M
+    share = _SHARE_ACROSS if ratio > _TELLING else _NEAR_SHARE_ACROSS
+    return float(across[facing].sum()) > max(_ENOUGH_ACROSS, share * len(points))

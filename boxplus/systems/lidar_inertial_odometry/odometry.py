@@ -225,8 +225,9 @@ class LidarInertialOdometry:
             self._x, self._cov = posterior.x, posterior.cov
         self._datum.follow(self._x, cov_prior, self._cov, *((posterior.A, posterior.last.directions) if taken else ()))
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        map_points_world = NavState.unpack(self._x).to_world(map_points)
-        self._unshown.look(map_points_world, self.config.map_cell)
+        state = NavState.unpack(self._x)
+        map_points_world = state.to_world(map_points)
+        self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:

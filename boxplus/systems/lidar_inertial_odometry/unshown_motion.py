@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import with_weak_axis
+from boxplus.filtering.degeneracy import PoseDirections, with_weak_axis
 from boxplus.filtering.iterated_update import Posterior
 from boxplus.filtering.nav_state import T_P, T_V
 from boxplus.maps.ikd_tree import IkdTree
@@ -65,14 +65,20 @@ class UnshownMotion:
             if abs(along[best]) > _ONE_AXIS:
                 self._axes[number] = np.sign(along[best]) * vectors[:, best]
 
-    def look(self, p_world: NDArray[np.float64], map_cell: float) -> None:
-        """Whether the points (N, 3) of a scan show the speed; every few scans, as it takes a map of them."""
+    def look(
+        self, p_world: NDArray[np.float64], p_world_imu: NDArray[np.float64], map_cell: float, directions: PoseDirections | None
+    ) -> None:
+        """Whether a scan, its points (N, 3) and what it said of the pose, shows the speed; every few scans, as it takes a map."""
         self._scans += 1
-        if not len(self._axes) or self._scans % _SCANS_BETWEEN_LOOKS:
+        if not len(self._axes) or self._scans % _SCANS_BETWEEN_LOOKS or directions is None:
             return
         tree = IkdTree(cell_size=map_cell, rebuild="inplace")
         tree.insert(p_world, downsample=True)
-        self._axes = np.array([axis for axis in self._axes if not surfaces_across(tree, p_world, axis)]).reshape(-1, 3)
+
+        def shown(axis: NDArray[np.float64]) -> bool:
+            return surfaces_across(tree, p_world, p_world_imu, axis, directions.ratio_along(axis))
+
+        self._axes = np.array([axis for axis in self._axes if not shown(axis)]).reshape(-1, 3)
 
     def widened(self, cov: NDArray[np.float64], time_ns: int) -> NDArray[np.float64]:
         """A covariance at `time_ns`, of the tangent (24, 24) or of the pose (6, 6), with what the filter does not know of."""

@@ -34,7 +34,7 @@ def surface(normal: int, seed: int = 0) -> np.ndarray:
 
 def looked_at(unshown: UnshownMotion, points: np.ndarray) -> None:
     for _ in range(5):
-        unshown.look(points, CELL_M)
+        unshown.look(points, np.zeros(3), CELL_M, pose_directions(np.eye(6), np.eye(6), 1.0, 0.0))
 
 
 @lru_cache(maxsize=1)
