@@ -46,6 +46,7 @@ _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
 _LEAST_SHARE = 0.25  # of the points lie on the map, or the scan is not registered
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
+_MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
 
@@ -115,6 +116,7 @@ def lidar_path(
     undistort: bool = False,
     expected: Sequence[Twist] | None = None,
     velocity: NDArray[np.float64] | None = None,
+    unbroken: bool = False,
 ) -> LidarPath:
     """The path of the LiDAR through `scans`, in order of time; streamed.
 
@@ -125,10 +127,13 @@ def lidar_path(
         undistort: whether to undistort with the first guess, where it has been found to be right, instead of a constant rate.
         expected: of every scan, how an estimator believes that the LiDAR moved: one more start, and no further search.
         velocity: (3,) with which the first registration begins [m/s], LiDAR frame; zero when not given.
+        unbroken: whether to stop at the first scan that cannot be registered: the most costly one, as all starts are tried.
     """
     motion = LidarMotion(config, guesses, undistort=undistort, velocity=velocity)
     for number, scan in enumerate(scans):
         motion.add(scan, None if expected is None else expected[number])
+        if unbroken and motion.failed:
+            break
     return motion.path()
 
 
@@ -178,6 +183,11 @@ class LidarMotion:
             self._failed,
         )
 
+    @property
+    def failed(self) -> int:
+        """Scans that could not be registered so far."""
+        return self._failed
+
     def add(self, scan: Scan, expected: Twist | None = None) -> None:
         """Register the next scan; `expected` is one more start."""
         if len(scan) < self._config.min_points:
@@ -216,24 +226,37 @@ class LidarMotion:
         The first was taken as it came. At 8 m/s it and the next are distorted alike, and fit each other where they are: where
         rest does not fit well, both are tried at speed.
         """
-        axes = np.vstack([np.eye(3), -np.eye(3)])
-        speeds = [speed * axis for speed in _FIRST_SPEEDS for axis in axes] if expected is None else []
-        best: _Fit | None = None
-        kept = self._tree, self._rate, self._velocity
-        for velocity in [np.zeros(3), *speeds]:
-            if best is not None and best.misfit < GOOD_MISFIT_M:
-                break
-            if velocity.any():
-                self._tree, self._rate, self._velocity = self._map_of(first, np.zeros(3), velocity), np.zeros(3), velocity
-            fit = self._best(scan, middle_ns, step_s, expected)
-            if fit is None:
-                continue
-            self._tree, self._rate, self._velocity = self._map_of(first, fit.rate, fit.velocity), fit.rate, fit.velocity
-            fit = self._best(scan, middle_ns, step_s, expected)
-            if fit is not None and (best is None or fit.cost < best.cost):
-                best, kept = fit, (self._tree, self._rate, self._velocity)
+        best = self._best(scan, middle_ns, step_s, expected)
+        if best is not None:
+            best = self._again(first, scan, middle_ns, step_s, best, expected)
+        if expected is not None or self._failed > _MOST_SEARCHES or (best is not None and best.misfit < GOOD_MISFIT_M):
+            return best
+        kept, self._rate = (self._tree, self._rate, self._velocity), self._turning(middle_ns, step_s)[0]
+        found: _Fit | None = None
+        for velocity in (speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])):
+            self._tree = self._map_of(first, self._rate, velocity)
+            fit = self._register(scan, middle_ns, step_s, self._rate, velocity)
+            if fit is not None and (found is None or fit.cost < found.cost):
+                found = fit
+        if found is not None:
+            found = self._again(first, scan, middle_ns, step_s, found, expected)
+        if found is not None and (best is None or found.cost < best.cost):
+            return found
         self._tree, self._rate, self._velocity = kept
         return best
+
+    def _again(self, first: Scan, scan: Scan, middle_ns: int, step_s: float, fit: _Fit, expected: Twist | None) -> _Fit | None:
+        """A fit again, with the map that the first scan makes for the motion that was found."""
+        self._tree, self._rate, self._velocity = self._map_of(first, fit.rate, fit.velocity), fit.rate, fit.velocity
+        return self._best(scan, middle_ns, step_s, expected)
+
+    def _turning(self, middle_ns: int, step_s: float) -> list[NDArray[np.float64]]:
+        """The turn rates (3,) [rad/s] of the guesses on the way to a scan; the last one found where there are none."""
+        rates = []
+        for guess in self._guesses:
+            R_guess = guess(np.array([middle_ns - round(step_s * 1e9), middle_ns]))
+            rates.append(so3.log(R_guess[0].T @ R_guess[1]) / step_s)
+        return rates or [self._rate]
 
     def _map_of(self, first: Scan, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> IkdTree:
         """The map that a first scan makes for a LiDAR that moves like this."""
@@ -255,11 +278,7 @@ class LidarMotion:
 
     def _best(self, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
         """The registration that fits best, from constant velocity, from the guesses and, if need be, from other speeds."""
-        starts = [(self._rate, self._velocity)]
-        for guess in self._guesses:
-            R_guess = guess(np.array([middle_ns - round(step_s * 1e9), middle_ns]))
-            rate = so3.log(R_guess[0].T @ R_guess[1]) / step_s
-            starts.append((rate, self._velocity))
+        starts = [(rate, self._velocity) for rate in (self._rate, *self._turning(middle_ns, step_s))]
         if expected is not None:
             rate, velocity = expected
             starts.append((rate, self._x[R : R + 9].reshape(3, 3) @ so3.exp(0.5 * step_s * rate) @ velocity))

@@ -35,7 +35,7 @@ from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, f
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 
-_LONGEST_START_SCANS, _SCANS_BETWEEN_TRIES = 30, 5
+_LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # shared: see `MapDatum`, what random recordings need
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
@@ -183,7 +183,7 @@ class LidarInertialOdometry:
             forgotten = max(len(self._waiting) - keep, 0)
             self._sequencer.rejected["scan before a start could be found"] += forgotten
             del self._waiting[:forgotten]
-            self._next_try = len(self._waiting) + _SCANS_BETWEEN_TRIES
+            self._next_try = len(self._waiting) + 1 + int(_FEWEST_NEW * len(self._waiting))
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))

@@ -120,7 +120,7 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     gyro_std, accel_std = float(imu.gyro.std(axis=0).max()), float(imu.accel.std(axis=0).max())
     evidence = f"gyro std {gyro_std:.3f} rad/s, accelerometer std {accel_std:.2f} m/s² around {norm:.2f} m/s²"
     scans = [frame.scan for frame in frames]
-    path = lidar_path(scans, config, gyro_guesses(imu, extrinsic.R_imu_lidar))
+    path = lidar_path(scans, config, gyro_guesses(imu, extrinsic.R_imu_lidar), unbroken=True)
     if path.failed or len(path) < min(len(frames), 3) or path.segment[-1] != path.segment[0]:
         return f"the first scans do not overlap enough to see whether they move ({evidence}); waiting for more data"
     within = int(np.count_nonzero((imu.time_ns >= path.time_ns[0]) & (imu.time_ns <= path.time_ns[-1])))
@@ -156,7 +156,8 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
         return f"not at rest ({evidence}), and {len(frames)} scans are not enough for a moving start; waiting for more data"
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
     steady = ImuSamples(imu.time_ns, imu.gyro - _gyro_bias(path, imu, extrinsic), imu.accel)
-    path = lidar_path(scans, config, gyro_guesses(steady, extrinsic.R_imu_lidar), undistort=True, velocity=_first_velocity(path))
+    guesses = gyro_guesses(steady, extrinsic.R_imu_lidar)
+    path = lidar_path(scans, config, guesses, undistort=True, velocity=_first_velocity(path), unbroken=True)
     if path.failed or path.segment[-1] != path.segment[0]:
         return f"not at rest ({evidence}), and the first scans do not overlap enough for a moving start; waiting for more data"
     fit = _moving_fit(frames, path, imu, extrinsic)
