@@ -53,6 +53,7 @@ _HALF_TURN_RAD = np.deg2rad(12.0)
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
+_MOUNTED = 0.95  # share of the turning that a mounting explains
 _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
 
 
@@ -172,8 +173,13 @@ def _of_unit(rotation: RotationFit) -> Finding | None:
 
 
 def _of_sign(rotation: RotationFit) -> Finding | None:
-    """No rotation has a determinant of −1: a gyroscope that only fits mirrored has its sign flipped."""
-    if not _turning(rotation) or rotation.mirrored < _FITS or 1.0 - rotation.mirrored > 0.3 * (1.0 - rotation.explained):
+    """No rotation has a determinant of −1: a gyroscope that only fits mirrored has its sign flipped.
+
+    About a single axis a mirror and half a turn are the same: where a mounting explains nearly all, it is the mounting's to say.
+    """
+    if not _turning(rotation) or rotation.mirrored < _FITS or rotation.explained > _MOUNTED:
+        return None
+    if 1.0 - rotation.mirrored > 0.3 * (1.0 - rotation.explained):
         return None
     return Finding(
         "gyro_sign",
