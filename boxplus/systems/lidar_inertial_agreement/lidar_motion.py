@@ -37,6 +37,8 @@ _MOST_MAP_POINTS = 5000  # that it leaves in the map
 _MOST_RAW = 12_000  # that it is undistorted and filtered from
 _PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
 _NODES = 21  # within a scan, of a known turning
+# The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
+_WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
 _FEWEST_USED = 60
@@ -146,7 +148,7 @@ class LidarMotion:
         undistort: bool = False,
         velocity: NDArray[np.float64] | None = None,
     ) -> None:
-        self._config = config
+        self._config = config.model_copy(update={"weak_threshold": min(config.weak_threshold, _WEAK)})
         self._guesses = tuple(guesses)
         self._undistort = undistort and bool(guesses)
         self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _MOST_POINTS)

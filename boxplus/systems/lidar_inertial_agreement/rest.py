@@ -1,7 +1,7 @@
 """Whether the LiDAR rests against what it sees.
 
-The hypothesis that all velocities are zero, twice: against the path that registration finds, and, where that path creeps along a
-direction that noisy surfaces only seem to determine, by how well the last scans fit the first ones unmoved.
+The hypothesis that all velocities are zero, twice: against the path that registration finds, and, where that path creeps or
+turns in a way that noisy surfaces only seem to determine, by how well the last scans fit the first ones unmoved.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
 _NEAR_M = 0.03
 _DEVIATIONS = 3.0
 _POSE_SIGMA_M = 0.004
-_CREEP_M_S = 0.15
+_CREEP_M_S, _CREEP_RAD_S = 0.15, 0.25
 _AS_WELL = 1.1  # times the cost
 _COMPARED, _POINTS = 3, 3000
 _MOST_MAP_POINTS = 5000
@@ -77,7 +77,8 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
         ends < _NEAR_M + _DEVIATIONS * std[seen] * seconds[-1]
     ).all()
     speed = float(np.linalg.norm(speeds))
-    at_rest = rate < _SLOW_RAD_S and bool(slow or (speed < _CREEP_M_S and _fits_unmoved(path, scans, config)))
+    creeps = speed < _CREEP_M_S and rate < _CREEP_RAD_S
+    at_rest = bool((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config)))
     open_axes = axes[:, ~seen].T
     if at_rest and seen.all() and not _faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T
