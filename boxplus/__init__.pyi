@@ -61,8 +61,10 @@ from .simulation.simulation import simulate as simulate
 from .sparse.cholesky import SparseCholesky as SparseCholesky
 from .systems.bundle_adjustment.bundle_adjustment import adjust_bundle as adjust_bundle
 from .systems.bundle_adjustment.config import BundleAdjustmentConfig as BundleAdjustmentConfig
-from .systems.direct_alignment.direct_alignment import Alignment as Alignment
 from .systems.direct_alignment.direct_alignment import align_rgbd as align_rgbd
+from .systems.direct_alignment.keyframe import Keyframe as Keyframe
+from .systems.direct_alignment.tracking import Alignment as Alignment
+from .systems.direct_alignment.tracking import track as track
 from .systems.lidar_inertial_odometry.config import LioConfig as LioConfig
 from .systems.lidar_inertial_odometry.estimate import Estimate as Estimate
 from .systems.lidar_inertial_odometry.odometry import LidarInertialOdometry as LidarInertialOdometry

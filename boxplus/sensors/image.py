@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import kernel
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.residuals.camera.photometric_sampling import checked_image
@@ -43,8 +44,9 @@ class Image:
 
     def half(self) -> Image:
         """The image at half the resolution: means of 2×2 pixels; an odd last row or column is left out."""
-        blocks = two_by_two(self.grey)
-        return Image(np.ascontiguousarray(blocks.mean(axis=(1, 3), dtype=np.float32)))
+        half = np.empty((self.shape[0] // 2, self.shape[1] // 2), dtype=np.float32)
+        _mean_of_two_by_two(self.grey, half)
+        return Image(half)
 
     def pyramid(self, levels: int) -> list[Image]:
         """This image and its halves, finest first.
@@ -64,10 +66,13 @@ class Image:
         return images
 
 
-def two_by_two(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A view (H // 2, 2, W // 2, 2) of (H, W): axes 1 and 3 run within a block of 2×2 pixels."""
-    height, width = values.shape[0] // 2, values.shape[1] // 2
-    return values[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+@kernel
+def _mean_of_two_by_two(grey: NDArray[np.float32], half: NDArray[np.float32]) -> None:
+    for i in range(np.uint64(half.shape[0])):
+        upper, lower, row = grey[np.uint64(2) * i], grey[np.uint64(2) * i + np.uint64(1)], half[i]
+        for j in range(np.uint64(half.shape[1])):
+            k = np.uint64(2) * j
+            row[j] = np.float32(0.25) * ((upper[k] + upper[k + np.uint64(1)]) + (lower[k] + lower[k + np.uint64(1)]))
 
 
 def half_camera(camera: Pinhole) -> Pinhole:

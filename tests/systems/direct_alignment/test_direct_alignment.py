@@ -15,6 +15,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.optimization.losses import Squared
+from boxplus.residuals.camera.photometric import Photometric
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.direct_alignment import align_rgbd
 
@@ -51,6 +52,16 @@ def textured_plane(seed: int, T_21: NDArray[np.float64]) -> tuple[NDArray[np.flo
     R, t = quaternion.to_matrix(T_21[:4]), T_21[4:]
     s = (distance + normal @ R.T @ t) / (rays @ R @ normal)
     return grey(depth[..., None] * rays), depth, grey((s[..., None] * rays - t) @ R)
+
+
+def mean_error(camera: Pinhole, first: object, depth: NDArray[np.float64], second: object, T_21: NDArray[np.float64]) -> float:
+    """Mean |e| at a pose [grey values], by the residual that bundle adjustments use."""
+    rows, columns = np.nonzero(depth > 0.0)
+    inner = (columns > 0) & (rows > 0) & (columns < depth.shape[1] - 1) & (rows < depth.shape[0] - 1)
+    pixels = np.stack([columns, rows], axis=1)[inner].astype(float)
+    residual = Photometric(camera, first, second, pixels, depth[rows[inner], columns[inner]])  # type: ignore[arg-type]
+    e = residual.evaluate(T_21)
+    return float(np.abs(e[e != 0.0]).mean())
 
 
 @pytest.mark.parametrize("loss", [None, Squared()], ids=["Huber", "Squared"])
@@ -107,7 +118,7 @@ def test_it_says_when_it_cannot() -> None:
     assert align_rgbd(stripes, depth, stripes, CAMERA, levels=1).status == "unobservable"  # sliding along them changes nothing
     away = align_rgbd(first, depth, second, CAMERA, T_21=[1.0, 0, 0, 0, 50.0, 0, 0], levels=2)
     assert away.status == "little overlap" and away.overlap == 0.0
-    short = align_rgbd(first, depth, textured_plane(5, se3.exp(np.full(6, 0.03)))[2], CAMERA, levels=1, max_iterations=1)
+    short = align_rgbd(first, depth, textured_plane(5, se3.exp(np.full(6, 0.01)))[2], CAMERA, levels=1, max_iterations=1)
     assert short.status == "iteration limit" and short.iterations == (1,)
     same = align_rgbd(first, depth, first, CAMERA, levels=2)
     assert same.status == "converged" and np.abs(same.T_21 - [1, 0, 0, 0, 0, 0, 0]).max() < 1e-9
@@ -185,8 +196,7 @@ def test_slambook_pairs_agree_with_each_other(shared_data: Path) -> None:
         T_file = np.concatenate([quaternion.from_matrix(R[j - 1].T @ R[i - 1]), R[j - 1].T @ (p[i - 1] - p[j - 1])])
         degrees, metres = degrees_and_metres(found[i, j].T_21, T_file)
         assert degrees < 0.8 and metres < 0.02
-        at_file = align_rgbd(images[i], depths[i], images[j], camera, T_21=T_file, levels=1, max_iterations=1)
-        assert at_file.mean_error > 1.3 * found[i, j].mean_error
+        assert mean_error(camera, images[i], depths[i], images[j], T_file) > 1.3 * found[i, j].mean_error
     for i, j in ((1, 2), (1, 4)):
         there_and_back = se3.compose(found[j, i].T_21, found[i, j].T_21)
         degrees, metres = degrees_and_metres(there_and_back, np.array([1.0, 0, 0, 0, 0, 0, 0]))

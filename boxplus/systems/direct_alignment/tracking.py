@@ -1,0 +1,281 @@
+"""An image aligned to a keyframe, from coarse to fine, with a verdict on whether to believe it.
+
+    T* = argmin_T Σ ρ(e(T)/σ),   e = I₁(p₁) − (eᵃ I₂(π(T X₁)) + b)
+
+by Levenberg-Marquardt, inverse compositional (see `keyframe.py`). σ is estimated anew by the median of the residuals, so that ρ
+sees occlusions and reflections as outliers at every stage. A loss that turns outliers off altogether is for the finest level only:
+far from the solution it would turn off what has to move, so that the levels above have `Huber(1.345)`. At the coarsest levels the
+brightness stands still, as otherwise it takes a share of what motion has to explain; it is either none or that which makes medians
+and spreads of the two images the same, whichever leaves less.
+
+Source: Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Baker and Matthews, IJCV 2004.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds import se3
+from boxplus.manifolds.se3 import SE3Left
+from boxplus.optimization.losses import Huber, Loss, Tukey
+from boxplus.sensors.image import Image
+from boxplus.systems.direct_alignment.alignment_kernel import (
+    CONVERGED,
+    ITERATION_LIMIT,
+    LITTLE_OVERLAP,
+    NO_GRADIENT,
+    align_level,
+)
+from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe, Level
+from boxplus.systems.direct_alignment.keyframe_kernel import motion_of_seen
+
+_FAR_LOSS = Huber(1.345)
+_BRIGHTNESS_BELOW = 3  # octaves that estimate it
+_LEAST_SIGMA = 1e-3  # of the range of grey values of the keyframe; identical images have residuals of zero
+_LEAST_OVERLAP = 0.2  # share of the keyframe's pixels that land in the image
+_LEAST_CURVATURE = 1e-9  # smallest over largest eigenvalue of H, translations measured in units of the median depth
+# Signal over noise of gradients, see `_signal`. On recorded pairs, right poses had 3.4 and more in every direction, wrong ones
+# 0.7 and less in their weakest. A mean of 4 is a standard deviation of the residuals worth one pixel.
+_LEAST_SIGNAL, _LEAST_MEAN_SIGNAL = 2.0, 4.0
+_SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
+
+Status = Literal["converged", "iteration limit", "little overlap", "unobservable", "large residual"]
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """What `track` and `align_rgbd` found; figures are those at the pose returned, at the last level that was reached.
+
+    Attributes:
+        T_21: (7,) wxyz and xyz, maps points in camera 1, of the keyframe, to camera 2.
+        covariance: (6, 6) of ξ = [w, v] in Exp(ξ) T_21 [rad², rad·m, m²], as if pixels were independent and depth exact, which
+            makes it too small by a factor; NaN where the grey values do not support the pose, whatever the status.
+        brightness: (a, b) of image 2 [-, grey values], I₁ = eᵃ I₂ + b.
+        cost: mean of ρ over the pixels that count, in units of σ².
+        sigma: robust standard deviation of the residuals [grey values of image 1].
+        mean_error: mean |e| [grey values of image 1].
+        pixels: of image 1 that count at the finest level; overlap: their share of those compared.
+        iterations: linearisations at every level, coarsest first; levels with fewer than 100 pixels with depth are left out.
+        status: `converged`; `iteration limit` at the finest level; `little overlap`, fewer than 100 pixels or a fifth of
+            them land in image 2; `large residual`, grey values differ by as much as a pixel's shift makes them differ, so that
+            this is another place or a wrong pose; `unobservable`, a direction of motion about which grey values say
+            no more than their noise.
+        reason: why the pose must not be believed, in a sentence with figures; empty when `converged`.
+    """
+
+    T_21: Matrix
+    covariance: Matrix
+    brightness: tuple[float, float]
+    cost: float
+    sigma: float
+    mean_error: float
+    pixels: int
+    overlap: float
+    iterations: tuple[int, ...]
+    status: Status
+    reason: str
+
+
+def track(
+    keyframe: Keyframe,
+    image: Image | ArrayLike,
+    *,
+    T_21: ArrayLike = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    loss: Loss | None = None,
+    brightness: bool = True,
+    max_iterations: int = 50,
+    tolerance: float = 1e-4,
+    search_deg: float = 0.0,
+) -> Alignment:
+    """Align an image to a keyframe.
+
+    Args:
+        keyframe: camera 1.
+        image: grey values (H, W), or colours, of the keyframe's camera: camera 2.
+        T_21: (7,) start, by default no motion.
+        loss: of e/σ at the finest level; by default `Tukey(4.685)`. Levels above have `Huber(1.345)` where the loss given turns
+            outliers off.
+        brightness: whether image 2 may be brighter, affinely, than image 1.
+        max_iterations: linearisations at each level.
+        tolerance: the finest level ends with a step below this [rad; the translation in units of the median depth], others with
+            one below what is the same in their pixels.
+        search_deg: start at the coarsest level from rotations up to this far from `T_21`, 10 degrees apart, and go on with the
+            best; for turns beyond about 10 degrees. The number of starts grows with its cube.
+
+    Returns:
+        Pose, covariance, brightness; and a status other than `converged`, with the reason, when they must not be believed.
+
+    Raises:
+        InputError: an image of another shape or not finite, a start that is no pose.
+
+    Example:
+        >>> v, u = np.mgrid[:120, :160]
+        >>> grey = 100.0 + 40.0 * np.sin(0.2 * u) * np.cos(0.15 * v)
+        >>> from boxplus.cameras.pinhole import Pinhole
+        >>> keyframe = Keyframe.prepare(grey, np.full((120, 160), 2.0), Pinhole(150.0, 150.0, 79.5, 59.5), levels=3)
+        >>> found = track(keyframe, 0.8 * grey + 5.0)
+        >>> found.status, round(float(np.exp(found.brightness[0])), 3)
+        ('converged', 1.25)
+    """
+    second = image if isinstance(image, Image) else Image.from_array(image)
+    if second.shape != keyframe.shape:
+        raise InputError("two images of the same shape", f"{keyframe.shape} and {second.shape}", "resize one of them and its camera")
+    if max_iterations < 1:
+        raise InputError("max_iterations at least 1", f"{max_iterations}", "leave it out for 50")
+    pose = SE3Left.check("T_21", T_21)[0].copy()
+    pyramid = second.pyramid(keyframe.halvings + 1)
+    descent = _Descent(keyframe, Tukey(4.685) if loss is None else loss, brightness, pose)
+    if len(keyframe.levels) > 1 or search_deg > 0.0:
+        coarsest = keyframe.levels[0]
+        descent.search(coarsest, pyramid[coarsest.octave], search_deg, min(max_iterations, _SEARCH_ITERATIONS))
+    iterations: list[int] = []
+    for level in keyframe.levels:
+        is_free = brightness and (level.octave < _BRIGHTNESS_BELOW or level is keyframe.levels[-1])
+        code = descent.refine(level, pyramid[level.octave], max_iterations, tolerance * 2.0**level.octave, is_free)
+        iterations.append(int(descent.figures[5]))
+        if code == LITTLE_OVERLAP:
+            break
+    return _judged(descent, level, pyramid[level.octave], code, tuple(iterations), tolerance)
+
+
+class _Descent:
+    """Pose and brightness on their way through the levels, and what the last linearisation saw."""
+
+    def __init__(self, keyframe: Keyframe, loss: Loss, brightness: bool, T_21: Matrix) -> None:
+        self.loss, self.brightness = loss, brightness
+        self.z_min, self.reach = keyframe.camera.z_min, keyframe.median_depth
+        self.least_sigma = max(_LEAST_SIGMA * keyframe.contrast, 1e-30)
+        self.T_21, self.light = T_21, np.array([1.0, 0.0])
+        self.H, self.figures = np.zeros((8, 8)), np.zeros(6)
+
+    def refine(self, level: Level, image: Image, max_iterations: int, tolerance: float, is_free: bool) -> int:
+        """Align at one level; returns the code of `align_level`."""
+        is_far = level.octave > 0 and self.loss.is_redescending
+        loss = _FAR_LOSS if is_far else self.loss
+        fewest = int(np.ceil(max(FEWEST_PIXELS, _LEAST_OVERLAP * len(level.grey))))
+        code: int = align_level(
+            self.T_21, self.light, level.rays, level.inverse_depth, level.grey, level.J, image.grey, level.intrinsics,
+            self.z_min, loss.code, loss.scale, is_free, max_iterations, tolerance, self.reach, self.least_sigma, fewest,
+            self.H, self.figures,
+        )  # fmt: skip
+        return code
+
+    def motion_of_seen(self, level: Level, image: Image) -> Matrix:
+        """(6, 6), see the kernel."""
+        N = np.empty((6, 6))
+        motion_of_seen(self.T_21, level.rays, level.inverse_depth, level.intrinsics, self.z_min, *image.shape, N)
+        return N
+
+    def search(self, level: Level, image: Image, search_deg: float, max_iterations: int) -> None:
+        """Go on from that of several starts which leads to the smallest mean of |e|, where enough of the image is seen."""
+        most = search_deg // _SEARCH_STEP_DEG
+        steps = np.radians(_SEARCH_STEP_DEG * np.arange(-most, most + 1.0))
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        grid = grid[np.linalg.norm(grid, axis=1) <= np.radians(search_deg) + 1e-12]
+        T_start, best, least = self.T_21, (self.T_21, self.light), np.inf
+        for light in _lights(level.grey, image.grey) if self.brightness else (self.light,):
+            for rotation in grid:
+                self.T_21 = se3.compose(se3.exp(np.concatenate([rotation, np.zeros(3)])), T_start)
+                self.light = light.copy()
+                code = self.refine(level, image, max_iterations, _SEARCH_TOLERANCE, False)
+                count, total = self.figures[0], self.figures[2]
+                if code in (CONVERGED, ITERATION_LIMIT) and total < least * count:
+                    best, least = (self.T_21, self.light), total / count
+        self.T_21, self.light = best
+
+
+def _lights(grey_1: Matrix, grey_2: NDArray[np.float32]) -> list[Matrix]:
+    """Gain and offset of image 2: none; and what makes its median and its spread those of image 1."""
+    median_1, median_2 = float(np.median(grey_1)), float(np.median(grey_2))
+    spread_1, spread_2 = float(np.median(np.abs(grey_1 - median_1))), float(np.median(np.abs(grey_2 - median_2)))
+    lights = [np.array([1.0, 0.0])]
+    if spread_1 > 0.0 and spread_2 > 0.0:
+        gain = spread_1 / spread_2
+        lights.append(np.array([gain, median_1 - gain * median_2]))
+    return lights
+
+
+def _without_brightness(H: Matrix) -> Matrix:
+    """(6, 6) information of the pose when gain and offset are unknown as well."""
+    return H[:6, :6] - H[:6, 6:] @ np.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
+
+
+def _signal(information: Matrix, noise: Matrix) -> Matrix:
+    """How much more the grey values say about motions than noise would, (6,), weakest direction first.
+
+    Noise of residuals of variance σ², half of it from image 1, is noise of variance σ²/4 in its central differences, and has
+    a Hessian as well: σ²/4 Σ ρ' PᵀP/σ², taken here with the mean of ρ'. These are the generalised eigenvalues of the two, which do
+    not depend on where the pixels lie or how far they are away.
+    """
+    L = np.linalg.cholesky(noise)
+    half = np.linalg.solve(L, information)
+    signal: Matrix = np.linalg.eigvalsh(np.linalg.solve(L, half.T))
+    return signal
+
+
+def _judged(
+    descent: _Descent, level: Level, image: Image, code: int, iterations: tuple[int, ...], tolerance: float
+) -> Alignment:
+    """The alignment with its status."""
+    pixels, (_, cost, total, weights, sigma, _) = int(descent.figures[0]), descent.figures
+    overlap, count = pixels / len(level.grey), max(pixels, 1)
+    covariance = np.full((6, 6), np.nan)
+    status: Status = "converged"
+    reason = ""
+    unit = np.array([1.0, 1.0, 1.0, descent.reach, descent.reach, descent.reach])
+    information = (_without_brightness(descent.H) if descent.brightness else descent.H[:6, :6]) * unit[:, None] * unit
+    noise = descent.motion_of_seen(level, image) * unit[:, None] * unit * (0.25 * weights / count)
+    if code == LITTLE_OVERLAP:
+        status = "little overlap"
+        reason = (
+            f"{pixels} of {len(level.grey)} pixels of the keyframe land in the image, at 1/{2**level.octave} of its resolution; a "
+            f"fifth and {FEWEST_PIXELS} are needed: start closer, or take a keyframe that sees more of the same"
+        )
+    elif code == NO_GRADIENT or not _is_definite(information) or not _is_definite(noise):
+        status = "unobservable"
+        reason = "a direction of motion changes no grey value: the image has no texture along it"
+    else:
+        signal = _signal(information, noise)
+        is_right_place, is_known = signal.mean() >= _LEAST_MEAN_SIGNAL, signal[0] >= _LEAST_SIGNAL
+        if code == ITERATION_LIMIT:
+            status = "iteration limit"
+            reason = f"after {iterations[-1]} linearisations a step was still larger than the tolerance, {tolerance:g}"
+        elif not is_right_place:
+            status = "large residual"
+            reason = (
+                f"grey values differ by {sigma:.3g}, as much as a shift of {2.0 / np.sqrt(signal.mean()):.2g} pixels makes them differ "
+                "(1 at most): the image shows something else, or the start was too far away"
+            )
+        elif not is_known:
+            status = "unobservable"
+            reason = (
+                f"along one direction of motion grey values say {signal[0]:.2g} times what noise would ({_LEAST_SIGNAL:g} at least): "
+                "the image has no texture along it, or the residuals are too large"
+            )
+        if is_right_place and is_known:
+            Ad = se3.adjoint(descent.T_21) * unit
+            covariance = Ad @ np.linalg.inv(information) @ Ad.T
+    return Alignment(
+        T_21=descent.T_21,
+        covariance=covariance,
+        brightness=(float(np.log(descent.light[0])), float(descent.light[1])),
+        cost=cost / count,
+        sigma=sigma,
+        mean_error=total / count,
+        pixels=pixels,
+        overlap=overlap,
+        iterations=iterations,
+        status=status,
+        reason=reason,
+    )
+
+
+def _is_definite(matrix: Matrix) -> bool:
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    return bool(eigenvalues[0] > _LEAST_CURVATURE * eigenvalues[-1])
