@@ -91,6 +91,7 @@ BENCHMARKS = {
     "bundle": Benchmark(("--rounds", "1")),
     "imu": Benchmark(("--rounds", "2")),
     "residuals": Benchmark(("--edges", "1000", "--rounds", "1")),
+    "direct": Benchmark(("--rounds", "1")),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
 

@@ -99,7 +99,9 @@ class Keyframe:
         """
         first = image if isinstance(image, Image) else Image.from_array(image)
         if points is not None and points < FEWEST_PIXELS:
-            raise InputError(f"at least {FEWEST_PIXELS} points a level", f"{points}", "leave it out for 3000, or give None for all")
+            raise InputError(
+                f"at least {FEWEST_PIXELS} points a level", f"{points}", "leave it out for 3000, or give None for all"
+            )
         z = _checked_depth(depth, first)
         median_depth = float(np.median(z[z > 0.0]))
         found: list[Level] = []

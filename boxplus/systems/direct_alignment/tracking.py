@@ -3,10 +3,10 @@
     T* = argmin_T Σ ρ(e(T)/σ),   e = I₁(p₁) − (eᵃ I₂(π(T X₁)) + b)
 
 by Levenberg-Marquardt, inverse compositional (see `keyframe.py`). σ is estimated anew by the median of the residuals, so that ρ
-sees occlusions and reflections as outliers at every stage. A loss that turns outliers off altogether is for the finest level only:
-far from the solution it would turn off what has to move, so that the levels above have `Huber(1.345)`. At the coarsest levels the
-brightness stands still, as otherwise it takes a share of what motion has to explain; it is either none or that which makes medians
-and spreads of the two images the same, whichever leaves less.
+sees occlusions and reflections as outliers at every stage. A loss that turns outliers off altogether is for the finest level
+only: far from the solution it would turn off what has to move, so that the levels above have `Huber(1.345)`. At the coarsest
+levels the brightness stands still, as otherwise it takes a share of what motion has to explain; it is either none or that which
+makes medians and spreads of the two images the same, whichever leaves less.
 
 Source: Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Baker and Matthews, IJCV 2004.
 """
@@ -39,8 +39,8 @@ _BRIGHTNESS_BELOW = 3  # octaves that estimate it
 _LEAST_SIGMA = 1e-3  # of the range of grey values of the keyframe; identical images have residuals of zero
 _LEAST_OVERLAP = 0.2  # share of the keyframe's pixels that land in the image
 _LEAST_CURVATURE = 1e-9  # smallest over largest eigenvalue of H, translations measured in units of the median depth
-# Signal over noise of gradients, see `_signal`. On recorded pairs, right poses had 3.4 and more in every direction, wrong ones
-# 0.7 and less in their weakest. A mean of 4 is a standard deviation of the residuals worth one pixel.
+# Signal over noise of gradients, see `_signal`. On recorded pairs, wrong poses had 1.0 and less in their weakest direction, right
+# ones ten times that, unless much of the image was saturated. A mean of 4 is a standard deviation worth one pixel.
 _LEAST_SIGNAL, _LEAST_MEAN_SIGNAL = 2.0, 4.0
 _SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
 
@@ -125,7 +125,9 @@ def track(
     """
     second = image if isinstance(image, Image) else Image.from_array(image)
     if second.shape != keyframe.shape:
-        raise InputError("two images of the same shape", f"{keyframe.shape} and {second.shape}", "resize one of them and its camera")
+        raise InputError(
+            "two images of the same shape", f"{keyframe.shape} and {second.shape}", "resize one of them and its camera"
+        )
     if max_iterations < 1:
         raise InputError("max_iterations at least 1", f"{max_iterations}", "leave it out for 50")
     pose = SE3Left.check("T_21", T_21)[0].copy()
@@ -209,9 +211,9 @@ def _without_brightness(H: Matrix) -> Matrix:
 def _signal(information: Matrix, noise: Matrix) -> Matrix:
     """How much more the grey values say about motions than noise would, (6,), weakest direction first.
 
-    Noise of residuals of variance σ², half of it from image 1, is noise of variance σ²/4 in its central differences, and has
-    a Hessian as well: σ²/4 Σ ρ' PᵀP/σ², taken here with the mean of ρ'. These are the generalised eigenvalues of the two, which do
-    not depend on where the pixels lie or how far they are away.
+    Noise of residuals of variance σ², half of it from image 1, is noise of variance σ²/4 in its central differences, and
+    has a Hessian as well: σ²/4 Σ ρ' PᵀP/σ², taken here with the mean of ρ'. These are the generalised eigenvalues of the two,
+    which do not depend on where the pixels lie or how far they are away.
     """
     L = np.linalg.cholesky(noise)
     half = np.linalg.solve(L, information)
@@ -219,9 +221,7 @@ def _signal(information: Matrix, noise: Matrix) -> Matrix:
     return signal
 
 
-def _judged(
-    descent: _Descent, level: Level, image: Image, code: int, iterations: tuple[int, ...], tolerance: float
-) -> Alignment:
+def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations: tuple[int, ...], tolerance: float) -> Alignment:
     """The alignment with its status."""
     pixels, (_, cost, total, weights, sigma, _) = int(descent.figures[0]), descent.figures
     overlap, count = pixels / len(level.grey), max(pixels, 1)
@@ -234,8 +234,8 @@ def _judged(
     if code == LITTLE_OVERLAP:
         status = "little overlap"
         reason = (
-            f"{pixels} of {len(level.grey)} pixels of the keyframe land in the image, at 1/{2**level.octave} of its resolution; a "
-            f"fifth and {FEWEST_PIXELS} are needed: start closer, or take a keyframe that sees more of the same"
+            f"{pixels} of {len(level.grey)} pixels of the keyframe land in the image, at 1/{2**level.octave} of its resolution; "
+            f"a fifth and {FEWEST_PIXELS} are needed: start closer, or take a keyframe that sees more of the same"
         )
     elif code == NO_GRADIENT or not _is_definite(information) or not _is_definite(noise):
         status = "unobservable"
@@ -249,14 +249,14 @@ def _judged(
         elif not is_right_place:
             status = "large residual"
             reason = (
-                f"grey values differ by {sigma:.3g}, as much as a shift of {2.0 / np.sqrt(signal.mean()):.2g} pixels makes them differ "
-                "(1 at most): the image shows something else, or the start was too far away"
+                f"grey values differ by {sigma:.3g}, as much as a shift of {2.0 / np.sqrt(signal.mean()):.2g} pixels makes them "
+                "differ (1 at most): the image shows something else, or the start was too far away"
             )
         elif not is_known:
             status = "unobservable"
             reason = (
-                f"along one direction of motion grey values say {signal[0]:.2g} times what noise would ({_LEAST_SIGNAL:g} at least): "
-                "the image has no texture along it, or the residuals are too large"
+                f"along one direction of motion grey values say {signal[0]:.2g} times what noise would ({_LEAST_SIGNAL:g} at "
+                "least): the image has no texture along it, or the residuals are too large"
             )
         if is_right_place and is_known:
             Ad = se3.adjoint(descent.T_21) * unit

@@ -54,12 +54,12 @@ def textured_plane(seed: int, T_21: NDArray[np.float64]) -> tuple[NDArray[np.flo
     return grey(depth[..., None] * rays), depth, grey((s[..., None] * rays - t) @ R)
 
 
-def mean_error(camera: Pinhole, first: object, depth: NDArray[np.float64], second: object, T_21: NDArray[np.float64]) -> float:
+def mean_error(camera: Pinhole, first: Image, depth: NDArray[np.float32], second: Image, T_21: NDArray[np.float64]) -> float:
     """Mean |e| at a pose [grey values], by the residual that bundle adjustments use."""
     rows, columns = np.nonzero(depth > 0.0)
     inner = (columns > 0) & (rows > 0) & (columns < depth.shape[1] - 1) & (rows < depth.shape[0] - 1)
     pixels = np.stack([columns, rows], axis=1)[inner].astype(float)
-    residual = Photometric(camera, first, second, pixels, depth[rows[inner], columns[inner]])  # type: ignore[arg-type]
+    residual = Photometric(camera, first.grey, second.grey, pixels, depth[rows[inner], columns[inner]])
     e = residual.evaluate(T_21)
     return float(np.abs(e[e != 0.0]).mean())
 
@@ -187,7 +187,7 @@ def test_slambook_pairs_agree_with_each_other(shared_data: Path) -> None:
     camera = Pinhole(481.2, 480.0, 319.5, 239.5)
     R = flip @ Rotation.from_quat(rows[:, 3:]).as_matrix() @ flip
     p = rows[:, :3] @ flip
-    images = {i: read_png(folder / "color" / f"{i}.png") for i in (1, 2, 4)}
+    images = {i: Image.from_array(read_png(folder / "color" / f"{i}.png")) for i in (1, 2, 4)}
     depths = {i: read_png(folder / "depth" / f"{i}.png") / 5000.0 for i in (1, 2, 4)}
     found = {}
     for i, j in ((1, 2), (2, 1), (1, 4), (4, 1)):
