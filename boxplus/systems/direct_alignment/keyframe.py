@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.sensors.image import Image, half_camera
@@ -95,8 +96,10 @@ class Keyframe:
             points: about as many pixels a level at most; None for all.
 
         Raises:
-            InputError: depth of another shape or negative, too many levels, fewer than 100 pixels with depth.
+            InputError: depth of another shape or negative, too many levels, fewer than 100 pixels with depth, a camera
+                that is no pinhole.
         """
+        camera = check_pinhole(camera, "direct alignment")
         first = image if isinstance(image, Image) else Image.from_array(image)
         if points is not None and points < FEWEST_PIXELS:
             raise InputError(
