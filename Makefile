@@ -45,5 +45,5 @@ $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
-	@$(PIP) install -e '.[dev]'
+	@$(PIP) install -e '.[dev,vision]'
 	@touch $(VENV)/.runtime $@

@@ -13,7 +13,7 @@ _NEAR_M = 1.5
 _ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
 _ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and their share of all
 # Where the information along the axis is not this many times that of noise: their share within so many metres.
-_TELLING, _NEAR_SHARE_ACROSS, _NEAR_SENSOR_M = 8.0, 0.02, 10.0
+_TELLING, _NEAR_SHARE_ACROSS, _NEAR_SENSOR_M = 6.0, 0.02, 10.0
 
 
 def surface_distances(
