@@ -121,6 +121,12 @@ class PlaneMeasurement:
         on_map = np.count_nonzero(self._fate == USED) + np.count_nonzero(self._fate == ONE_LINE)
         return on_map / max(self.points, 1)
 
+    @property
+    def fitting_share(self) -> float:
+        """Share of the points with a plane that lie on it, by the gate; 1 where no point has one."""
+        used, gated = np.count_nonzero(self._fate == USED), np.count_nonzero(self._fate == GATED)
+        return used / (used + gated) if used + gated else 1.0
+
     def rejected(self) -> Mapping[str, int]:
         """Points that were not used, by reason."""
         counts = np.bincount(self._fate, minlength=5)

@@ -59,6 +59,21 @@ def test_every_point_is_used_or_counted(seed: int) -> None:
     assert np.linalg.eigvalsh(information.A).min() > -1e-6 * np.trace(information.A)
 
 
+def test_the_share_of_points_that_fit_tells_a_pose_from_one_gone_astray() -> None:
+    random = np.random.default_rng(3)
+    tree = IkdTree(_faces(random, 8000))
+    x = _pose(random)
+    points = _look(_faces(random, 600), x)
+    measurement = _measure(points, tree)
+    measurement.at(x.pack(), rematch=True)
+    assert measurement.fitting_share > 0.95
+    shift = np.zeros(24)
+    shift[3:6] = [0.6, 0.6, 0.5]
+    information = measurement.at(x.boxplus(shift).pack(), rematch=True)
+    used, gated = information.used, measurement.rejected()["too far from the plane"]
+    assert measurement.fitting_share == used / (used + gated) < 0.5
+
+
 def test_the_number_of_threads_does_not_change_a_bit() -> None:
     random = np.random.default_rng(0)
     tree, x = IkdTree(_faces(random, 4000)), _pose(random)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections
+from boxplus.filtering.iterated_update import Posterior
 from boxplus.filtering.nav_state import PL, RL, TANGENT, P, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
@@ -27,6 +27,7 @@ _SUSPICIOUS_INNOVATION, _CONTRADICTED_INNOVATION = 2.0, 25.0  # mean square of t
 _CONTRADICTED_STREAK_S = 1.0
 _ONE_SCAN = 100.0  # no single scan counts for more: it takes several to contradict
 _LOST_STREAK = 3
+_LEAST_FITTING = 0.6  # of the points with a plane lie on it; 0.92 at least on sound runs
 _SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
 _FASTEST_M_S = 120.0
 _MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
@@ -49,6 +50,7 @@ class Consistency:
         self._innovation = 0.0
         self._contradicted_since_ns: int | None = None
         self._innovation_text: str | None = None
+        self._misfit_since_ns: int | None = None
         self._unmatched = 0
         self._previous_start_ns: int | None = None
         self._told: set[str] = set()
@@ -70,19 +72,21 @@ class Consistency:
         x_before: NDArray[np.float64],
         x_prior: NDArray[np.float64],
         cov_prior: NDArray[np.float64],
-        x: NDArray[np.float64],
+        posterior: Posterior,
         matched_share: float,
-        directions: PoseDirections | None,
+        fitting_share: float,
     ) -> list[str]:
         """Take one scan in; returns what is wrong, one sentence each.
 
         Args:
             frame: the scan and its IMU samples.
-            x_before, x_prior, x: (36,) state at the end of the scan before, predicted, and after the update.
+            x_before, x_prior: (36,) state at the end of the scan before, and predicted.
             cov_prior: (24, 24) of the prediction.
+            posterior: the update.
             matched_share: points that lie on the map over points filtered.
-            directions: of the pose that the scan determined; None if there was no update.
+            fitting_share: of the points with a plane, those that lie on it.
         """
+        x = posterior.x
         self._unmatched = self._unmatched + 1 if matched_share < self._min_matched_share else 0
         before = x_before[R : R + 9].reshape(3, 3)
         predicted = _turn(before.T @ x_prior[R : R + 9].reshape(3, 3))
@@ -92,7 +96,8 @@ class Consistency:
         self._turned = _KEEP * self._turned + max(float(predicted @ predicted), float(measured @ measured))
         self._corrected = _KEEP * self._corrected + float(corrected @ corrected)
         warnings = self._span(frame)
-        warnings += self._innovate(frame, x_prior, cov_prior, x, directions)
+        warnings += self._innovate(frame, x_prior, cov_prior, posterior)
+        warnings += self._fit(frame, fitting_share)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -124,15 +129,15 @@ class Consistency:
         frame: Frame,
         x_prior: NDArray[np.float64],
         cov_prior: NDArray[np.float64],
-        x: NDArray[np.float64],
-        directions: PoseDirections | None,
+        posterior: Posterior,
     ) -> list[str]:
         """The correction of the pose against what the prediction's covariance allows, along the directions that were measured."""
+        x, directions = posterior.x, posterior.last.directions
         speed = float(np.linalg.norm(x[V : V + 3]))
         if speed > _FASTEST_M_S:
             self._innovation_text = f"the estimate moves at {speed:.0f} m/s, which no platform with a LiDAR does"
             return [self._innovation_text] if self._once("speed") else []
-        if directions is None or directions.weak.all():
+        if not posterior.valid or directions.weak.all():
             self._contradicted_since_ns = None
             return []
         delta = np.zeros(TANGENT)
@@ -155,6 +160,23 @@ class Consistency:
             f"for {lasted:.1f} s the LiDAR has contradicted what the IMU predicts, scan after scan, by "
             f"{np.sqrt(self._innovation):.0f} standard deviations: units, mounting, clocks or topics of the two do not "
             "fit together (see 'boxplus inspect')"
+        )
+        return [self._innovation_text]
+
+    def _fit(self, frame: Frame, fitting_share: float) -> list[str]:
+        """Whether the points near surfaces of the map lie on them: a pose that has gone astray fits some, and misses most."""
+        if fitting_share > _LEAST_FITTING:
+            self._misfit_since_ns = None
+            return []
+        if self._misfit_since_ns is None:
+            self._misfit_since_ns = frame.scan.start_ns
+        lasted = (frame.scan.end_ns - self._misfit_since_ns) * 1e-9
+        if lasted < _CONTRADICTED_STREAK_S or self._innovation_text is not None:
+            return []
+        self._innovation_text = (
+            f"for {lasted:.1f} s only {fitting_share:.0%} of the points near surfaces of the map lie on them: the estimate has "
+            "come away from its map; the IMU is not the one of this LiDAR, units, mounting or clocks do not fit together (see "
+            "'boxplus inspect'), or most of what is seen moves"
         )
         return [self._innovation_text]
 

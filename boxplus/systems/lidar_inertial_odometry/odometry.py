@@ -217,9 +217,9 @@ class LidarInertialOdometry:
         x_prior, cov_prior = self._x.copy(), self._cov.copy()
         limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
         posterior = self._unshown.mark(iterated_update(x_prior, cov_prior, measurement, **limits))
-        on_map = measurement.on_map_share if posterior.valid else 0.0
+        on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior.x, on_map, directions)
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov

@@ -1,0 +1,34 @@
+"""A pose that fits a part of what it sees and misses the rest is contradicted within about a second."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
+
+PERIOD_NS = 100_000_000
+
+
+def follow(shares: list[float]) -> tuple[Consistency, list[str]]:
+    """The shares of the points that lie on their planes, a scan each at 10 Hz."""
+    consistency, told = Consistency(LioConfig(), None), []
+    for number, share in enumerate(shares):
+        frame: Any = SimpleNamespace(scan=SimpleNamespace(start_ns=number * PERIOD_NS, end_ns=(number + 1) * PERIOD_NS))
+        told += consistency._fit(frame, share)
+    return consistency, told
+
+
+@pytest.mark.parametrize("shares", [[0.95] * 50, [0.2] * 9, ([0.3] * 9 + [0.9]) * 5])
+def test_what_fits_or_misses_for_a_moment_is_no_contradiction(shares: list[float]) -> None:
+    consistency, told = follow(shares)
+    assert not told and consistency.contradiction is None
+
+
+def test_a_second_of_misses_is_a_contradiction_and_stays_one() -> None:
+    consistency, told = follow([0.98] * 20 + [0.4] * 30 + [0.98] * 10)
+    assert len(told) == 1 and told[0].startswith("for 1.0 s only 40% of the points near surfaces of the map lie on them")
+    assert consistency.contradiction == told[0]
