@@ -6,6 +6,7 @@ Both see beyond 90° from the axis, where z ≤ 0, which no pinhole does.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -20,7 +21,7 @@ from boxplus.manifolds._batch import as_batch
 _LARGEST_ANGLE = math.pi - 1e-6  # straight behind, all directions meet
 
 
-class _WideAngle:
+class _WideAngle(ABC):
     """What both models share; `code`, the fields and `theta_max` make the difference."""
 
     __slots__ = ()
@@ -62,9 +63,9 @@ class _WideAngle:
         return padded
 
     @property
+    @abstractmethod
     def theta_max(self) -> float:
         """Angle from the axis up to which points are seen [rad]."""
-        raise NotImplementedError
 
     def project(self, p_camera: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Pixels (..., 2) of points (..., 3) in the camera frame [m], and whether each is seen (...).

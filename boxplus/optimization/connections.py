@@ -33,6 +33,20 @@ _MEANINGS = (
 )
 
 
+def require_connections(residual: Residual, connections: Sequence[object]) -> None:
+    """Refuse another number of connections than the residual has variables.
+
+    Raises:
+        InputError: so many others.
+    """
+    if len(connections) != len(residual.manifolds):
+        raise InputError(
+            f"{len(residual.manifolds)} connections ({', '.join(residual.roles)})",
+            f"{len(connections)}",
+            f"connect every variable of {type(residual).__name__}",
+        )
+
+
 def check_connections(residual: Residual, rows: Sequence[VariableRows], groups: Iterable[Group], carry_over: bool) -> None:
     """Refuse variables on other manifolds than the residual is derived for, or in another meaning than elsewhere.
 

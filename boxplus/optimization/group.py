@@ -80,7 +80,7 @@ class Group:
     ) -> None:
         """`holds`: the group stands for components that are held, and is the only one that has Jacobians for them."""
         self.residual, self.name = residual, name
-        self.connections = tuple(_broadcast(rows, residual.count) for rows in connections)
+        self.connections = tuple(broadcast(rows, residual.count) for rows in connections)
         self.r = np.zeros((residual.count, residual.dim))
         self.jacobians = tuple(np.zeros((residual.count, residual.dim, c.block.manifold.dof)) for c in self.connections)
         self.valid = np.ones(residual.count, dtype=np.bool_)
@@ -270,7 +270,12 @@ class Group:
         return None
 
 
-def _broadcast(rows: VariableRows, count: int) -> VariableRows:
+def broadcast(rows: VariableRows, count: int) -> VariableRows:
+    """One row for each of `count` residuals, a single one for all.
+
+    Raises:
+        InputError: another number of rows.
+    """
     if len(rows) == count:
         return rows
     if len(rows) == 1:

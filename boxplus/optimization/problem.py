@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
 
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.optimization.connections import check_connections
+from boxplus.optimization.connections import check_connections, require_connections
 from boxplus.optimization.elimination import choose_system
 from boxplus.optimization.faded import faded_notes, faded_shares
 from boxplus.optimization.group import Group, ResidualRows
@@ -25,7 +24,7 @@ from boxplus.optimization.minimize import Callback, minimize, strategy_of
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
 from boxplus.optimization.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.solver_options import SolverOptions, options_from
 from boxplus.optimization.variables import VariableRows, Variables
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
@@ -93,12 +92,7 @@ class Problem:
             InputError: wrong number of connections, wrong length, another manifold than the residual is derived for, a
                 block that residuals take for different things (T_world_camera and T_camera_world).
         """
-        if len(connections) != len(residual.manifolds):
-            raise InputError(
-                f"{len(residual.manifolds)} connections ({', '.join(residual.roles)})",
-                f"{len(connections)}",
-                f"connect every variable of {type(residual).__name__}",
-            )
+        require_connections(residual, connections)
         rows = [c[:] if isinstance(c, Variables) else c for c in connections]
         for connection in rows:
             self._require_own(connection)
@@ -308,7 +302,7 @@ class Problem:
         begin = time.perf_counter()
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
-        options = options if options is not None else _options(settings)
+        options = options if options is not None else options_from(SolverOptions, settings)
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0
@@ -381,13 +375,3 @@ class Problem:
             model = LeastSquares(layout, groups, system, options.threads)
             self._analysed = (key, model, tuple(self.defects()))
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin
-
-
-def _options(settings: dict[str, Any]) -> SolverOptions:
-    try:
-        return SolverOptions(**settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(SolverOptions.model_fields)
-        raise InputError(f"settings of SolverOptions ({known})", f"{where}: {first['msg']}", "correct that setting") from None

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from boxplus.errors import InputError
+
+OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 Method = Literal["levenberg_marquardt", "gauss_newton", "dogleg"]
 Elimination = Literal["auto", "dense", "sparse", "schur"]
@@ -30,3 +34,18 @@ class SolverOptions(BaseModel):
     )
     initial_radius: float = Field(1e4, gt=0, description="trust region of the dogleg at the start, in tangents scaled by diag(H)")
     threads: int = Field(1, ge=1, description="results are the same for any number")
+
+
+def options_from(kind: type[OptionsT], settings: dict[str, Any]) -> OptionsT:
+    """The options that settings given one by one make.
+
+    Raises:
+        InputError: a setting is unknown or out of range; the message names those that there are.
+    """
+    try:
+        return kind(**settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = ", ".join(kind.model_fields)
+        raise InputError(f"settings of {kind.__name__} ({known})", f"{where}: {first['msg']}", "correct that setting") from None

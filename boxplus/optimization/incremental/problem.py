@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
 
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, NotFiniteError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.optimization.connections import check_connections
-from boxplus.optimization.group import Group
+from boxplus.optimization.connections import check_connections, require_connections
+from boxplus.optimization.group import Group, broadcast
 from boxplus.optimization.incremental.bayes_tree import BayesTree, TreeUpdate
 from boxplus.optimization.incremental.covariance import blocks, joint
 from boxplus.optimization.incremental.factor_store import FactorStore, GroupStore, RelativePoseStore
@@ -23,6 +22,7 @@ from boxplus.optimization.incremental.reports import IncrementalSolution, Increm
 from boxplus.optimization.incremental.variables import GrowingVariables
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
+from boxplus.optimization.solver_options import options_from
 from boxplus.optimization.variables import VariableRows, Variables
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
@@ -60,7 +60,7 @@ class IncrementalProblem:
     def __init__(self, options: IncrementalOptions | None = None, **settings: Any) -> None:
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
-        self.options = options if options is not None else _options(settings)
+        self.options = options if options is not None else options_from(IncrementalOptions, settings)
         self.blocks: list[GrowingVariables] = []
         self._guard = ThreadGuard("IncrementalProblem")
         self._tree = BayesTree()
@@ -144,12 +144,7 @@ class IncrementalProblem:
         Raises:
             InputError: wrong number of connections, wrong length, another manifold than the residual is derived for.
         """
-        if len(connections) != len(residual.manifolds):
-            raise InputError(
-                f"{len(residual.manifolds)} connections ({', '.join(residual.roles)})",
-                f"{len(connections)}",
-                f"connect every variable of {type(residual).__name__}",
-            )
+        require_connections(residual, connections)
         rows = [self._own_rows(connection) for connection in connections]
         loss = loss if loss is not None else Squared()
         blocks = [self.blocks[c.block.number] for c in rows]
@@ -175,13 +170,7 @@ class IncrementalProblem:
             self._stores.append(RelativePoseStore(residual, key[2], key[3], loss, label))
         both = np.empty((residual.count, 2), np.uint32)
         for slot, selected in enumerate(rows):
-            if len(selected) not in (1, residual.count):
-                raise InputError(
-                    f"{residual.count} rows of {selected.block.name!r}, one for each residual (or one for all)",
-                    f"{len(selected)}",
-                    "select a variable for every residual",
-                )
-            both[:, slot] = selected.rows
+            both[:, slot] = broadcast(selected, residual.count).rows
         ids = np.stack([self.blocks[key[2]].numbers[both[:, 0]], self.blocks[key[3]].numbers[both[:, 1]]], axis=1)
         store = self._stores[number]
         self._enter(number, store.append(residual, both, ids >= 0), ids)  # type: ignore[attr-defined]
@@ -375,15 +364,3 @@ class IncrementalProblem:
         if not any(block is own for own in self.blocks):
             advice = "use a block that `add_variables` returned, or rows of it"
             raise InputError("variables of this problem", f"{block!r}", advice)
-
-
-def _options(settings: dict[str, Any]) -> IncrementalOptions:
-    try:
-        return IncrementalOptions(**settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(IncrementalOptions.model_fields)
-        raise InputError(
-            f"settings of IncrementalOptions ({known})", f"{where}: {first['msg']}", "correct that setting"
-        ) from None

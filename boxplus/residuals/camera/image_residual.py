@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.residuals.residual import Array, Arrays, Residual, Rows
+from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 
 
 class ImageResidual(Residual):
@@ -35,3 +36,27 @@ class ImageResidual(Residual):
     def change_into(self, begin: int, end: int, x: Arrays, index: Rows, delta: Array, out: Array) -> None:
         """out[begin:end] = ∂e/∂z δ (N, dim) for δ (N, k); here e = z − …"""
         out[begin:end] = delta[begin:end]
+
+
+class PixelResidual(ImageResidual):
+    """An image residual whose kernel does both: with Jacobians, or with none.
+
+    Attributes:
+        no_jacobians: empty arrays of the Jacobians' shapes, for the kernel to leave alone.
+    """
+
+    no_jacobians: ClassVar[Arrays]
+
+    @abstractmethod
+    def _run(
+        self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
+    ) -> None:
+        """Fill r, valid and, if wanted, the Jacobians [begin:end]."""
+
+    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
+        """See `Residual.linearize_into`."""
+        self._run(begin, end, x, index, r, jacobians, valid, True)
+
+    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
+        """See `Residual.evaluate_into`."""
+        self._run(begin, end, x, index, r, self.no_jacobians, valid, False)

@@ -35,13 +35,12 @@ from boxplus.cameras.projection import project_any
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.image_residual import PixelResidual
 from boxplus.residuals.camera.reprojection import check_pixels
 from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
 
 RHO_MIN = 1e-6  # inverse depth below which a point counts as at infinity [1/m]
-_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
 
 @kernel(inline=True)
@@ -146,7 +145,7 @@ def _inverse_depth(
             )
 
 
-class InverseDepthReprojection(ImageResidual):
+class InverseDepthReprojection(PixelResidual):
     """Points by bearing and inverse depth in an anchor camera, seen in cameras, as derived in the head of this file.
 
     Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,), both world to camera; `bearing_rho` on `Euclidean(3)`,
@@ -163,6 +162,8 @@ class InverseDepthReprojection(ImageResidual):
     Raises:
         InputError: pixels of another shape or not finite, or noise that `Whitening.of` refuses.
     """
+
+    no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
     def __init__(
         self,
@@ -183,14 +184,6 @@ class InverseDepthReprojection(ImageResidual):
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
         self._parameters = camera.padded_parameters
-
-    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
-        """See `Residual.linearize_into`."""
-        self._run(begin, end, x, index, r, jacobians, valid, True)
-
-    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        """See `Residual.evaluate_into`."""
-        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool

@@ -32,13 +32,11 @@ from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.image_residual import PixelResidual
 from boxplus.residuals.camera.inverse_depth import RHO_MIN, relative_pose, write_anchor_observer_point
 from boxplus.residuals.camera.reprojection import check_pixels
 from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
-
-_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
 
 
 @kernel
@@ -110,7 +108,7 @@ def _inverse_depth_intrinsics(
         J_intrinsics[n, 1, 3] = -1.0 - a22
 
 
-class InverseDepthIntrinsics(ImageResidual):
+class InverseDepthIntrinsics(PixelResidual):
     """As `InverseDepthReprojection`, with the pinhole intrinsics of both views as a variable, as derived above.
 
     Variables: `T_anchor_world` and `T_observer_world` on `SE3Left` (7,); `pixel_rho` on `Euclidean(3)`, the point's pixel in the
@@ -127,6 +125,8 @@ class InverseDepthIntrinsics(ImageResidual):
         InputError: pixels of another shape or not finite, `z_min` negative or not finite, or noise that `Whitening.of`
             refuses.
     """
+
+    no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
 
     def __init__(
         self,
@@ -148,14 +148,6 @@ class InverseDepthIntrinsics(ImageResidual):
             roles=("T_anchor_world", "T_observer_world", "pixel_rho", "intrinsics"),
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
-
-    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
-        """See `Residual.linearize_into`."""
-        self._run(begin, end, x, index, r, jacobians, valid, True)
-
-    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        """See `Residual.evaluate_into`."""
-        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool

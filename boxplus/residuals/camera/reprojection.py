@@ -28,11 +28,9 @@ from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.image_residual import PixelResidual
 from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
-
-_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
 
 @kernel(inline=True)
@@ -129,7 +127,7 @@ def check_pixels(name: str, pixels: ArrayLike, columns: int = 2) -> NDArray[np.f
     return array
 
 
-class Reprojection(ImageResidual):
+class Reprojection(PixelResidual):
     """Points seen in a calibrated camera: pixel − π(T_camera_world p_world), as derived in the head of this file.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m].
@@ -142,6 +140,8 @@ class Reprojection(ImageResidual):
     Raises:
         InputError: `pixels` of another shape or not finite, or noise that `Whitening.of` refuses.
     """
+
+    no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
     def __init__(
         self,
@@ -162,14 +162,6 @@ class Reprojection(ImageResidual):
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
         self._parameters = camera.padded_parameters
-
-    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
-        """See `Residual.linearize_into`."""
-        self._run(begin, end, x, index, r, jacobians, valid, True)
-
-    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        """See `Residual.evaluate_into`."""
-        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool

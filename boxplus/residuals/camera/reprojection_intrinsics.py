@@ -26,12 +26,10 @@ from boxplus.cameras.projection import intrinsics_jacobian_any, project_any
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.residuals.camera.image_residual import ImageResidual
+from boxplus.residuals.camera.image_residual import PixelResidual
 from boxplus.residuals.camera.reprojection import check_pixels, write_pose_point
 from boxplus.residuals.residual import Array, Arrays, Mask, Rows
 from boxplus.residuals.whitening import Whitening
-
-_NO_JACOBIANS = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
 
 
 @kernel
@@ -88,7 +86,7 @@ def _reprojection_intrinsics(
             intrinsics_jacobian_any(code, x, y, z, c0, c1, c2, c3, c4, c5, c6, c7, c8, -1.0, J_intrinsics[n])
 
 
-class ReprojectionIntrinsics(ImageResidual):
+class ReprojectionIntrinsics(PixelResidual):
     """Points seen in a camera that is calibrated along: pixel − π(T_camera_world p_world; intrinsics), as derived above.
 
     Variables: `T_camera_world` on `SE3Left` (7,), `p_world` on `Euclidean(3)` [m], `intrinsics` on `Euclidean(4)`, 6, 8
@@ -102,6 +100,8 @@ class ReprojectionIntrinsics(ImageResidual):
     Raises:
         InputError: `pixels` of another shape or not finite, or noise that `Whitening.of` refuses.
     """
+
+    no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))
 
     def __init__(
         self,
@@ -121,14 +121,6 @@ class ReprojectionIntrinsics(ImageResidual):
             roles=("T_camera_world", "p_world", "intrinsics"),
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
-
-    def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
-        """See `Residual.linearize_into`."""
-        self._run(begin, end, x, index, r, jacobians, valid, True)
-
-    def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
-        """See `Residual.evaluate_into`."""
-        self._run(begin, end, x, index, r, _NO_JACOBIANS, valid, False)
 
     def _run(
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
