@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bags import Container, Content, _Bag, _imu_message, _transform_message
 from numpy.typing import NDArray
+
+from tests.bags import Container, Content, _Bag, _imu_message, _transform_message
 
 START_NS = 1_700_000_000_123_456_789
 FRAME_NS = 50_000_000

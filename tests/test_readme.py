@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from small_problems import write_small_files
 
 from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.config import MapConfig
 from boxplus.simulation import simulate, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from tests.small_problems import write_small_files
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

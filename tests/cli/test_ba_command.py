@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_problems import bal_problem, colmap_model, gbp_problem
 from typer.testing import CliRunner, Result
 
 from boxplus.cli import app
@@ -18,6 +17,7 @@ from boxplus.formats.colmap import read_colmap, write_colmap
 from boxplus.formats.gbp import read_gbp, write_gbp
 from boxplus.formats.ply import read_ply
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from tests.small_problems import bal_problem, colmap_model, gbp_problem
 
 
 def call(*arguments: object) -> Result:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from small_problems import loop_graph
 from typer.testing import CliRunner, Result
 
 from boxplus.cli import app
@@ -20,6 +19,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph import pose_graph
 from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
+from tests.small_problems import loop_graph
 
 
 def call(*arguments: object) -> Result:

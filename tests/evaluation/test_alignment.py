@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from smooth_paths import SmoothPath, moved
 
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import align
+from tests.evaluation.smooth_paths import SmoothPath, moved
 
 
 @settings(max_examples=50, deadline=None)

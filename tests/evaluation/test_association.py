@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from smooth_paths import SmoothPath
 
 from boxplus.errors import InputError
 from boxplus.evaluation.association import associate
 from boxplus.formats.trajectory import Trajectory
+from tests.evaluation.smooth_paths import SmoothPath
 
 stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=40, unique=True).map(sorted)
 

@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from smooth_paths import SmoothPath, disturbed, moved
 
 from boxplus.errors import InputError
 from boxplus.evaluation.evaluation import evaluate
 from boxplus.evaluation.plots import write_plots
 from boxplus.evaluation.rpe import pairs_by_distance, pairs_by_time, relative_errors
 from boxplus.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from tests.evaluation.smooth_paths import SmoothPath, disturbed, moved
 
 T = np.arange(0.0, 28.0, 0.1)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_states import random_covariance, random_state
 
 from boxplus.filtering.degeneracy import pose_directions, project_out_weak, strong_step, with_weak_axis
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.update_step import map_step
+from tests.filtering.random_states import random_covariance, random_state
 
 THRESHOLD = 2.5
 TILT = 0.02  # of the normals [rad]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_states import random_covariance, random_state
 
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.iterated_update import Information, iterated_update
 from boxplus.filtering.nav_state import PL, TANGENT, NavState, P
+from tests.filtering.random_states import random_covariance, random_state
 
 seeds = st.integers(0, 2**32 - 1)
 POSITIONS = [3, 4, 5, 9, 10, 11]  # of p and p_L among the twelve components

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_states import derivative, random_state
 
 from boxplus.errors import InputError
 from boxplus.filtering.nav_state import PL, RL, TANGENT, NavState, P, R, boxplus_into, check_transform
 from boxplus.manifolds import so3
+from tests.filtering.random_states import derivative, random_state
 
 ROTATIONS = (slice(0, 3), slice(18, 21))
 # Identity, tiny, both sides of the switches from series to closed form, generic, just below a half turn.

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_states import random_covariance, random_state
 
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE, propagate_interval, propagate_step
 from boxplus.manifolds import so3
+from tests.filtering.random_states import random_covariance, random_state
 
 DENSITY = np.array([1e-3, 2e-2, 3e-4, 4e-3]) ** 2
 GAP_DENSITY = np.array([0.5, 3.0, 1e-4, 1e-3]) ** 2

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_states import derivative, random_covariance, random_state
 
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.propagation import N_A, N_P, N_R, N_V, N_W, NODE, P, R, V, propagate_step
 from boxplus.manifolds import so3
+from tests.filtering.random_states import derivative, random_covariance, random_state
 
 SILENT = np.zeros(4)
 DENSITY = np.array([1e-3, 2e-2, 3e-4, 4e-3]) ** 2

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_states import random_covariance
 
 from boxplus.filtering.small_linalg import cholesky_inverse_into
+from tests.filtering.random_states import random_covariance
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_states import derivative, random_covariance, random_state
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from boxplus.filtering.nav_state import MEASURED, TANGENT, NavState
 from boxplus.filtering.update_step import map_step, move_covariance
 from boxplus.manifolds import so3
+from tests.filtering.random_states import derivative, random_covariance, random_state
 
 seeds = st.integers(0, 2**32 - 1)
 

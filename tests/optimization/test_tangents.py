@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from small_problems import in_camera, scene
 
 import boxplus as bp
 from boxplus.manifolds import quaternion
@@ -21,6 +20,7 @@ from boxplus.manifolds.tangent_change import POSES
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.variables import Variables
+from tests.small_problems import in_camera, scene
 
 SIGMA = 0.5
 TOLERANCE = 1e-7  # of the cost: a million metres away a pixel is a matter of 1e-8

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import CONTAINERS, LAYOUTS, PERIOD_NS, START_NS, Content, write_bag
 from scipy.spatial.transform import Rotation
 
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from tests.bags import CONTAINERS, LAYOUTS, PERIOD_NS, START_NS, Content, write_bag
 
 
 def read(path: Path, options: RecordingOptions | None = None) -> tuple[list[Scan], list[ImuSamples]]:

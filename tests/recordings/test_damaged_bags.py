@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import CONTAINERS, Content, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -17,6 +16,7 @@ from boxplus.errors import RecordingError
 from boxplus.recordings import Recording, open_recording, sequential
 from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.scan import Scan
+from tests.bags import CONTAINERS, Content, write_bag
 
 CONTENT = Content(scans=12, points=60, imu_rate=50)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from small_problems import bal_problem, colmap_model, gbp_problem, in_camera, loop_graph
 from typer.testing import CliRunner
 
 from boxplus.cli import app
@@ -20,6 +19,7 @@ from boxplus.report.optimization_figures import cost_over_iterations, counts_per
 from boxplus.runs.optimization_summary import ErrorFacts, IterationFacts
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
+from tests.small_problems import bal_problem, colmap_model, gbp_problem, in_camera, loop_graph
 
 
 def test_bins_hold_every_valid_error() -> None:

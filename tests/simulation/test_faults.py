@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_simulations import small
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, faults
 from boxplus.simulation.live_recording import as_recording
+from tests.simulation.small_simulations import small
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_simulations import small
 from typer import Typer
 from typer.testing import CliRunner
 
@@ -20,6 +19,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults
 from boxplus.simulation.live_recording import IMU_TOPIC, LIDAR_TOPIC
 from boxplus.simulation.recording_writer import Format, write_recording
+from tests.simulation.small_simulations import small
 
 
 @pytest.fixture(scope="module")

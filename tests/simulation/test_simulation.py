@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_simulations import small
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import SCENARIOS, RosetteLidar, Simulation, SpinningLidar, make_scenario, mounting, simulate
+from tests.simulation.small_simulations import small
 
 QUICK = [name for name in SCENARIOS if name != "drive30"]
 

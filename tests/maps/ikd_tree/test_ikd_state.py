@@ -7,12 +7,12 @@ import os
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from brute_force_map import BruteForceMap
 from hypothesis import HealthCheck, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree import tree as ikd_tree
+from tests.maps.ikd_tree.brute_force_map import BruteForceMap
 
 MODES = ("incremental", "background", "inplace")
 CELL = 0.3

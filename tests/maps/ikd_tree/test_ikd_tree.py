@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from brute_force_map import squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -17,6 +16,7 @@ from boxplus.errors import InputError
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.check import InvariantError
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, knn5
+from tests.maps.ikd_tree.brute_force_map import squares
 
 compiled = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
 needs_compiler = pytest.mark.skipif(not compiled, reason="too many points for interpreted kernels")

@@ -26,7 +26,7 @@ def test_the_simulated_residuals_have_the_right_jacobians():
 def test_two_hundred_marginalisations_leak_nothing():
     _, _, leaks, _ = drive(0, 204, window=4)
     assert len(leaks) == 200 and not any(leak.is_anchored for leak in leaks)
-    assert max(leak.worst for leak in leaks) < 1e-12
+    assert max(leak.worst for leak in leaks) < 1e-10  # rounding, as `Leak.relative` says: 1e-14 to 3e-12 by seed and BLAS
     assert leaks[-1].per_sigma[:3].min() > 1e9  # metres
     assert "yaw: one sigma of the prior is" in leaks[-1].sentences()[3]
 

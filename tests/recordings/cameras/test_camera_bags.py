@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import CONTAINERS, Container
-from camera_recordings import FRAME_NS, START_NS, CameraBag, K, mounting, picture
 
 from boxplus import (
     CameraImage,
@@ -19,6 +17,8 @@ from boxplus import (
 )
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import CameraRecording
+from tests.bags import CONTAINERS, Container
+from tests.camera_recordings import FRAME_NS, START_NS, CameraBag, K, mounting, picture
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 

@@ -4,13 +4,13 @@ import importlib.util
 
 import numpy as np
 import pytest
-from camera_recordings import pgm
 from hypothesis import given
 from hypothesis import strategies as st
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras import decode
 from boxplus.recordings.cameras.decode import MalformedImageError, decode_file, decode_raw
+from tests.camera_recordings import pgm
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 RNG = np.random.default_rng(1)

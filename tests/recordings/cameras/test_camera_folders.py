@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_recordings import FRAME_NS, IMU_NS, START_NS, D, K, mounting, pgm, picture, sensor_yaml, write_euroc
 
 from boxplus import (
     CameraImage,
@@ -21,6 +20,7 @@ from boxplus import (
 from boxplus.errors import RecordingError
 from boxplus.recordings import CameraRecording
 from boxplus.residuals.inertial.imu_noise import ImuNoise
+from tests.camera_recordings import FRAME_NS, IMU_NS, START_NS, D, K, mounting, pgm, picture, sensor_yaml, write_euroc
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 

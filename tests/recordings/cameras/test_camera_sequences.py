@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_recordings import pgm, picture
 
 from boxplus import CameraImage, CameraRecordingOptions, Pinhole, open_camera_recording
 from boxplus.errors import RecordingError
 from boxplus.recordings import CameraRecording
+from tests.camera_recordings import pgm, picture
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 DEPTH = np.arange(96, dtype=np.uint16).reshape(8, 12) * 100

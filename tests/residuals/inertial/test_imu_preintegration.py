@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from imu_streams import dense_preintegration, random_stream
 
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from tests.residuals.inertial.imu_streams import dense_preintegration, random_stream
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
 BIAS_ACCEL, BIAS_GYRO = np.array([0.1, -0.2, 0.05]), np.array([-0.02, 0.03, 0.01])

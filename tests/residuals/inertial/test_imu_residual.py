@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from imu_streams import random_stream
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -27,6 +26,7 @@ from boxplus.residuals.inertial.imu import VELOCITY_BIAS, ImuPreintegration
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
+from tests.residuals.inertial.imu_streams import random_stream
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
 GRAVITY = np.array([0.3, -0.2, -9.7])

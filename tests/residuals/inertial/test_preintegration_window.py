@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from imu_streams import random_stream
 
 from boxplus.errors import InputError
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from tests.residuals.inertial.imu_streams import random_stream
 
 NOISE = ImuNoise(gyro=0.02, accel=0.1, gyro_walk=0.003, accel_walk=0.05)
 BIAS_ACCEL, BIAS_GYRO = (0.1, -0.2, 0.05), (-0.02, 0.03, 0.01)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from bags import PERIOD_NS, START_NS, Content, write_bag
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -20,6 +19,7 @@ from boxplus.runs.inspection.diagnosis import Diagnosis, diagnose
 from boxplus.runs.inspection.imu_checks import check_rest, check_saturation, first_second, quiet_stretch
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
+from tests.bags import PERIOD_NS, START_NS, Content, write_bag
 
 IMU_FROM_LIDAR = Rotation.from_euler("xyz", [0.5, -0.4, 1.2])
 AMPLITUDE, SPEED, PHASE = np.array([0.25, 0.2, 0.3]), np.array([2.1, 2.7, 1.7]), np.array([0.0, 1.0, 2.0])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from small_problems import in_camera, scene
 
 from boxplus.formats.bal import BalProblem
 from boxplus.formats.colmap_model import ColmapModel
@@ -14,6 +13,7 @@ from boxplus.formats.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.systems.bundle_adjustment.sightings import Sightings
+from tests.small_problems import in_camera, scene
 
 FOCAL, SIGMA = 500.0, 0.5
 FORMATS = ("bal", "gbp", "colmap")

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_problems import PARAMS, SIGMA_PX, bal_problem, colmap_model, gbp_problem
 
 from boxplus.errors import InputError
 from boxplus.formats.bal import read_bal
@@ -17,6 +16,7 @@ from boxplus.optimization import losses
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from tests.small_problems import PARAMS, SIGMA_PX, bal_problem, colmap_model, gbp_problem
 
 REFINED = BundleAdjustmentConfig(intrinsics="refined")
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import FORMATS, reconstruction, turned_around, with_points_behind
 from typer.testing import CliRunner
 
 from boxplus.cli import app
@@ -16,6 +15,7 @@ from boxplus.formats.bal import BalProblem, write_bal
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.cheirality import make_sound
 from boxplus.systems.bundle_adjustment.sightings import Sightings
+from tests.systems.bundle_adjustment.scenes import FORMATS, reconstruction, turned_around, with_points_behind
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import FORMATS, reconstruction, turning
 from typer.testing import CliRunner
 
 import boxplus as bp
@@ -16,6 +15,7 @@ from boxplus.manifolds import quaternion
 from boxplus.optimization.losses import Huber
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.sightings import Sightings
+from tests.systems.bundle_adjustment.scenes import FORMATS, reconstruction, turning
 
 SENTENCE = "the cameras do not move apart: images that only turn explain what was seen as well"
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SIGMA, reconstruction
 
 from boxplus.optimization import losses
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from tests.systems.bundle_adjustment.scenes import SIGMA, reconstruction
 
 CONFIG = BundleAdjustmentConfig(sigma_px=SIGMA)
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import FORMATS, SIGMA, perturbed, reconstruction
-from small_problems import scene
 
 import boxplus as bp
 from boxplus.errors import BoxplusError, InputError, NotFiniteError
 from boxplus.formats.reconstruction import Reconstruction
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from tests.small_problems import scene
+from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, perturbed, reconstruction
 
 
 def chosen(start: Reconstruction, rows: np.ndarray) -> Reconstruction:

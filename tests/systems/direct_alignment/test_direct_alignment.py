@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
-from stereo_depth import stereo_depth
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
@@ -18,6 +17,7 @@ from boxplus.optimization.losses import Squared
 from boxplus.residuals.camera.photometric import Photometric
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.direct_alignment import align_rgbd
+from tests.systems.direct_alignment.stereo_depth import stereo_depth
 
 CAMERA = Pinhole(100.0, 104.0, 79.5, 59.5)
 

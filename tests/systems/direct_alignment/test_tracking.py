@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from test_direct_alignment import CAMERA, degrees_and_metres, read_png, textured_plane
 
 from boxplus.cameras.distortion import RadialTangential
 from boxplus.cameras.pinhole import Pinhole
@@ -20,6 +19,7 @@ from boxplus.residuals.camera.photometric_sampling import sample
 from boxplus.systems.direct_alignment.alignment_kernel import linearize
 from boxplus.systems.direct_alignment.keyframe import Keyframe, Level
 from boxplus.systems.direct_alignment.tracking import Alignment, track
+from tests.systems.direct_alignment.test_direct_alignment import CAMERA, degrees_and_metres, read_png, textured_plane
 
 MOTION = se3.exp(np.array([0.02, -0.02, 0.01, 0.05, -0.03, 0.04]))
 LENS = RadialTangential(0.2, -0.3, 0.002, -0.003, 0.1)

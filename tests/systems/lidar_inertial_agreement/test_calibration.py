@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_platforms import CONFIG, data, handheld
 
 from boxplus.manifolds import so3
 from boxplus.simulation import faults
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, calibrate
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
 
 SEEDS = (0, 2, 4, 6)
 

@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from small_platforms import CONFIG, data, handheld
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
@@ -15,6 +14,7 @@ from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.backwards import lidar_path_backwards, surer_path
 from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Twist, lidar_path
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
 """Its columns lie six degrees apart: at ten metres a metre, along a column a sixth of that."""

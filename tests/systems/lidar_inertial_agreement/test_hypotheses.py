@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_platforms import CONFIG, data, handheld, turned
 
 from boxplus.simulation import Fault, faults
 from boxplus.systems.lidar_inertial_agreement import agreement as agreement_module
@@ -20,6 +19,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     lengths_of_many,
     slope_of,
 )
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, turned
 
 FEET = 3.28084
 

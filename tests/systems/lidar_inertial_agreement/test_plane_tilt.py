@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from small_platforms import CONFIG, data
 
 from boxplus.manifolds import so3
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting, sites, worlds
@@ -16,6 +15,7 @@ from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 LIDAR = SpinningLidar(channels=24, azimuth_steps=120)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_platforms import CONFIG, LIDAR, data
 
 from boxplus.simulation import ImuModel, Scenario, Simulation, manoeuvres, trajectories, worlds
 from boxplus.simulation.spline import Trajectory
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, LIDAR, data
 
 ROOM = (24.0, 20.0, 5.0)
 START = (-5.0, -2.0, 1.5)

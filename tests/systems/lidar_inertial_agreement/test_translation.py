@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_platforms import data, handheld
-from test_explained_scans import true_path
 
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
+from tests.systems.lidar_inertial_agreement.small_platforms import data, handheld
+from tests.systems.lidar_inertial_agreement.test_explained_scans import true_path
 
 
 def fit(seed: int, bend_m: float = 0.0, at: float = 0.5, length: float = 1.0) -> TranslationFit:

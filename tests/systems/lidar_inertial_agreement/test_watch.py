@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_platforms import CONFIG, data, handheld
 
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement import watch
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
 
 
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_runs import SPARSE, Run, run
 
 from boxplus.errors import InputError
 from boxplus.recordings.open import open_recording
@@ -20,6 +19,7 @@ from boxplus.simulation.faults import Event
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from tests.systems.lidar_inertial_odometry.simulated_runs import SPARSE, Run, run
 
 AT_S, WALK_S = 5.0, 8.0
 

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from small_drives import config, position_errors, room_walk, run
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
@@ -18,6 +17,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from tests.systems.lidar_inertial_odometry.small_drives import config, position_errors, room_walk, run
 
 MS = 1_000_000
 

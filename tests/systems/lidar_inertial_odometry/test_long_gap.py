@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from simulated_runs import SPARSE
 
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -12,6 +11,7 @@ from boxplus.simulation import simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from tests.systems.lidar_inertial_odometry.simulated_runs import SPARSE
 
 HOUR_NS = 3_600_000_000_000
 

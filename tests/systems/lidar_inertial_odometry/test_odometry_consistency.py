@@ -8,7 +8,6 @@ the simulator draws it from.
 from __future__ import annotations
 
 import numpy as np
-from simulated_runs import SPARSE
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.manifolds import so3
@@ -17,6 +16,7 @@ from boxplus.simulation import ImuModel, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from tests.systems.lidar_inertial_odometry.simulated_runs import SPARSE
 
 RUNS, DURATION_S = 60, 3.5
 INSTANTS = (-6, -1)  # half a second before the end, and the end

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_drives import LIDAR, config, frames, room_walk
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
@@ -15,6 +14,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import Scenario, SpinningLidar, simulate, sites, trajectories
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
+from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, frames, room_walk
 
 
 def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:

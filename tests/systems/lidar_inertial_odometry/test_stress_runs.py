@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from simulated_runs import run
+
+from tests.systems.lidar_inertial_odometry.simulated_runs import run
 
 
 @pytest.mark.parametrize(("scenario", "duration_s", "metres", "degrees"), [

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from small_drives import LIDAR, config, run
 
 from boxplus.filtering.degeneracy import pose_directions
 from boxplus.filtering.iterated_update import Information, Posterior
@@ -14,6 +13,7 @@ from boxplus.simulation import Scenario, Simulation, manoeuvres, worlds
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
+from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, run
 
 AXIS = np.array([1.0, 0.0, 0.0])
 CELL_M = 0.25

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_recordings import FRAME_NS, START_NS, CameraBag, pgm, write_euroc
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -20,6 +19,7 @@ from boxplus.recordings import CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
 from boxplus.sensors.imu import ImuSamples
+from tests.camera_recordings import FRAME_NS, START_NS, CameraBag, pgm, write_euroc
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 BIAS = np.array([-0.003, 0.02, 0.08])
