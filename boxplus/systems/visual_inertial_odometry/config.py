@@ -1,0 +1,52 @@
+"""The settings of visual-inertial odometry. None has to be given."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class VioConfig(BaseModel):
+    """Settings of `VisualInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz).
+
+    Raises:
+        pydantic.ValidationError: a setting is unknown or out of range.
+
+    Example:
+        >>> VioConfig(keyframes=8).keyframes
+        8
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cameras: Literal["all", "first"] = Field("all", description="all cameras of the rig (stereo), or the first one alone (mono)")
+    features: int = Field(150, ge=30, le=2000, description="corners followed at most")
+    cell_size: int = Field(40, ge=8, description="side of the cells of the image that hold a corner or two each [px]")
+    pixel_sigma: float = Field(0.5, gt=0, description="standard deviation of a tracked corner along each axis [px]")
+    there_and_back: float = Field(0.7, gt=0, description="a corner tracked to the next image and back ends this near [px]")
+    epipolar: float = Field(1.5, gt=0, description="a corner lies this near to its epipolar line in another image [px]")
+    keyframes: int = Field(8, ge=3, le=30, description="keyframes in the window")
+    recent_frames: int = Field(2, ge=1, le=5, description="newest frames that are kept whether keyframes or not")
+    keyframe_parallax: float = Field(
+        12.0, gt=0, description="parallax since the last keyframe that makes a new one, in the mean [px]"
+    )
+    keyframe_tracked: float = Field(0.7, gt=0, lt=1, description="a smaller share of landmarks still tracked makes a keyframe")
+    keyframe_interval: float = Field(1.0, gt=0, description="longest time between keyframes while moving [s]")
+    max_iterations: int = Field(4, ge=1, le=50, description="most steps of the solver, per frame")
+    gyro_noise: float | None = Field(None, gt=0, description="gyroscope noise [rad/s/√Hz]; None is what the rig states")
+    accel_noise: float | None = Field(None, gt=0, description="accelerometer noise [m/s²/√Hz]; None is what the rig states")
+    gyro_bias_walk: float | None = Field(
+        None, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]; None is what the rig states"
+    )
+    accel_bias_walk: float | None = Field(
+        None, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]; None is what the rig states"
+    )
+    gravity: float = Field(9.81, gt=9.7, lt=9.9, description="magnitude of gravity [m/s²]")
+    max_imu_gap: float = Field(0.15, gt=0, description="longest interval between IMU samples that is integrated over [s]")
+    extrinsic_estimation: bool = Field(False, description="refine T_imu_camera of every camera while running")
+    extrinsic_rotation_sigma_deg: float = Field(0.2, gt=0, description="of the rotation in T_imu_camera, about each axis [deg]")
+    extrinsic_translation_sigma: float = Field(0.005, gt=0, description="of the translation in T_imu_camera, along each axis [m]")
+    time_offset_estimation: bool = Field(False, description="refine the offset of the cameras' clock while running")
+    time_offset_sigma: float = Field(0.005, gt=0, description="standard deviation of the clocks' offset beforehand [s]")
+    start_duration: float = Field(1.0, gt=0, description="time over which the start is observed, at rest or moving [s]")

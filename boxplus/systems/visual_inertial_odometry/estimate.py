@@ -1,0 +1,61 @@
+"""What visual-inertial odometry says about one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Status = Literal["starting", "ok", "weak", "lost"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VioEstimate:
+    """State, covariance and diagnosis at the time of one frame (all images of one instant).
+
+    Attributes:
+        time_ns: of the images, in the clock of the IMU [ns].
+        status: "starting": no start was found yet, and there is no state; "ok"; "weak": the cameras saw too little, or something
+            contradicts, so that the covariance is the better part of the estimate; "lost": nothing was seen for so long that the
+            IMU alone does not hold the pose any more, or the sensors contradict each other.
+        reasons: why the status is not "ok", a sentence each, with numbers.
+        T_world_imu: (4, 4) pose of the IMU in the world, whose z is up; NaN while starting.
+        velocity_world: (3,) [m/s].
+        gyro_bias: (3,) [rad/s]; accel_bias: (3,) [m/s²].
+        covariance: (15, 15) of the tangent `[θ, p, v, b_ω, b_a]`: rotation perturbed on the right (IMU frame) [rad], position
+            and velocity along the world's axes. Relative to the first pose, whose position and yaw are known by definition.
+        tracked: landmarks of the window seen in this frame that agree with it.
+        new: corners found in this frame.
+        rejected: corners and observations that were not used, by reason.
+        is_keyframe: whether the frame became a keyframe.
+        weak_directions: directions of the motion that this frame does not determine, a sentence each.
+        landmark_ids: (m,) int64 of the landmarks in the window; a landmark's last position is its best.
+        landmarks: (m, 3) their positions in the world [m].
+        landmark_sigmas: (m,) standard deviation of the distance from the camera that found them [m].
+        T_imu_camera: (c, 4, 4) as refined, or as given.
+        time_offset_s: added to the times of the images, beside what the recording knows [s].
+        timing_s: seconds spent, by stage.
+    """
+
+    time_ns: int
+    status: Status
+    reasons: tuple[str, ...]
+    T_world_imu: NDArray[np.float64]
+    velocity_world: NDArray[np.float64]
+    gyro_bias: NDArray[np.float64]
+    accel_bias: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    tracked: int
+    new: int
+    rejected: Mapping[str, int]
+    is_keyframe: bool
+    weak_directions: tuple[str, ...]
+    landmark_ids: NDArray[np.int64]
+    landmarks: NDArray[np.float64]
+    landmark_sigmas: NDArray[np.float64]
+    T_imu_camera: NDArray[np.float64]
+    time_offset_s: float
+    timing_s: Mapping[str, float]

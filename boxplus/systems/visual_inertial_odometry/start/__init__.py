@@ -1,0 +1,1 @@
+"""Where visual-inertial odometry begins: attitude, velocity, biases and, with one camera, scale."""

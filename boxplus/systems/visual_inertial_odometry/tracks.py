@@ -1,0 +1,39 @@
+"""What the images of one instant show of the corners that are followed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """The corners seen at one instant.
+
+    Attributes:
+        time_ns: of the images, in the clock of the IMU [ns].
+        ids: (n,) int64, ascending; a corner keeps its id from image to image, and it is never given again.
+        pixels: (n, c, 2) where each camera sees it, as recorded, distortion included [px]; NaN where a camera does not.
+        rays: (n, c, 3) the same as [X/Z, Y/Z, 1] in the camera frame; NaN where a camera does not see it.
+        is_new: (n,) bool, found in this image.
+        rejected: corners of the image before that were lost, by reason.
+        motion_px: median motion of the corners in the first camera since the image before [px]; NaN without any.
+        brightness: (c,) mean grey value of each camera, NaN without an image.
+        contrast: (c,) standard deviation of the grey values, NaN without an image.
+    """
+
+    time_ns: int
+    ids: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    rays: NDArray[np.float64]
+    is_new: NDArray[np.bool_]
+    rejected: Mapping[str, int]
+    motion_px: float
+    brightness: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.ids)
