@@ -28,6 +28,9 @@ class VioConfig(BaseModel):
     epipolar: float = Field(1.5, gt=0, description="a corner lies this near to its epipolar line in another image [px]")
     keyframes: int = Field(8, ge=3, le=30, description="keyframes in the window")
     recent_frames: int = Field(2, ge=1, le=5, description="newest frames that are kept whether keyframes or not")
+    spared_keyframes: int = Field(
+        2, ge=1, le=5, description="newest keyframes whose sight of a landmark that leaves the window founds it anew"
+    )
     keyframe_parallax: float = Field(
         12.0, gt=0, description="parallax since the last keyframe that makes a new one, in the mean [px]"
     )

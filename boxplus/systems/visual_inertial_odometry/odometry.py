@@ -1,20 +1,38 @@
 """Visual-inertial odometry: a sliding window of keyframes with IMU, landmarks and a prior of first estimates.
 
+Every frame: corners are followed into the new images, starting where the gyroscope puts them; the IMU predicts pose and velocity;
+the window is minimised over reprojection, IMU and prior; what does not fit is left out; what leaves the window stays as a prior.
+docs/visual_inertial_odometry.md derives the terms.
+
 Source: Qin, Li and Shen, VINS-Mono, TRO 2018; Leutenegger et al., OKVIS, IJRR 2015; Usenko et al., Basalt, RA-L 2020.
 """
 
 from __future__ import annotations
 
-from typing import overload
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, overload
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.rig import Rig
-from boxplus.systems.visual_inertial_odometry.start.start import Start
+from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.window import Window
+
+_OUTLIER = 4.0  # standard deviations
+_LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
+_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 13, 14, 9, 10, 11]  # [θ, p, v, b_a, b_ω] → [θ, p, v, b_ω, b_a]
 
 
 class VisualInertialOdometry:
@@ -29,9 +47,17 @@ class VisualInertialOdometry:
     """
 
     def __init__(self, config: VioConfig | None, rig: Rig) -> None:
-        self.config, self.rig = config or VioConfig(), rig
+        self.config = config or VioConfig()
+        self.rig = rig if self.config.cameras == "all" else replace(rig, cameras=rig.cameras[:1], mountings=rig.mountings[:1])
         self.start: Start | None = None
         self.start_problem: str | None = None
+        self.window = Window(self.config, self.rig)
+        self._tracker = FeatureTracker(self.config, self.rig)
+        self._imu = ImuSamples.joined([])
+        self._images: dict[int, dict[int, NDArray[Any]]] = {}
+        self._waiting: deque[Tracks] = deque()
+        self._time_ns = 0  # of the frame before
+        self._counters: Counter[str] = Counter()
 
     @overload
     def push_imu(self, samples: ImuSamples) -> list[VioEstimate]: ...
@@ -41,12 +67,154 @@ class VisualInertialOdometry:
         self, samples: ImuSamples | ArrayLike, gyro: ArrayLike | None = None, accel: ArrayLike | None = None
     ) -> list[VioEstimate]:
         """Take IMU samples, or times (N,) int64 [ns] with gyro (N, 3) [rad/s] and accel (N, 3) [m/s²]."""
-        return []
+        if not isinstance(samples, ImuSamples):
+            if gyro is None or accel is None:
+                raise InputError("times, gyro and accel", "times alone", "give all three, or ImuSamples")
+            samples = ImuSamples.from_arrays(samples, gyro, accel)
+        last = self._imu.time_ns[-1] if len(self._imu) else -(2**62)
+        ahead = samples.time_ns > np.maximum.accumulate(np.concatenate([[last], samples.time_ns[:-1]]))
+        usable = ahead & np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
+        self._counters["IMU samples not finite or out of order"] += int((~usable).sum())
+        chosen = ImuSamples(samples.time_ns[usable], samples.gyro[usable], samples.accel[usable])
+        self._imu = ImuSamples.joined([self._imu, chosen])
+        return self._advance(final=False)
 
     def push_image(self, image: CameraImage) -> list[VioEstimate]:
-        """Take an image; returns the estimates that became ready."""
-        return []
+        """Take an image; returns the estimates that became ready.
+
+        Raises:
+            InputError: an image of a camera that the rig does not have, or of another size than its calibration's.
+        """
+        if not 0 <= image.camera < len(self.rig.cameras):
+            if self.config.cameras == "first":
+                return []
+            raise InputError(f"cameras 0 to {len(self.rig.cameras) - 1}", f"camera {image.camera}", "give the rig all cameras")
+        camera = self.rig.cameras[image.camera]
+        if image.shape != (camera.height, camera.width):
+            got = f"{image.shape[1]}x{image.shape[0]} pixels of {image.name}"
+            raise InputError(f"{camera.width}x{camera.height} pixels, as calibrated", got, "calibrate for the size of the images")
+        if image.time_ns <= self._time_ns:
+            self._counters["images out of order"] += 1
+            return []
+        self._images.setdefault(image.time_ns, {})[image.camera] = image.grey()
+        return self._advance(final=False)
 
     def flush(self) -> list[VioEstimate]:
         """No more data will come: process what still waits."""
-        return []
+        return self._advance(final=True)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What could not be used before it reached the window, by reason."""
+        return Counter({reason: count for reason, count in self._counters.items() if count})
+
+    def _advance(self, *, final: bool) -> list[VioEstimate]:
+        """The frames that are complete, and covered by IMU samples."""
+        estimates = []
+        for time_ns in sorted(self._images):
+            complete = len(self._images[time_ns]) == len(self.rig.cameras) or final or time_ns < max(self._images)
+            if not complete or not len(self._imu) or self._imu.time_ns[-1] < time_ns:
+                break
+            images = self._images.pop(time_ns)
+            if self._imu.time_ns[0] > time_ns:
+                self._counters["images before the first IMU sample"] += 1
+                continue
+            estimates.append(self._frame(time_ns, images))
+            self._time_ns = time_ns
+        return estimates
+
+    def _frame(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
+        if self.start is None:
+            return self._before_start(time_ns, images)
+        pose, state = self.window.predict(time_ns, self._imu)
+        before = self.window.bodies.values[-1]
+        R = quaternion.to_matrix(before[:4]).T
+        tracks = self._tracker.track(time_ns, images, R @ quaternion.to_matrix(pose[:4]), R @ (pose[4:] - before[4:]))
+        is_keyframe = self.window.wants_keyframe(tracks, pose)
+        if is_keyframe:
+            tracks = self._tracker.detect(tracks)
+        self.window.add(tracks, pose, state, is_keyframe, self._imu)
+        self.window.solve()
+        agreed, not_agreed, given_up = self.window.reject(_OUTLIER)
+        self._tracker.forget(given_up)
+        estimate = self._estimate(tracks, is_keyframe, agreed, not_agreed)
+        self.window.shrink()
+        oldest = int(np.searchsorted(self._imu.time_ns, self.window.frames[0].time_ns)) - 2
+        if oldest > 0:
+            self._imu = ImuSamples(self._imu.time_ns[oldest:], self._imu.gyro[oldest:], self._imu.accel[oldest:])
+        return estimate
+
+    def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
+        turn = np.eye(3)
+        if self._waiting:
+            chosen = (self._imu.time_ns >= self._time_ns - 20_000_000) & (self._imu.time_ns <= time_ns + 20_000_000)
+            attitude = GyroAttitude(self._imu.time_ns[chosen], self._imu.gyro[chosen])
+            before, now = attitude.at(np.array([self._time_ns, time_ns]))
+            turn = before.T @ now
+        tracks = self._tracker.detect(self._tracker.track(time_ns, images, turn))
+        self._waiting.append(tracks)
+        while time_ns - self._waiting[0].time_ns > _LONGEST_START * self.config.start_duration * 1e9:
+            self._waiting.popleft()
+        seen = list(self._waiting)
+        start = find_start(seen, self._imu, self.rig, self.config) if len(seen) > 1 else "one frame so far"
+        if isinstance(start, str):
+            self.start_problem = start
+            return self._nothing(tracks, start)
+        self.start, self.start_problem = start, None
+        self._waiting.clear()
+        self.window.begin(start, [seen[k] for k in start.frames], self._imu)
+        self.window.solve()
+        agreed, not_agreed, given_up = self.window.reject(_OUTLIER)
+        self._tracker.forget(given_up)
+        return self._estimate(tracks, True, agreed, not_agreed)
+
+    def _nothing(self, tracks: Tracks, reason: str) -> VioEstimate:
+        nan = np.full(3, np.nan)
+        return VioEstimate(
+            time_ns=tracks.time_ns,
+            status="starting",
+            reasons=(reason,),
+            T_world_imu=np.full((4, 4), np.nan),
+            velocity_world=nan,
+            gyro_bias=nan,
+            accel_bias=nan,
+            covariance=np.full((15, 15), np.nan),
+            tracked=0,
+            new=int(tracks.is_new.sum()),
+            rejected=tracks.rejected,
+            is_keyframe=False,
+            weak_directions=(),
+            landmark_ids=np.zeros(0, np.int64),
+            landmarks=np.zeros((0, 3)),
+            landmark_sigmas=np.zeros(0),
+            T_imu_camera=np.array([camera.T_imu_camera for camera in self.rig.cameras]),
+            time_offset_s=0.0,
+            timing_s={},
+        )
+
+    def _estimate(self, tracks: Tracks, is_keyframe: bool, agreed: int, not_agreed: int) -> VioEstimate:
+        pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = quaternion.to_matrix(pose[:4]), pose[4:]
+        ids, landmarks = self.window.landmarks()
+        return VioEstimate(
+            time_ns=tracks.time_ns,
+            status="ok",
+            reasons=(),
+            T_world_imu=T,
+            velocity_world=state[:3].copy(),
+            gyro_bias=state[6:].copy(),
+            accel_bias=state[3:6].copy(),
+            covariance=self.window.covariance()[np.ix_(_ORDER, _ORDER)],
+            tracked=agreed,
+            new=int(tracks.is_new.sum()),
+            rejected={**tracks.rejected, "does not fit the window": not_agreed},
+            is_keyframe=is_keyframe,
+            weak_directions=(),
+            landmark_ids=ids,
+            landmarks=landmarks,
+            landmark_sigmas=np.zeros(len(ids)),
+            T_imu_camera=np.array([camera.T_imu_camera for camera in self.rig.cameras]),
+            time_offset_s=0.0,
+            timing_s={"opencv": self._tracker.opencv_s},
+        )

@@ -1,0 +1,250 @@
+"""Corners followed through the images of a rig: optical flow from where gyroscope and depth say, checked there and back.
+
+Corners are found in the first camera, in cells of its image that hold none, and followed from image to image there. The other
+cameras are searched in every instant, from where the depth known so far puts the corner, so that a corner's place in them never
+drifts away from that in the first. What is believed has come back to where it began, and lies on its epipolar line.
+
+Source: Lucas and Kanade 1981; Bouguet, Pyramidal implementation, 2001; Shi and Tomasi 1994; all three in OpenCV.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.rig import Rig
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+
+_WINDOW = (21, 21)
+_LEVELS = 3
+_STOP = (3, 30, 0.01)
+_QUALITY = 0.01  # of a corner against the best one of the image (Shi and Tomasi)
+_BORDER = 8  # px within which no corner is kept
+_LEAST_SPREAD = 4.0  # grey values; an image with a smaller standard deviation shows nothing
+_FAR = 1e-3  # 1/m
+_GUESSED = 4  # cv2.OPTFLOW_USE_INITIAL_FLOW
+
+Floats = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+
+def opencv() -> Any:
+    """The module cv2.
+
+    Raises:
+        InputError: it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module("cv2")
+    except ImportError:
+        raise InputError("OpenCV, which follows corners", "it is not installed", "pip install 'boxplus[vision]'") from None
+
+
+class FeatureTracker:
+    """Follows corners through the images of a rig.
+
+    Call `track` for the images of every instant, then `detect` where new corners are wanted.
+
+    Args:
+        rig: the first camera is the one in which corners are found and followed.
+
+    Raises:
+        InputError: OpenCV is not installed.
+
+    Attributes:
+        opencv_s: seconds spent in OpenCV for the last instant.
+    """
+
+    def __init__(self, config: VioConfig, rig: Rig) -> None:
+        self._cv2, self._config, self._rig = opencv(), config, rig
+        self._images: list[Grey | None] = [None] * len(rig.cameras)
+        self._before: Grey | None = None
+        self._ids = np.zeros(0, np.int64)
+        self._pixels = np.zeros((0, len(rig.cameras), 2))
+        self._rays = np.zeros((0, len(rig.cameras), 3))
+        self._rho = np.zeros(0)
+        self._next_id = 0
+        self.opencv_s = 0.0
+        T = [camera.T_imu_camera for camera in rig.cameras]
+        self._R_imu_first = T[0][:3, :3]
+        self._p_imu_first = T[0][:3, 3]
+        self._others = [np.linalg.inv(t) @ T[0] for t in T[1:]]  # first camera to each other one
+
+    def track(
+        self, time_ns: int, images: Mapping[int, NDArray[Any]], R_before_now: Floats, p_before_now: Floats | None = None
+    ) -> Tracks:
+        """Follow the corners into the images of the next instant.
+
+        Args:
+            images: grey images (H, W) by the number of their camera; without that of the first camera all corners are lost.
+            R_before_now: (3, 3) attitude of the IMU now in its frame at the instant before.
+            p_before_now: (3,) its position there [m], where known.
+        """
+        self.opencv_s = 0.0
+        greys = [None if images.get(c) is None else grey_8_bit(images[c]) for c in range(len(self._rig.cameras))]
+        rejected: Counter[str] = Counter()
+        motion = float("nan")
+        before, now = self._images[0], greys[0]
+        if len(self._ids) and (now is None or before is None):
+            rejected["no image of the first camera"] += len(self._ids)
+            self._keep(np.zeros(len(self._ids), dtype=np.bool_))
+        elif len(self._ids) and now is not None and before is not None:
+            old = self._pixels[:, 0].copy()
+            guess, rho = self._predicted(R_before_now, np.zeros(3) if p_before_now is None else p_before_now)
+            there, kept = self._flow(before, now, old, guess, rejected)
+            inside = self._inside(there, 0)
+            rejected["left the image"] += int((kept & ~inside).sum())
+            kept &= inside
+            self._rho = rho
+            self._pixels[:, 0] = there
+            motion = float(np.median(np.linalg.norm(there[kept] - old[kept], axis=1))) if kept.any() else motion
+            rays, found = self._rig.cameras[0].model.unproject(there)
+            kept &= found
+            self._rays[:, 0] = rays
+            self._keep(kept)
+        self._images, self._before = greys, now
+        self._search_others(np.ones(len(self._ids), dtype=np.bool_), rejected)
+        return self._tracks(time_ns, np.zeros(len(self._ids), dtype=np.bool_), rejected, motion)
+
+    def detect(self, tracks: Tracks) -> Tracks:
+        """The tracks of this instant with new corners, where cells of the first image hold none."""
+        grey = self._images[0]
+        room = self._config.features - len(self._ids)
+        if grey is None or room <= 0 or float(tracks.contrast[0]) < _LEAST_SPREAD:
+            return tracks
+        begin = time.perf_counter()
+        cell = self._config.cell_size
+        corners = self._cv2.goodFeaturesToTrack(grey, room, _QUALITY, 0.6 * cell, mask=self._empty(grey.shape, cell))
+        self.opencv_s += time.perf_counter() - begin
+        if corners is None:
+            return tracks
+        pixels = corners.reshape(-1, 2).astype(np.float64)
+        rays, found = self._rig.cameras[0].model.unproject(pixels)
+        pixels, rays = pixels[found], rays[found]
+        count, cameras = len(pixels), len(self._rig.cameras)
+        fresh = np.arange(len(self._ids) + count) >= len(self._ids)
+        self._ids = np.append(self._ids, self._next_id + np.arange(count))
+        self._next_id += count
+        self._pixels = np.concatenate([self._pixels, np.full((count, cameras, 2), np.nan)])
+        self._rays = np.concatenate([self._rays, np.full((count, cameras, 3), np.nan)])
+        self._pixels[fresh, 0], self._rays[fresh, 0] = pixels, rays
+        typical = float(np.median(self._rho[self._rho > _FAR])) if (self._rho > _FAR).any() else 0.0
+        self._rho = np.append(self._rho, np.full(count, typical))
+        rejected = Counter(tracks.rejected)
+        self._search_others(fresh, rejected)
+        return self._tracks(tracks.time_ns, fresh, rejected, tracks.motion_px)
+
+    def forget(self, ids: NDArray[np.int64]) -> None:
+        """Follow these corners no longer: they move on their own, or were never corners."""
+        self._keep(~np.isin(self._ids, ids))
+
+    def _tracks(self, time_ns: int, fresh: NDArray[np.bool_], rejected: Counter[str], motion_px: float) -> Tracks:
+        brightness, contrast = np.full((2, len(self._images)), np.nan)
+        for k, image in enumerate(self._images):
+            if image is not None:
+                some = image[::8, ::8]
+                brightness[k], contrast[k] = some.mean(), some.std()
+        counts = {reason: count for reason, count in rejected.items() if count}
+        return Tracks(
+            time_ns, self._ids.copy(), self._pixels.copy(), self._rays.copy(), fresh, counts, motion_px, brightness, contrast
+        )
+
+    def _keep(self, kept: NDArray[np.bool_]) -> None:
+        self._ids, self._rho = self._ids[kept], self._rho[kept]
+        self._pixels, self._rays = self._pixels[kept], self._rays[kept]
+
+    def _predicted(self, R: Floats, p: Floats) -> tuple[Floats, Floats]:
+        """Where the corners should be in the first image now (n, 2), and their inverse depths there (n,)."""
+        R_now_before = self._R_imu_first.T @ R.T @ self._R_imu_first
+        t = self._R_imu_first.T @ (R.T @ (self._p_imu_first - p) - self._p_imu_first)
+        points = self._rays[:, 0] @ R_now_before.T + self._rho[:, None] * t
+        pixels, seen = self._rig.cameras[0].model.project(points)
+        ahead = seen & (points[:, 2] > 0.2)
+        rho = np.where(ahead, self._rho / np.where(ahead, points[:, 2], 1.0), 0.0)
+        return np.where(ahead[:, None], pixels, self._pixels[:, 0]), rho
+
+    def _flow(
+        self, first: Grey, second: Grey, old: Floats, guess: Floats, rejected: Counter[str]
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Where `old` (n, 2) of the first image is in the second, and whether it was found there and comes back."""
+        begin = time.perf_counter()
+        start = old.astype(np.float32)
+        options = {"winSize": _WINDOW, "maxLevel": _LEVELS, "criteria": _STOP, "flags": _GUESSED}
+        there, found, _ = self._cv2.calcOpticalFlowPyrLK(first, second, start, guess.astype(np.float32), **options)
+        back, returned, _ = self._cv2.calcOpticalFlowPyrLK(second, first, there, start.copy(), **options)
+        self.opencv_s += time.perf_counter() - begin
+        ok = (found.ravel() == 1) & (returned.ravel() == 1)
+        close = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < self._config.there_and_back
+        rejected["not found again"] += int((~ok).sum())
+        rejected["did not come back to where it began"] += int((ok & ~close).sum())
+        return there.reshape(-1, 2).astype(np.float64), ok & close
+
+    def _search_others(self, which: NDArray[np.bool_], rejected: Counter[str]) -> None:
+        """Find the corners `which` (n,) of the first image in the other cameras."""
+        rows = np.flatnonzero(which)
+        first = self._images[0]
+        self._pixels[rows, 1:], self._rays[rows, 1:] = np.nan, np.nan
+        for c, T in enumerate(self._others, start=1):
+            image = self._images[c]
+            if image is None or first is None or not len(rows):
+                continue
+            model = self._rig.cameras[c].model
+            m = self._rays[rows, 0]
+            turned = m @ T[:3, :3].T
+            guess, seen = model.project(turned + self._rho[rows, None] * T[:3, 3])
+            tried = rows[seen & self._inside(guess, c)]
+            guess = guess[seen & self._inside(guess, c)]
+            if not len(tried):
+                continue
+            there, kept = self._flow(first, image, self._pixels[tried, 0], guess, Counter())
+            rays, found = model.unproject(there)
+            kept &= found & self._inside(there, c)
+            # y = (turned + ρ t) / z lies on the line through turned and t: n = t × turned is at right angles to it.
+            turned = self._rays[tried, 0] @ T[:3, :3].T
+            n = np.cross(T[:3, 3], turned)
+            off = np.abs((n * rays).sum(axis=1)) / np.linalg.norm(n[:, :2], axis=1) * model.fx
+            on_line = off < self._config.epipolar
+            rho, rho_sigma = _inverse_depth(turned, T[:3, 3], rays, 2.0 * self._config.pixel_sigma / model.fx)
+            before = rho > -rho_sigma
+            rejected["off its epipolar line"] += int((kept & ~on_line).sum())
+            rejected["behind the camera by its disparity"] += int((kept & on_line & ~before).sum())
+            kept &= on_line & before
+            self._pixels[tried[kept], c], self._rays[tried[kept], c] = there[kept], rays[kept]
+            self._rho[tried[kept]] = np.maximum(rho[kept], 0.0)
+
+    def _inside(self, pixels: Floats, camera: int) -> NDArray[np.bool_]:
+        size = np.array([self._rig.cameras[camera].width, self._rig.cameras[camera].height])
+        return np.asarray(((pixels >= _BORDER) & (pixels <= size - 1 - _BORDER)).all(axis=1))
+
+    def _empty(self, shape: tuple[int, ...], cell: int) -> Grey:
+        """(H, W) 255 in cells without a corner and around them no nearer to one than half a cell, else 0."""
+        mask = np.full(shape, 255, np.uint8)
+        mask[:_BORDER], mask[-_BORDER:], mask[:, :_BORDER], mask[:, -_BORDER:] = 0, 0, 0, 0
+        half = cell // 2
+        for u, v in np.rint(self._pixels[:, 0]).astype(np.int64):
+            mask[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1] = 0
+        return mask
+
+
+def _inverse_depth(turned: Floats, t: Floats, rays: Floats, sigma: float) -> tuple[Floats, Floats]:
+    """ρ (n,) in the first camera by which turned + ρ t points along the rays (n, 3) of the second, and its sigma."""
+    # Two equations, x: turned_x + ρ t_x = y_x (turned_z + ρ t_z), and likewise for y; least squares of both.
+    a = t[:2] - rays[:, :2] * t[2]
+    b = rays[:, :2] * turned[:, 2:3] - turned[:, :2]
+    square = np.maximum((a * a).sum(axis=1), 1e-12)
+    return (a * b).sum(axis=1) / square, sigma / np.sqrt(square)
+
+
+def grey_8_bit(grey: NDArray[Any]) -> Grey:
+    """Grey values in 8 bits; 16-bit ones lose their lower half."""
+    if grey.dtype == np.uint8:
+        return np.ascontiguousarray(grey)
+    return np.ascontiguousarray((grey >> 8).astype(np.uint8))

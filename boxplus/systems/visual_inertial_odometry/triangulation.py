@@ -1,0 +1,64 @@
+"""Inverse depths of corners from what several frames and cameras saw of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion
+
+_MOST_SIGMAS = 5.0  # by which a view may differ from the point found
+_RELATIVE, _ABSOLUTE = 0.3, 0.02  # of the standard deviation of ρ: of ρ, and in 1/m for points that are nearly at infinity
+_RANGE = (-0.02, 5.0)  # 1/m
+
+Floats = NDArray[np.float64]
+
+
+def triangulate(
+    rays: Floats, bodies: Floats, mountings: Floats, sigma: float
+) -> tuple[NDArray[np.intp], Floats, NDArray[np.bool_]]:
+    """The anchor of each corner, its inverse depth there, and whether to believe it.
+
+    The anchor is the first frame whose first camera saw the corner. With m the ray there and (R, t) the pose of another camera
+    against it, y ∝ R m + ρ t is linear in ρ; least squares over all views, weighted by what a pixel moves with ρ.
+
+    Args:
+        rays: (f, n, c, 3) of n corners in c cameras of f frames, [X/Z, Y/Z, 1]; NaN where not seen.
+        bodies: (f, 7) T_world_imu, wxyz and xyz.
+        mountings: (c, 7) T_imu_camera.
+        sigma: standard deviation of a ray's x and y.
+
+    Returns:
+        (n,) frame, (n,) ρ [1/m], (n,) bool.
+    """
+    frames, count, cameras = rays.shape[:3]
+    seen = np.isfinite(rays[..., 0])
+    anchor = np.argmax(seen[:, :, 0], axis=0)
+    anchored = np.asarray(seen[:, :, 0].any(axis=0))
+    n = np.arange(count)
+    R_c, p_c = quaternion.to_matrix(mountings[:, :4]), mountings[:, 4:]
+    R_b, p_b = quaternion.to_matrix(bodies[:, :4]), bodies[:, 4:]
+    R_w = np.einsum("fij,cjk->fcik", R_b, R_c)  # R_world_camera
+    p_w = p_b[:, None] + np.einsum("fij,cj->fci", R_b, p_c)
+    m_world = np.einsum("nij,nj->ni", R_w[anchor, 0], rays[anchor, n, 0])
+    turned = np.einsum("fcji,nj->fnci", R_w, m_world)
+    t = np.einsum("fcji,fncj->fnci", R_w, p_w[anchor, 0][None, :, None] - p_w[:, None])
+    is_own = (np.arange(frames)[:, None] == anchor)[:, :, None] & (np.arange(cameras) == 0)
+    used = seen & ~is_own & (np.arange(frames)[:, None] >= anchor)[:, :, None] & anchored[:, None]
+    y = np.where(used[..., None], rays, 0.0)
+    a = np.where(used[..., None], t[..., :2] - y[..., :2] * t[..., 2:], 0.0)
+    b = np.where(used[..., None], y[..., :2] * turned[..., 2:] - turned[..., :2], 0.0)
+    rho = np.zeros(count)
+    square = np.ones(count)
+    depth = np.where(used, turned[..., 2], 1.0)
+    for _ in range(2):
+        w = np.where(used, 1.0 / np.maximum(depth, 0.05) ** 2, 0.0)
+        square = (w * (a * a).sum(axis=-1)).sum(axis=(0, 2))
+        rho = (w * (a * b).sum(axis=-1)).sum(axis=(0, 2)) / np.maximum(square, 1e-12)
+        depth = np.where(used, turned[..., 2] + rho[:, None] * t[..., 2], 1.0)
+    rho_sigma = np.sqrt(2.0) * sigma / np.sqrt(np.maximum(square, 1e-12))
+    off = np.linalg.norm(a * rho[:, None, None] - b, axis=-1) / np.maximum(depth, 0.05)
+    fits = (np.where(used, off, 0.0) < _MOST_SIGMAS * sigma).all(axis=(0, 2)) & (depth > 0.05).all(axis=(0, 2))
+    sharp = rho_sigma < np.maximum(_RELATIVE * rho, _ABSOLUTE)
+    good: NDArray[np.bool_] = used.any(axis=(0, 2)) & fits & sharp & (rho > _RANGE[0]) & (rho < _RANGE[1])
+    return anchor, rho, good

@@ -1,0 +1,385 @@
+"""The window: frames with IMU between them, landmarks by inverse depth in the keyframe that found them, and what was let go.
+
+A keyframe that leaves takes along the landmarks it found, with what older keyframes saw of them; what the newest ones saw of a
+landmark that is still followed founds a new one there. No measurement counts twice, and no variable that still moves much is
+linearised for good. A frame that is no keyframe is dropped, and the IMU's intervals before and after it become one.
+
+Source: Demmel et al., Square root marginalization, ICCV 2021; Qin, Li and Shen, VINS-Mono, TRO 2018; docs/marginalization.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.body_pose import BodyPose
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.optimization.group import Group
+from boxplus.optimization.losses import Huber
+from boxplus.optimization.marginalization.leak import Leak, world_gauge
+from boxplus.optimization.marginalization.marginalize import marginalize
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.residuals.camera.inverse_depth import InverseDepthReprojection
+from boxplus.residuals.camera.on_body import OnBody
+from boxplus.residuals.inertial.imu import ImuPreintegration
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from boxplus.residuals.prior import Prior
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.rig import Rig
+from boxplus.systems.visual_inertial_odometry.start.start import Start
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.triangulation import triangulate
+
+_HUBER = 1.5  # standard deviations
+_KNOWN = 1e-4  # rad, m: of the first yaw and position, which are known by definition
+_COST_TOLERANCE = 1e-3
+_BEHIND = -0.02  # 1/m, of a landmark that is not only far
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Frame:
+    """One instant in the window.
+
+    Attributes:
+        number: id of its pose and state in their blocks.
+        time_ns: of the images.
+        tracks: what was seen.
+        is_keyframe: whether it stays until it is the oldest.
+    """
+
+    number: int
+    time_ns: int
+    tracks: Tracks
+    is_keyframe: bool
+
+
+@dataclass(slots=True)
+class _Seen:
+    """Observations of landmarks, a row each: frame and landmark by their ids, camera, pixel."""
+
+    frame: Ints
+    landmark: Ints
+    camera: Ints
+    pixel: Floats
+
+    @classmethod
+    def none(cls) -> _Seen:
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        self.frame, self.landmark = self.frame[kept], self.landmark[kept]
+        self.camera, self.pixel = self.camera[kept], self.pixel[kept]
+
+    def add(self, frame: Ints, landmark: Ints, camera: Ints, pixel: Floats) -> None:
+        self.frame, self.landmark = np.append(self.frame, frame), np.append(self.landmark, landmark)
+        self.camera, self.pixel = np.append(self.camera, camera), np.concatenate([self.pixel, pixel])
+
+
+class Window:
+    """Frames, landmarks and their problem; see the head of this file.
+
+    Attributes:
+        problem: poses `bodies`, velocities and biases `states` [v, b_a, b_g], camera mountings, `points` [x, y, ρ] in the first
+            camera of their anchor.
+        frames: in order of time.
+        leak: what the last prior claims to know of position and yaw.
+    """
+
+    def __init__(self, config: VioConfig, rig: Rig) -> None:
+        self._config, self._rig, self._noise = config, rig, _noise_of(config, rig)
+        self._gravity = (0.0, 0.0, -config.gravity)
+        self.problem = Problem()
+        self.bodies = self.problem.add_variables(BodyPose, np.zeros((0, 7)), name="bodies")
+        self.states = self.problem.add_variables(Euclidean(9), np.zeros((0, 9)), name="states")
+        self.mountings = self.problem.add_variables(BodyPose, rig.mountings, name="mountings")
+        self.points = self.problem.add_variables(Euclidean(3), np.zeros((0, 3)), name="points")
+        if config.extrinsic_estimation:
+            sigma = np.repeat([np.radians(config.extrinsic_rotation_sigma_deg), config.extrinsic_translation_sigma], 3)
+            self.problem.add_residuals(Prior(BodyPose, rig.mountings, sigma=sigma), self.mountings, name="drawing")
+        else:
+            self.problem.fix(self.mountings)
+        self._gauge = world_gauge({self.bodies: "world_from_body", self.states: "velocity_first"}, rotation="yaw")
+        self.leak: Leak | None = None
+        self.frames: list[Frame] = []
+        self._imu: Preintegration | None = None
+        self._imu_group: Group | None = None
+        self._views: list[tuple[Group, NDArray[np.intp]]] = []
+        self._seen = _Seen.none()
+        self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
+        self._anchor: Ints = np.zeros(0, np.int64)
+        self._founded = 0  # landmarks that the last keyframe saw
+        self._covariance = np.zeros((15, 15))
+        self._free_from: dict[int, int] = {}  # of a corner the first frame whose sight of it is in no prior
+
+    def begin(self, start: Start, seen: list[Tracks], imu: ImuSamples) -> None:
+        """The first frames, as a start found them: `seen` are those of `start.frames`."""
+        pose, sigma = start.T_world_imu[0], start.sigma
+        R = quaternion.to_matrix(pose[:4])
+        covariance = np.zeros((6, 6))
+        tilt = max(float(sigma[:3].max()), _KNOWN)
+        covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _KNOWN])) @ R
+        covariance[3:, 3:] = np.eye(3) * _KNOWN**2
+        for k, tracks in enumerate(seen):
+            state = np.concatenate([start.velocity_world[k], start.accel_bias, start.gyro_bias])
+            self._add(tracks, start.T_world_imu[k], state, True, imu)
+            if not k:
+                self.problem.add_residuals(Prior(BodyPose, pose, covariance=covariance), self.bodies[0], name="first pose")
+                known = Prior(Euclidean(9), state, sigma=np.maximum(sigma[[6, 7, 8, 12, 13, 14, 9, 10, 11]], 1e-6))
+                self.problem.add_residuals(known, self.states[0], name="first state")
+        self._found_landmarks()
+        self._founded = len(self._track)
+
+    def predict(self, time_ns: int, imu: ImuSamples) -> tuple[Floats, Floats]:
+        """Pose (7,) and [v, b_a, b_g] (9,) at a time, from the newest frame and the IMU."""
+        step = self._step(time_ns, imu)
+        pose, state = step.predict(self.bodies.values[-1], self.states.values[-1], self._gravity)
+        return pose[0], state[0]
+
+    def _step(self, time_ns: int, imu: ImuSamples) -> Preintegration:
+        state, since = self.states.values[-1], self.frames[-1].time_ns
+        first = max(int(np.searchsorted(imu.time_ns, since, side="right")) - 1, 0)
+        last = int(np.searchsorted(imu.time_ns, time_ns, side="left")) + 1
+        return Preintegration.integrate(
+            imu.time_ns[first:last],
+            imu.gyro[first:last],
+            imu.accel[first:last],
+            noise=self._noise,
+            intervals_ns=[since, time_ns],
+            bias_accel=state[3:6],
+            bias_gyro=state[6:],
+        )
+
+    def add(self, tracks: Tracks, pose: Floats, state: Floats, is_keyframe: bool, imu: ImuSamples) -> None:
+        """The next frame, at its predicted pose and state; what it saw of landmarks, and for a keyframe new landmarks."""
+        self._add(tracks, pose, state, is_keyframe, imu)
+        number = self.frames[-1].number
+        _, landmark, row = np.intersect1d(self._track, tracks.ids, assume_unique=True, return_indices=True)
+        for camera in range(tracks.pixels.shape[1]):
+            there = np.isfinite(tracks.pixels[row, camera, 0])
+            here = np.full(int(there.sum()), number)
+            ids, pixels = self.points.ids[landmark[there]], tracks.pixels[row[there], camera]
+            self._seen.add(here, ids, np.full(len(here), camera), pixels)
+        if is_keyframe:
+            self._found_landmarks()
+            self._founded = int(np.isin(tracks.ids, self._track).sum())
+
+    def _add(self, tracks: Tracks, pose: Floats, state: Floats, is_keyframe: bool, imu: ImuSamples) -> None:
+        if self.frames:
+            step = self._step(tracks.time_ns, imu)
+            self._imu = step if self._imu is None else self._imu.append(step)
+        number = int(self.problem.extend(self.bodies, pose).ids[0])
+        self.problem.extend(self.states, state)
+        self.frames.append(Frame(number, tracks.time_ns, tracks, is_keyframe))
+
+    def add_rest(self, sigma: float) -> None:
+        """The newest frame stands still."""
+        information = np.zeros((9, 9))
+        information[range(3), range(3)] = 1.0 / sigma**2
+        number = self.frames[-1].number
+        self.problem.add_residuals(
+            Prior(Euclidean(9), np.zeros(9), information=information), self.states[number], name=f"rest {number}"
+        )
+
+    def _found_landmarks(self) -> None:
+        """New landmarks for the corners that have none, where what keyframes saw of them gives a depth."""
+        newest = self.frames[-1].tracks
+        lone = newest.ids[~np.isin(newest.ids, self._track)]
+        keyframes = [frame for frame in self.frames if frame.is_keyframe]
+        if not len(lone) or not keyframes:
+            return
+        count, cameras = len(lone), newest.pixels.shape[1]
+        pixels = np.full((len(keyframes), count, cameras, 2), np.nan)
+        rays = np.full((len(keyframes), count, cameras, 3), np.nan)
+        free_from = np.array([self._free_from.get(int(k), 0) for k in lone])
+        for k, frame in enumerate(keyframes):
+            at = np.searchsorted(frame.tracks.ids, lone)
+            at[at == len(frame.tracks.ids)] = 0
+            there = (frame.tracks.ids[at] == lone) & (frame.number >= free_from) if len(frame.tracks) else np.zeros(count, bool)
+            pixels[k, there], rays[k, there] = frame.tracks.pixels[at[there]], frame.tracks.rays[at[there]]
+        poses = self.bodies.values[[self._row(frame.number) for frame in keyframes]]
+        sigma = self._config.pixel_sigma / self._rig.cameras[0].model.fx
+        anchor, rho, good = triangulate(rays, poses, self.mountings.values, sigma)
+        chosen = np.flatnonzero(good)
+        if not len(chosen):
+            return
+        bearing = rays[anchor[chosen], chosen, 0, :2]
+        ids = self.problem.extend(self.points, np.column_stack([bearing, rho[chosen]])).ids
+        numbers = np.array([frame.number for frame in keyframes])
+        self._track = np.append(self._track, lone[chosen])
+        self._anchor = np.append(self._anchor, numbers[anchor[chosen]])
+        for k in range(len(keyframes)):
+            for camera in range(cameras):
+                rows = np.isfinite(pixels[k, chosen, camera, 0]) & (anchor[chosen] <= k)
+                here = np.full(int(rows.sum()), numbers[k])
+                self._seen.add(here, ids[rows], np.full(len(here), camera), pixels[k, chosen[rows], camera])
+
+    def wants_keyframe(self, tracks: Tracks, pose: Floats) -> bool:
+        """Whether a frame at the predicted pose (7,) shows enough that is new, or little of what is known."""
+        last = next(frame for frame in reversed(self.frames) if frame.is_keyframe)
+        if tracks.time_ns - last.time_ns > self._config.keyframe_interval * 1e9:
+            return True
+        known = np.isin(tracks.ids, self._track)
+        if known.sum() < self._config.keyframe_tracked * self._founded:
+            return True
+        _, then, now = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
+        if not len(now):
+            return True
+        R_imu_camera = self._rig.cameras[0].T_imu_camera[:3, :3]
+        R_world = [quaternion.to_matrix(q[:4]) @ R_imu_camera for q in (self.bodies.values[self._row(last.number)], pose)]
+        turned = last.tracks.rays[then, 0] @ (R_world[1].T @ R_world[0]).T
+        model = self._rig.cameras[0].model
+        shift = (tracks.rays[now, 0, :2] - turned[:, :2] / turned[:, 2:]) * [model.fx, model.fy]
+        return float(np.linalg.norm(shift, axis=1).mean()) > self._config.keyframe_parallax
+
+    def landmarks(self) -> tuple[Ints, Floats]:
+        """Corners (m,) and positions (m, 3) in the world of the landmarks; those at infinity are left out."""
+        rows = np.flatnonzero(self.points.values[:, 2] > 1e-3)
+        if not len(rows):
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        points, anchors = self.points.values[rows], self.bodies.values[np.searchsorted(self.bodies.ids, self._anchor[rows])]
+        p_camera = np.column_stack([points[:, :2], np.ones(len(rows))]) / points[:, 2:]
+        return self._track[rows], se3.act(anchors, se3.act(self.mountings.values[0], p_camera))
+
+    def covariance(self) -> Floats:
+        """(15, 15) of the newest frame, [θ, p, v, b_a, b_ω]."""
+        return self._covariance
+
+    def _row(self, number: int) -> int:
+        return int(np.searchsorted(self.bodies.ids, number))
+
+    def solve(self) -> Solution:
+        """Minimise over the window, from where it is."""
+        self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
+        solution = self.problem.solve(
+            max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, linear_solver="schur"
+        )
+        self.problem.set_values(solution)
+        number = self.frames[-1].number
+        self._covariance = solution.joint_covariance(self.bodies[number], self.states[number])
+        return solution
+
+    def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
+        """Residuals of these observations, one group for each camera, and of the IMU's first intervals; of no others."""
+        old = [group for group, _ in self._views] + ([] if self._imu_group is None else [self._imu_group])
+        if old:
+            self.problem.remove(*old)
+        self._views, self._imu_group = [], None
+        seen = self._seen
+        anchor = self._anchor[np.searchsorted(self.points.ids, seen.landmark)]
+        for camera, mounted in enumerate(self._rig.cameras):
+            rows = observations[seen.camera[observations] == camera]
+            if not len(rows):
+                continue
+            group = self.problem.add_residuals(
+                OnBody(InverseDepthReprojection(mounted.model, seen.pixel[rows], sigma=self._config.pixel_sigma)),
+                self.bodies[anchor[rows]],
+                self.mountings[[0]],
+                self.bodies[seen.frame[rows]],
+                self.mountings[[camera]],
+                self.points[seen.landmark[rows]],
+                loss=Huber(_HUBER),
+                name=f"camera {camera}",
+            )
+            self._views.append((group, rows))
+        if self._imu is not None and intervals:
+            state = self.states.values[:-1]
+            stale = self._imu.is_stale(state[:, 3:6], state[:, 6:])
+            if stale.any():
+                self._imu = self._imu.reintegrated(state[:, 3:6], state[:, 6:], stale)
+            self._imu_group = self.problem.add_residuals(
+                ImuPreintegration(self._imu if intervals == len(self._imu) else self._imu[:intervals], gravity=self._gravity),
+                self.bodies[:intervals],
+                self.states[:intervals],
+                self.bodies[1 : intervals + 1],
+                self.states[1 : intervals + 1],
+                name="imu",
+            )
+
+    def reject(self, threshold: float) -> tuple[int, int, Ints]:
+        """Leave out observations whose residual is larger, and landmarks that too few agree on.
+
+        Args:
+            threshold: [standard deviations].
+
+        Returns:
+            how many landmarks the newest frame agreed with, how many not, and the corners of landmarks that were given up.
+        """
+        seen = self._seen
+        values = [block.values for block in self.problem.blocks]
+        bad = np.zeros(len(seen.frame), dtype=np.bool_)
+        for group, rows in self._views:
+            bad[rows] = group.squares(values) > threshold**2
+        newest = (seen.frame == self.frames[-1].number) & (seen.camera == 0)
+        # A landmark without what its anchor saw, with nothing but that, or behind the camera, is none.
+        row = np.searchsorted(self.points.ids, seen.landmark)
+        left = np.bincount(row[~bad], minlength=len(self.points))
+        own = (seen.frame == self._anchor[row]) & (seen.camera == 0)
+        anchored = np.bincount(row[own & ~bad], minlength=len(self.points))
+        gone = (left < 2) | (anchored < 1) | (self.points.values[:, 2] < _BEHIND)
+        counts = int((newest & ~bad).sum()), int((newest & bad).sum())
+        tracks = self._track[gone]
+        seen.keep(~bad)
+        self._remove_landmarks(gone)
+        return *counts, tracks
+
+    def _remove_landmarks(self, gone: NDArray[np.bool_]) -> None:
+        """Landmarks (m,) that prove to be none, with all that was seen of them."""
+        if gone.any():
+            ids = self.points.ids[gone]
+            self._seen.keep(~np.isin(self._seen.landmark, ids))
+            self.problem.remove(self.points[ids], *[group for group, _ in self._views])
+            self._views = []
+            self._track, self._anchor = self._track[~gone], self._anchor[~gone]
+
+    def shrink(self) -> None:
+        """Drop frames that are no keyframes and not recent any more; let the oldest keyframe go where there are too many."""
+        for frame in [f for f in self.frames[1 : -self._config.recent_frames] if not f.is_keyframe]:
+            k = self.frames.index(frame)
+            self.problem.remove(self.bodies[frame.number], self.states[frame.number])
+            self._imu_group = None if self._imu_group not in self.problem.groups else self._imu_group
+            self._views = [(group, rows) for group, rows in self._views if group in self.problem.groups]
+            self._seen.keep(self._seen.frame != frame.number)
+            if self._imu is not None:
+                self._imu = self._imu.merge(k - 1)
+            del self.frames[k]
+        while sum(f.is_keyframe for f in self.frames) > self._config.keyframes:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Marginalise the oldest keyframe and the landmarks it found."""
+        oldest, seen = self.frames[0], self._seen
+        keyframes = [f.number for f in self.frames if f.is_keyframe]
+        spared = keyframes[-self._config.spared_keyframes]
+        leaving = self._anchor == oldest.number
+        ids, corners = self.points.ids[leaving], self._track[leaving]
+        lives = np.isin(corners, self.frames[-1].tracks.ids)
+        founds_anew = np.isin(seen.landmark, ids[lives]) & (seen.frame >= spared)
+        absorbed = np.isin(seen.landmark, ids) & np.isin(seen.frame, keyframes) & ~founds_anew
+        for corner in corners:
+            self._free_from.pop(int(corner), None)
+        self._free_from |= dict.fromkeys(corners[lives].tolist(), spared)
+        self._connect(np.flatnonzero(absorbed), 1)
+        variables = [self.bodies[oldest.number], self.states[oldest.number], self.points[ids]]
+        self.leak = marginalize(self.problem, variables, at=None, gauge=self._gauge).leak
+        self._imu_group, self._views = None, []
+        seen.keep(~np.isin(seen.landmark, ids))
+        self._track, self._anchor = self._track[~leaving], self._anchor[~leaving]
+        if self._imu is not None:
+            self._imu = self._imu[1:]
+        del self.frames[0]
+
+
+def _noise_of(config: VioConfig, rig: Rig) -> ImuNoise:
+    c, n = config, rig.noise
+    return ImuNoise(
+        c.gyro_noise or n.gyro, c.accel_noise or n.accel, c.gyro_bias_walk or n.gyro_walk, c.accel_bias_walk or n.accel_walk
+    )
