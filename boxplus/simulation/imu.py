@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from boxplus.simulation.spline import Motion
+from boxplus.sensors.imu import ImuSamples
+from boxplus.simulation.spline import Motion, Trajectory
 
 GRAVITY = 9.81
 """Free fall in simulated worlds [m/s²], along −z."""
 
+_IMU_STREAM, _BIAS_STREAM, _VIBRATION_STREAM = 2, 3, 4
 _BIAS_STEP_S = 0.1
 _PHASE_STEP_S = 0.02
 _PHASE_STEP_RAD = 0.5
@@ -125,3 +127,43 @@ def measure(
     gyro = motion.omega_imu + gyro_bias + imu.gyro_noise_density * noise[0]
     accel = accel + accel_bias + imu.accel_noise_density * noise[1]
     return np.clip(gyro, -imu.gyro_max, imu.gyro_max), np.clip(accel, -imu.accel_max, imu.accel_max)
+
+
+class SimulatedImu:
+    """An IMU on a moving body. The noise of every block of samples has a seed of its own, so any part can be computed alone.
+
+    Args:
+        imu: the sensor.
+        trajectory: motion of the IMU.
+        seed: of the noise.
+        duration_s: from the beginning of the motion on [s].
+    """
+
+    def __init__(self, imu: ImuModel, trajectory: Trajectory, seed: int, duration_s: float) -> None:
+        self._imu, self._trajectory, self._seed = imu, trajectory, seed
+        self._period_ns = round(1e9 / imu.rate_hz)
+        self._bias_walk = BiasWalk(imu, duration_s, self._random(_BIAS_STREAM, 0))
+        self._vibration: Vibration | None = None
+        if imu.accel_vibration or imu.gyro_vibration:
+            self._vibration = Vibration(imu, duration_s, self._random(_VIBRATION_STREAM, 0))
+
+    def _random(self, stream: int, index: int) -> np.random.Generator:
+        return np.random.Generator(np.random.PCG64([self._seed, stream, index]))
+
+    def samples(self, begin_ns: int, end_ns: int, block: int) -> ImuSamples:
+        """The samples in (begin_ns, end_ns], with the noise of block `block`."""
+        start_ns = self._trajectory.start_ns
+        first = (begin_ns - start_ns) // self._period_ns + 1
+        last = (end_ns - start_ns) // self._period_ns
+        time_ns = start_ns + np.arange(first, last + 1, dtype=np.int64) * self._period_ns
+        gyro_offset, accel_offset = self.biases(time_ns)
+        if self._vibration is not None:
+            gyro_shaken, accel_shaken = self._vibration.at((time_ns - start_ns) * 1e-9)
+            gyro_offset, accel_offset = gyro_offset + gyro_shaken, accel_offset + accel_shaken
+        motion = self._trajectory.evaluate(time_ns)
+        gyro, accel = measure(self._imu, motion, gyro_offset, accel_offset, self._random(_IMU_STREAM, block))
+        return ImuSamples.from_arrays(time_ns, gyro, accel)
+
+    def biases(self, time_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Exact gyro [rad/s] and accelerometer [m/s²] biases (N, 3) at `time_ns` (N,) int64 [ns]."""
+        return self._bias_walk.at((np.atleast_1d(np.asarray(time_ns)) - self._trajectory.start_ns) * 1e-9)

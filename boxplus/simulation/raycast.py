@@ -53,7 +53,7 @@ def _roots(a: float, b: float, c: float) -> tuple[float, float]:
 
 
 @kernel(inline=True)
-def _hit(solid: Floats, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
+def hit_distance(solid: Floats, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
     """Distance along the ray to the surface of one solid, infinite when it misses."""
     near: float
     far: float
@@ -129,7 +129,7 @@ def cast_rays(
         found = False
         hit = np.uint32(0)
         for k in range(large.shape[0]):
-            t = _hit(solids[large[k]], ox, oy, oz, dx, dy, dz)
+            t = hit_distance(solids[large[k]], ox, oy, oz, dx, dy, dz)
             if t <= best:
                 best, hit, found = t, large[k], True
 
@@ -155,7 +155,7 @@ def cast_rays(
             while t_enter < best and 0 <= column < columns and 0 <= row < rows:
                 cell = row * columns + column
                 for k in range(cell_begin[cell], cell_begin[cell + 1]):
-                    t = _hit(solids[cell_solids[k]], ox, oy, oz, dx, dy, dz)
+                    t = hit_distance(solids[cell_solids[k]], ox, oy, oz, dx, dy, dz)
                     if t <= best:
                         best, hit, found = t, cell_solids[k], True
                 if next_x < next_y:

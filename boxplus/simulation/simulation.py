@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation.imu import BiasWalk, ImuModel, Vibration, measure
+from boxplus.simulation.imu import ImuModel, SimulatedImu
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.scenarios import Scenario, make_scenario
 from boxplus.simulation.spline import Motion
@@ -20,7 +20,7 @@ from boxplus.simulation.world import World
 
 Event = Scan | ImuSamples
 
-_LIDAR_STREAM, _IMU_STREAM, _BIAS_STREAM, _VIBRATION_STREAM = 1, 2, 3, 4
+_LIDAR_STREAM = 1
 _FIRST_SCAN_NS = 7_300_000
 """The first scan begins after the first IMU sample and at none of the others: sensors are not synchronised."""
 _LAST_MARGIN_NS = 20_000_000
@@ -79,13 +79,9 @@ class Simulation:
             T_imu_lidar=tuple(map(tuple, T_imu_lidar.tolist())),
         )
         self._scan_ns = round(1e9 / scenario.lidar.rate_hz)
-        self._imu_ns = round(1e9 / scenario.imu.rate_hz)
         available = self.end_ns - self.start_ns - _FIRST_SCAN_NS - _LAST_MARGIN_NS
         self.scan_count = max(available // self._scan_ns, 0)
-        self._bias_walk = BiasWalk(scenario.imu, duration, self._random(_BIAS_STREAM, 0))
-        self._vibration: Vibration | None = None
-        if scenario.imu.accel_vibration or scenario.imu.gyro_vibration:
-            self._vibration = Vibration(scenario.imu, duration, self._random(_VIBRATION_STREAM, 0))
+        self._imu = SimulatedImu(scenario.imu, trajectory, seed, duration)
 
     def _random(self, stream: int, index: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64([self.config.seed, stream, index]))
@@ -126,16 +122,7 @@ class Simulation:
 
     def imu_samples(self, begin_ns: int, end_ns: int, block: int) -> ImuSamples:
         """The samples in (begin_ns, end_ns], with the noise of block `block`."""
-        first = (begin_ns - self.start_ns) // self._imu_ns + 1
-        last = (end_ns - self.start_ns) // self._imu_ns
-        time_ns = self.start_ns + np.arange(first, last + 1, dtype=np.int64) * self._imu_ns
-        gyro_offset, accel_offset = self.biases(time_ns)
-        if self._vibration is not None:
-            gyro_shaken, accel_shaken = self._vibration.at((time_ns - self.start_ns) * 1e-9)
-            gyro_offset, accel_offset = gyro_offset + gyro_shaken, accel_offset + accel_shaken
-        motion = self.scenario.trajectory.evaluate(time_ns)
-        gyro, accel = measure(self.scenario.imu, motion, gyro_offset, accel_offset, self._random(_IMU_STREAM, block))
-        return ImuSamples.from_arrays(time_ns, gyro, accel)
+        return self._imu.samples(begin_ns, end_ns, block)
 
     def events(self) -> Iterator[Event]:
         """Blocks of IMU samples and scans in order of time, like `Recording.events`: a scan comes when it is complete."""
@@ -156,7 +143,7 @@ class Simulation:
 
     def biases(self, time_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Exact gyro [rad/s] and accelerometer [m/s²] biases (N, 3) at `time_ns` (N,) int64 [ns]."""
-        return self._bias_walk.at((np.atleast_1d(np.asarray(time_ns)) - self.start_ns) * 1e-9)
+        return self._imu.biases(time_ns)
 
 
 def simulate(

@@ -17,8 +17,9 @@ from boxplus.recordings.open_container import open_container
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults
+from boxplus.simulation.bag_writer import BagFormat as Format
 from boxplus.simulation.live_recording import IMU_TOPIC, LIDAR_TOPIC
-from boxplus.simulation.recording_writer import Format, write_recording
+from boxplus.simulation.recording_writer import write_recording
 from tests.simulation.small_simulations import small
 
 
