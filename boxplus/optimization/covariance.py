@@ -66,8 +66,11 @@ class Covariances:
         number = rows.block.number
         return to_own_tangent(self._problem.layout, number, self._values[number][self._problem.layout.rows(rows)])
 
-    def joint(self, selected: Sequence[VariableRows]) -> NDArray[np.float64]:
+    def joint(self, selected: Sequence[VariableRows], is_determined: bool = False) -> NDArray[np.float64]:
         """The covariance (D, D) of all selected variables together, tangent after tangent in the order given.
+
+        Args:
+            is_determined: no direction is free, and none is looked for.
 
         Raises:
             InputError: nothing is selected.
@@ -79,7 +82,7 @@ class Covariances:
         dof = np.concatenate([np.full(len(rows), rows.block.manifold.dof) for rows in selected])
         start = np.concatenate([[0], np.cumsum(dof)])
         free = np.flatnonzero(number >= 0)
-        self._prepare(number[free])
+        self._prepare(number[free], is_determined)
         matrix = np.zeros((int(start[-1]), int(start[-1])))
         a, b = (free[k] for k in np.tril_indices(len(free)))
         for p, q, block in zip(a, b, self._problem.system.inverse_blocks(number[a], number[b]), strict=True):
@@ -97,12 +100,18 @@ class Covariances:
         matrix *= moving[:, None] * moving
         return 0.5 * (matrix + matrix.T)
 
-    def _prepare(self, wanted: NDArray[np.int64]) -> None:
+    def _prepare(self, wanted: NDArray[np.int64], is_determined: bool = False) -> None:
         """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""
         problem = self._problem
-        if problem.values is not self._values:
+        if any(now is not then for now, then in zip(problem.values, self._values, strict=True)):
             problem.start(self._values)
             self._is_factorized = False
+        if is_determined and not self._is_factorized:
+            try:
+                problem.solve(None)
+                return
+            except NotPositiveDefinite:  # it is not: see why
+                pass
         if self._space is None:
             self._space = find_null_space(problem)
             self._is_factorized = False

@@ -27,13 +27,18 @@ def inner(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 class LeastSquares:
     """Cost, linearisation and linear system of residual groups over a layout.
 
+    Args:
+        keeps_tangents: poses are moved by the ⊞ they were given, whether another were better conditioned or not.
+
     Attributes:
         values: of every block, at the accepted point.
         cost: at the accepted point.
         timing_s: seconds spent by stage.
     """
 
-    def __init__(self, layout: Layout, groups: Sequence[Group], system: LinearSystem, threads: int) -> None:
+    def __init__(
+        self, layout: Layout, groups: Sequence[Group], system: LinearSystem, threads: int, *, keeps_tangents: bool = False
+    ) -> None:
         self.layout, self.groups, self.system = layout, tuple(groups), system
         self.values: Values = [block.values for block in layout.blocks]
         self.cost = GroupCost(0.0, 0.0, 0, 0)
@@ -42,7 +47,7 @@ class LeastSquares:
         self._revisions = tuple(group.revision for group in self.groups)
         self._linearized: Values = ()
         self._tangents: tuple[Manifold, ...] | None = None  # where they are not the blocks' own
-        self._has_tangents = False
+        self._has_tangents = keeps_tangents
 
     def start(self, values: Values) -> None:
         """Linearise at `values` and accept them.

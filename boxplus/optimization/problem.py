@@ -363,7 +363,7 @@ class Problem:
     def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, tuple[str, ...], float]:
         """The problem as the solvers see it, what is wrong with its structure, and the seconds this took."""
         begin = time.perf_counter()
-        key = (options.linear_solver, options.threads)
+        key = (options.linear_solver, options.threads, options.examine)
         if self._analysed is None or self._analysed[0] != key:
             if not self.groups:
                 raise InputError("at least one group of residuals", "none", "call `add_residuals` first")
@@ -372,6 +372,6 @@ class Problem:
                 raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
             groups = [*self.groups, *held_groups(self.blocks)]
             system = choose_system(layout, groups, options)
-            model = LeastSquares(layout, groups, system, options.threads)
-            self._analysed = (key, model, tuple(self.defects()))
+            model = LeastSquares(layout, groups, system, options.threads, keeps_tangents=not options.examine)
+            self._analysed = (key, model, tuple(self.defects()) if options.examine else ())
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin

@@ -131,13 +131,17 @@ class Solution:
         rows = self._own(first)
         return self._covariances.blocks(rows, rows if second is None else self._own(second))
 
-    def joint_covariance(self, *selected: VariableRows | Variables) -> NDArray[np.float64]:
+    def joint_covariance(self, *selected: VariableRows | Variables, is_determined: bool = False) -> NDArray[np.float64]:
         """Covariance (D, D) of all selected variables together, their tangents one after the other in the order given.
 
+        Args:
+            is_determined: the problem determines all of its variables, which is then not looked into: the search for directions
+                that it leaves free takes ten times as long as the rest.
+
         Raises:
-            InputError, SingularProblemError: as for `covariance`.
+            InputError, SingularProblemError: as for `covariance`; with `is_determined` where H is singular to rounding.
         """
-        return self._covariances.joint([self._own(rows) for rows in selected])
+        return self._covariances.joint([self._own(rows) for rows in selected], is_determined)
 
     def standard_deviations(self, selected: VariableRows | Variables) -> NDArray[np.float64]:
         """Square roots (k, dof) of the diagonals of `covariance`, in the units of the tangents; zero where fixed.

@@ -33,6 +33,11 @@ class SolverOptions(BaseModel):
         "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start as in SPEC 2.2"
     )
     initial_radius: float = Field(1e4, gt=0, description="trust region of the dogleg at the start, in tangents scaled by diag(H)")
+    examine: bool = Field(
+        True,
+        description="look for defects of the structure and for tangents of poses that are better conditioned, beforehand; off for a "
+        "window that is solved again and again, whose structure is known to be sound",
+    )
     threads: int = Field(1, ge=1, description="results are the same for any number")
 
 

@@ -260,11 +260,11 @@ class Window:
         """Minimise over the window, from where it is."""
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
         solution = self.problem.solve(
-            max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, linear_solver="schur"
+            max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, linear_solver="schur", examine=False
         )
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        self._covariance = solution.joint_covariance(self.bodies[number], self.states[number])
+        self._covariance = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
         return solution
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
