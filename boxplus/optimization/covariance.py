@@ -103,15 +103,15 @@ class Covariances:
     def _prepare(self, wanted: NDArray[np.int64], is_determined: bool = False) -> None:
         """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""
         problem = self._problem
-        if any(now is not then for now, then in zip(problem.values, self._values, strict=True)):
-            problem.start(self._values)
-            self._is_factorized = False
-        if is_determined and not self._is_factorized:
+        if is_determined and not self._is_factorized and self._is_where_it_was_solved():
             try:
                 problem.solve(None)
                 return
             except NotPositiveDefinite:  # it is not: see why
                 pass
+        if problem.values is not self._values:
+            problem.start(self._values)
+            self._is_factorized = False
         if self._space is None:
             self._space = find_null_space(problem)
             self._is_factorized = False
@@ -130,3 +130,8 @@ class Covariances:
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(problem, error, self._space)) from error
         self._is_factorized = True
+
+    def _is_where_it_was_solved(self) -> bool:
+        """Whether nothing was linearised elsewhere since."""
+        self._problem.require_current()
+        return all(now is then for now, then in zip(self._problem.values, self._values, strict=True))

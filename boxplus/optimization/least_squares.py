@@ -56,13 +56,7 @@ class LeastSquares:
             InputError: variables or residuals were removed since the problem was analysed; no residual can be evaluated.
             NotFiniteError: a residual or a Jacobian is NaN or infinite there.
         """
-        revisions = tuple(group.revision for group in self.groups)
-        if not self.layout.is_current or revisions != self._revisions:
-            raise InputError(
-                "a problem that is as it was when it was solved",
-                "one from which variables or residuals were removed since",
-                "ask a solution about covariances before that, or solve again",
-            )
+        self.require_current()
         for group in self.groups:
             group.counted[:] = False
         cost = self.linearize(values)
@@ -81,6 +75,16 @@ class LeastSquares:
                 self.layout.tangents = self._tangents = best
                 cost = self.linearize(values)
         self.accept(values, cost)
+
+    def require_current(self) -> None:
+        """Raises InputError where variables or residuals were removed since the problem was analysed."""
+        revisions = tuple(group.revision for group in self.groups)
+        if not self.layout.is_current or revisions != self._revisions:
+            raise InputError(
+                "a problem that is as it was when it was solved",
+                "one from which variables or residuals were removed since",
+                "ask a solution about covariances before that, or solve again",
+            )
 
     def linearize(self, values: Values) -> GroupCost:
         """Linearise every group at `values`, without accepting them: the linear system keeps the accepted point."""

@@ -35,8 +35,8 @@ class SolverOptions(BaseModel):
     initial_radius: float = Field(1e4, gt=0, description="trust region of the dogleg at the start, in tangents scaled by diag(H)")
     examine: bool = Field(
         True,
-        description="look for defects of the structure and for tangents of poses that are better conditioned, beforehand; off for a "
-        "window that is solved again and again, whose structure is known to be sound",
+        description="look beforehand for defects of the structure, and for better conditioned tangents of poses; off for a "
+        "window that is solved again and again and known to be sound",
     )
     threads: int = Field(1, ge=1, description="results are the same for any number")
 

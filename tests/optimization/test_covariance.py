@@ -36,6 +36,27 @@ def test_joint_covariance_is_the_submatrix_of_the_inverse(linear_solver):
     np.testing.assert_array_equal(joint, joint.T)
 
 
+@pytest.mark.parametrize("linear_solver", SOLVERS)
+def test_where_all_is_determined_the_search_for_free_directions_may_be_left_out(linear_solver, monkeypatch):
+    scene = make_scene(points=12)
+    solution = scene.problem.solve(linear_solver=linear_solver, examine=False)
+    assert not solution.notes
+    selected = scene.points[[3, 1]], scene.cameras[[4, 0, 2]]
+    with monkeypatch.context() as patch:
+        patch.setattr("boxplus.optimization.covariance.find_null_space", None)
+        quick = solution.joint_covariance(*selected, is_determined=True)
+    np.testing.assert_allclose(quick, solution.joint_covariance(*selected), rtol=1e-9, atol=1e-14)
+
+
+def test_what_is_not_determined_is_said_whatever_was_promised():
+    problem = Problem()
+    free = problem.add_variables(Euclidean(2), np.zeros((1, 2)))
+    problem.add_residuals(Prior(Euclidean(2), np.zeros(2), information=np.diag([1.0, 0.0])), free)
+    solution = problem.solve(examine=False)
+    with pytest.raises(SingularProblemError, match="no covariance of"):
+        solution.joint_covariance(free, is_determined=True)
+
+
 def test_standard_deviations_are_roots_of_the_diagonal(scene):
     solution = scene.problem.solve()
     sigma = solution.standard_deviations(scene.points)

@@ -24,9 +24,11 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
+from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
+from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import Window
 
@@ -44,19 +46,24 @@ class VisualInertialOdometry:
     Args:
         config: the settings; None for the defaults.
         rig: cameras and IMU.
+        tracker: what follows corners through the images; optical flow if left out, for which OpenCV has to be installed.
+
+    Raises:
+        InputError: OpenCV, the extra `vision`, is not installed.
     """
 
-    def __init__(self, config: VioConfig | None, rig: Rig) -> None:
+    def __init__(self, config: VioConfig | None, rig: Rig, tracker: Tracker | None = None) -> None:
         self.config = config or VioConfig()
         self.rig = rig if self.config.cameras == "all" else replace(rig, cameras=rig.cameras[:1], mountings=rig.mountings[:1])
         self.start: Start | None = None
         self.start_problem: str | None = None
         self.window = Window(self.config, self.rig)
-        self._tracker = FeatureTracker(self.config, self.rig)
+        self._tracker = FeatureTracker(self.config, self.rig) if tracker is None else tracker
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._waiting: deque[Tracks] = deque()
         self._time_ns = 0  # of the frame before
+        self._health = Health(self.config)
         self._counters: Counter[str] = Counter()
 
     @overload
@@ -108,6 +115,11 @@ class VisualInertialOdometry:
         """What could not be used before it reached the window, by reason."""
         return Counter({reason: count for reason, count in self._counters.items() if count})
 
+    @property
+    def contradiction(self) -> str | None:
+        """What makes the estimates not to be trusted, whatever their status: cameras and IMU that contradict each other."""
+        return self._health.contradiction
+
     def _advance(self, *, final: bool) -> list[VioEstimate]:
         """The frames that are complete, and covered by IMU samples."""
         estimates = []
@@ -135,9 +147,9 @@ class VisualInertialOdometry:
             tracks = self._tracker.detect(tracks)
         self.window.add(tracks, pose, state, is_keyframe, self._imu)
         self.window.solve()
-        agreed, not_agreed, given_up = self.window.reject(_OUTLIER)
-        self._tracker.forget(given_up)
-        estimate = self._estimate(tracks, is_keyframe, agreed, not_agreed)
+        fit = self.window.reject(_OUTLIER)
+        self._tracker.forget(fit.given_up)
+        estimate = self._estimate(tracks, is_keyframe, fit)
         self.window.shrink()
         oldest = int(np.searchsorted(self._imu.time_ns, self.window.frames[0].time_ns)) - 2
         if oldest > 0:
@@ -164,9 +176,10 @@ class VisualInertialOdometry:
         self._waiting.clear()
         self.window.begin(start, [seen[k] for k in start.frames], self._imu)
         self.window.solve()
-        agreed, not_agreed, given_up = self.window.reject(_OUTLIER)
-        self._tracker.forget(given_up)
-        return self._estimate(tracks, True, agreed, not_agreed)
+        fit = self.window.reject(_OUTLIER)
+        self._tracker.forget(fit.given_up)
+        self._health.begin(tracks.time_ns)
+        return self._estimate(tracks, True, fit)
 
     def _nothing(self, tracks: Tracks, reason: str) -> VioEstimate:
         nan = np.full(3, np.nan)
@@ -192,28 +205,30 @@ class VisualInertialOdometry:
             timing_s={},
         )
 
-    def _estimate(self, tracks: Tracks, is_keyframe: bool, agreed: int, not_agreed: int) -> VioEstimate:
+    def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit) -> VioEstimate:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = quaternion.to_matrix(pose[:4]), pose[4:]
-        ids, landmarks = self.window.landmarks()
+        ids, landmarks, sigmas = self.window.landmarks()
+        covariance = self.window.covariance[np.ix_(_ORDER, _ORDER)]
+        status, reasons = self._health.judge(tracks, fit, position_sigma(covariance))
         return VioEstimate(
             time_ns=tracks.time_ns,
-            status="ok",
-            reasons=(),
+            status=status,
+            reasons=reasons,
             T_world_imu=T,
             velocity_world=state[:3].copy(),
             gyro_bias=state[6:].copy(),
             accel_bias=state[3:6].copy(),
-            covariance=self.window.covariance()[np.ix_(_ORDER, _ORDER)],
-            tracked=agreed,
+            covariance=covariance,
+            tracked=fit.agreed,
             new=int(tracks.is_new.sum()),
-            rejected={**tracks.rejected, "does not fit the window": not_agreed},
+            rejected={**tracks.rejected, "does not fit the window": fit.not_agreed},
             is_keyframe=is_keyframe,
             weak_directions=(),
             landmark_ids=ids,
             landmarks=landmarks,
-            landmark_sigmas=np.zeros(len(ids)),
+            landmark_sigmas=sigmas,
             T_imu_camera=np.array([camera.T_imu_camera for camera in self.rig.cameras]),
             time_offset_s=0.0,
             timing_s={"opencv": self._tracker.opencv_s},

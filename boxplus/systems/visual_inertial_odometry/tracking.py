@@ -13,7 +13,7 @@ import importlib
 import time
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,20 @@ def opencv() -> Any:
         return importlib.import_module("cv2")
     except ImportError:
         raise InputError("OpenCV, which follows corners", "it is not installed", "pip install 'boxplus[vision]'") from None
+
+
+class Tracker(Protocol):
+    """What odometry asks of whatever follows corners; `FeatureTracker` says what the methods do."""
+
+    opencv_s: float
+
+    def track(
+        self, time_ns: int, images: Mapping[int, NDArray[Any]], R_before_now: Floats, p_before_now: Floats | None = None
+    ) -> Tracks: ...
+
+    def detect(self, tracks: Tracks) -> Tracks: ...
+
+    def forget(self, ids: NDArray[np.int64]) -> None: ...
 
 
 class FeatureTracker:

@@ -1,4 +1,4 @@
-"""Inverse depths of corners from what several frames and cameras saw of them."""
+"""Parallax and depth: what several frames and cameras tell together about the place of corners."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion
+from boxplus.systems.visual_inertial_odometry.rig import RigCamera
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _MOST_SIGMAS = 5.0  # by which a view may differ from the point found
 _RELATIVE, _ABSOLUTE = 0.3, 0.02  # of the standard deviation of ρ: of ρ, and in 1/m for points that are nearly at infinity
@@ -62,3 +64,19 @@ def triangulate(
     sharp = rho_sigma < np.maximum(_RELATIVE * rho, _ABSOLUTE)
     good: NDArray[np.bool_] = used.any(axis=(0, 2)) & fits & sharp & (rho > _RANGE[0]) & (rho < _RANGE[1])
     return anchor, rho, good
+
+
+def mean_parallax(before: Tracks, now: Tracks, body_before: Floats, body_now: Floats, camera: RigCamera) -> float:
+    """By how much corners moved in the first camera beside what its turning explains, in the mean [px]; infinite without any.
+
+    Args:
+        body_before, body_now: (7,) T_world_imu, of which only the attitude counts.
+        camera: the first one of the rig.
+    """
+    _, then, there = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    if not len(there):
+        return float("inf")
+    R_before, R_now = (quaternion.to_matrix(body[:4]) @ camera.T_imu_camera[:3, :3] for body in (body_before, body_now))
+    turned = before.rays[then, 0] @ (R_now.T @ R_before).T
+    shift = (now.rays[there, 0, :2] - turned[:, :2] / turned[:, 2:]) * [camera.model.fx, camera.model.fy]
+    return float(np.linalg.norm(shift, axis=1).mean())

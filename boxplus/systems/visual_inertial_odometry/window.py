@@ -9,8 +9,6 @@ Source: Demmel et al., Square root marginalization, ICCV 2021; Qin, Li and Shen,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,57 +29,18 @@ from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
-from boxplus.systems.visual_inertial_odometry.triangulation import triangulate
+from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax, triangulate
 
 _HUBER = 1.5  # standard deviations
 _KNOWN = 1e-4  # rad, m: of the first yaw and position, which are known by definition
 _COST_TOLERANCE = 1e-3
+_MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
+_LAST_INTERVALS = 5
 _BEHIND = -0.02  # 1/m, of a landmark that is not only far
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
-
-@dataclass(slots=True)
-class Frame:
-    """One instant in the window.
-
-    Attributes:
-        number: id of its pose and state in their blocks.
-        time_ns: of the images.
-        tracks: what was seen.
-        is_keyframe: whether it stays until it is the oldest.
-    """
-
-    number: int
-    time_ns: int
-    tracks: Tracks
-    is_keyframe: bool
-
-
-@dataclass(slots=True)
-class _Seen:
-    """Observations of landmarks, a row each: frame and landmark by their ids, camera, pixel."""
-
-    frame: Ints
-    landmark: Ints
-    camera: Ints
-    pixel: Floats
-
-    @classmethod
-    def none(cls) -> _Seen:
-        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-
-    def keep(self, kept: NDArray[np.bool_]) -> None:
-        self.frame, self.landmark = self.frame[kept], self.landmark[kept]
-        self.camera, self.pixel = self.camera[kept], self.pixel[kept]
-
-    def add(self, frame: Ints, landmark: Ints, camera: Ints, pixel: Floats) -> None:
-        self.frame, self.landmark = np.append(self.frame, frame), np.append(self.landmark, landmark)
-        self.camera, self.pixel = np.append(self.camera, camera), np.concatenate([self.pixel, pixel])
 
 
 class Window:
@@ -91,6 +50,7 @@ class Window:
         problem: poses `bodies`, velocities and biases `states` [v, b_a, b_g], camera mountings, `points` [x, y, ρ] in the first
             camera of their anchor.
         frames: in order of time.
+        covariance: (15, 15) of the newest frame, [θ, p, v, b_a, b_ω].
         leak: what the last prior claims to know of position and yaw.
     """
 
@@ -109,15 +69,16 @@ class Window:
             self.problem.fix(self.mountings)
         self._gauge = world_gauge({self.bodies: "world_from_body", self.states: "velocity_first"}, rotation="yaw")
         self.leak: Leak | None = None
+        self.covariance = np.zeros((15, 15))
         self.frames: list[Frame] = []
         self._imu: Preintegration | None = None
         self._imu_group: Group | None = None
         self._views: list[tuple[Group, NDArray[np.intp]]] = []
-        self._seen = _Seen.none()
+        self._seen = Seen.none()
         self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
         self._anchor: Ints = np.zeros(0, np.int64)
         self._founded = 0  # landmarks that the last keyframe saw
-        self._covariance = np.zeros((15, 15))
+        self._rho_sigma = np.zeros(0)  # of each landmark [1/m]
         self._free_from: dict[int, int] = {}  # of a corner the first frame whose sight of it is in no prior
 
     def begin(self, start: Start, seen: list[Tracks], imu: ImuSamples) -> None:
@@ -230,28 +191,19 @@ class Window:
         known = np.isin(tracks.ids, self._track)
         if known.sum() < self._config.keyframe_tracked * self._founded:
             return True
-        _, then, now = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
-        if not len(now):
-            return True
-        R_imu_camera = self._rig.cameras[0].T_imu_camera[:3, :3]
-        R_world = [quaternion.to_matrix(q[:4]) @ R_imu_camera for q in (self.bodies.values[self._row(last.number)], pose)]
-        turned = last.tracks.rays[then, 0] @ (R_world[1].T @ R_world[0]).T
-        model = self._rig.cameras[0].model
-        shift = (tracks.rays[now, 0, :2] - turned[:, :2] / turned[:, 2:]) * [model.fx, model.fy]
-        return float(np.linalg.norm(shift, axis=1).mean()) > self._config.keyframe_parallax
+        poses = self.bodies.values[self._row(last.number)], pose
+        return mean_parallax(last.tracks, tracks, *poses, self._rig.cameras[0]) > self._config.keyframe_parallax
 
-    def landmarks(self) -> tuple[Ints, Floats]:
-        """Corners (m,) and positions (m, 3) in the world of the landmarks; those at infinity are left out."""
+    def landmarks(self) -> tuple[Ints, Floats, Floats]:
+        """Corners (m,), positions (m, 3) in the world and standard deviations of the distance (m,) of the landmarks.
+
+        Those at infinity are left out. The standard deviation is that of the landmark among poses that are known.
+        """
         rows = np.flatnonzero(self.points.values[:, 2] > 1e-3)
-        if not len(rows):
-            return np.zeros(0, np.int64), np.zeros((0, 3))
         points, anchors = self.points.values[rows], self.bodies.values[np.searchsorted(self.bodies.ids, self._anchor[rows])]
         p_camera = np.column_stack([points[:, :2], np.ones(len(rows))]) / points[:, 2:]
-        return self._track[rows], se3.act(anchors, se3.act(self.mountings.values[0], p_camera))
-
-    def covariance(self) -> Floats:
-        """(15, 15) of the newest frame, [θ, p, v, b_a, b_ω]."""
-        return self._covariance
+        sigma = self._rho_sigma[rows] * np.linalg.norm(p_camera, axis=1) / points[:, 2]
+        return self._track[rows], se3.act(anchors, se3.act(self.mountings.values[:1], p_camera)), sigma
 
     def _row(self, number: int) -> int:
         return int(np.searchsorted(self.bodies.ids, number))
@@ -259,12 +211,10 @@ class Window:
     def solve(self) -> Solution:
         """Minimise over the window, from where it is."""
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
-        solution = self.problem.solve(
-            max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, linear_solver="schur", examine=False
-        )
+        solution = self.problem.solve(max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, examine=False)
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        self._covariance = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
+        self.covariance = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
         return solution
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
@@ -304,32 +254,46 @@ class Window:
                 name="imu",
             )
 
-    def reject(self, threshold: float) -> tuple[int, int, Ints]:
+    def reject(self, threshold: float) -> Fit:
         """Leave out observations whose residual is larger, and landmarks that too few agree on.
 
         Args:
             threshold: [standard deviations].
-
-        Returns:
-            how many landmarks the newest frame agreed with, how many not, and the corners of landmarks that were given up.
         """
         seen = self._seen
         values = [block.values for block in self.problem.blocks]
-        bad = np.zeros(len(seen.frame), dtype=np.bool_)
+        squares = np.zeros(len(seen.frame))
         for group, rows in self._views:
-            bad[rows] = group.squares(values) > threshold**2
-        newest = (seen.frame == self.frames[-1].number) & (seen.camera == 0)
+            squares[rows] = group.squares(values)
+        bad = squares > threshold**2
+        newest = seen.frame == self.frames[-1].number
+        first = newest & (seen.camera == 0)
         # A landmark without what its anchor saw, with nothing but that, or behind the camera, is none.
         row = np.searchsorted(self.points.ids, seen.landmark)
         left = np.bincount(row[~bad], minlength=len(self.points))
         own = (seen.frame == self._anchor[row]) & (seen.camera == 0)
         anchored = np.bincount(row[own & ~bad], minlength=len(self.points))
         gone = (left < 2) | (anchored < 1) | (self.points.values[:, 2] < _BEHIND)
-        counts = int((newest & ~bad).sum()), int((newest & bad).sum())
-        tracks = self._track[gone]
+        imu = np.zeros(0) if self._imu_group is None else self._imu_group.squares(values) / 15.0
+        spread = float(np.median(squares[newest])) if newest.any() else float("nan")
+        fit = Fit(
+            agreed=int((first & ~bad).sum()),
+            not_agreed=int((first & bad).sum()),
+            given_up=self._track[gone],
+            reprojection_px=self._config.pixel_sigma * float(np.sqrt(spread / _MEDIAN_OF_TWO)),
+            imu_ratio=float(np.sqrt(imu[-_LAST_INTERVALS:].mean())) if len(imu) else 0.0,
+        )
         seen.keep(~bad)
+        self._rho_sigma = self._inverse_depth_sigmas()
         self._remove_landmarks(gone)
-        return *counts, tracks
+        return fit
+
+    def _inverse_depth_sigmas(self) -> Floats:
+        """(m,) of ρ of every landmark, from the information that the residuals just evaluated have about it."""
+        information = np.zeros(len(self.points))
+        for group, _ in self._views:
+            np.add.at(information, group.connections[-1].rows, (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1))
+        return 1.0 / np.sqrt(np.maximum(information, 1e-12))
 
     def _remove_landmarks(self, gone: NDArray[np.bool_]) -> None:
         """Landmarks (m,) that prove to be none, with all that was seen of them."""
@@ -338,7 +302,7 @@ class Window:
             self._seen.keep(~np.isin(self._seen.landmark, ids))
             self.problem.remove(self.points[ids], *[group for group, _ in self._views])
             self._views = []
-            self._track, self._anchor = self._track[~gone], self._anchor[~gone]
+            self._track, self._anchor, self._rho_sigma = self._track[~gone], self._anchor[~gone], self._rho_sigma[~gone]
 
     def shrink(self) -> None:
         """Drop frames that are no keyframes and not recent any more; let the oldest keyframe go where there are too many."""

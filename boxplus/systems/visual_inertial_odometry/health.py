@@ -1,0 +1,124 @@
+"""Whether to believe a frame: how much it saw, whether what it saw agrees, and whether the IMU says the same.
+
+A frame is weak where little was seen, or where what was seen contradicts itself, the calibration or the IMU; lost where nothing
+was seen for longer than the IMU holds the pose. A contradiction that lasts is remembered for the whole run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.estimate import Status
+from boxplus.systems.visual_inertial_odometry.observations import Fit
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+
+_ENOUGH = 15  # landmarks that agree; fewer leave directions to the IMU
+_ANY = 6  # landmarks without which a frame counts as blind
+_DISAGREE = 0.35  # share of a frame's landmarks that is more than outliers
+_IMU_RATIO = 1.5  # residuals of the IMU over what its noise explains
+_FIT_RATIO = 2.5  # residuals of the corners over what their noise explains
+_MEMORY = 0.9  # of the running means, per frame
+_LEAST_PARTNERS = 0.15  # share of the corners that a second camera finds where the calibration puts them
+_SUSTAINED_S = 1.0  # of a contradiction that is no accident
+_DARK, _FLAT = 12.0, 5.0  # grey values: mean and standard deviation of an image that shows nothing
+
+
+@dataclass(slots=True)
+class Health:
+    """Judges frame after frame.
+
+    Attributes:
+        contradiction: the first contradiction that lasted for a second; poses from then on are not to be believed.
+    """
+
+    config: VioConfig
+    contradiction: str | None = None
+    _seen_ns: int = 0
+    _agreed_ns: int = 0
+    _disagreeing: float = 0.0
+    _imu_ratio: float = 0.0
+    _fit_ratio: float = 0.0
+    _partners: float = 1.0
+
+    def begin(self, time_ns: int) -> None:
+        """A start was found."""
+        self._seen_ns = self._agreed_ns = time_ns
+
+    def judge(self, tracks: Tracks, fit: Fit, position_sigma: float) -> tuple[Status, tuple[str, ...]]:
+        """The status of a frame, and why it is not "ok".
+
+        Args:
+            position_sigma: standard deviation of the position, all axes together [m].
+        """
+        time_ns, reasons = tracks.time_ns, []
+        if fit.agreed >= _ANY:
+            self._seen_ns = time_ns
+        blind_s = (time_ns - self._seen_ns) * 1e-9
+        if fit.agreed < _ENOUGH:
+            reasons.append(f"{fit.agreed} landmarks agree with the frame, of at least {_ENOUGH}{self._view(tracks)}")
+        if blind_s > self.config.max_blind:
+            reasons.append(
+                f"nothing was seen for {blind_s:.1f} s, and the IMU holds the pose for {self.config.max_blind:g} s; its standard "
+                f"deviation is {position_sigma:.2f} m by now"
+            )
+        contradictions = self._contradictions(tracks, fit)
+        if not contradictions:
+            self._agreed_ns = time_ns
+        elif (time_ns - self._agreed_ns) * 1e-9 > _SUSTAINED_S and self.contradiction is None:
+            self.contradiction = contradictions[0]
+        status: Status = "ok"
+        if reasons or contradictions:
+            status = "lost" if blind_s > self.config.max_blind else "weak"
+        return status, (*reasons, *contradictions)
+
+    def _contradictions(self, tracks: Tracks, fit: Fit) -> list[str]:
+        """What does not go together, in the mean over the last ten frames or so."""
+        seen, new = fit.agreed + fit.not_agreed, 1.0 - _MEMORY
+        if seen >= _ANY:
+            self._disagreeing += new * (fit.not_agreed / seen - self._disagreeing)
+            self._fit_ratio += new * (fit.reprojection_px / self.config.pixel_sigma - self._fit_ratio)
+        self._imu_ratio += new * (fit.imu_ratio - self._imu_ratio)
+        sentences = []
+        if self._disagreeing > _DISAGREE:
+            sentences.append(
+                f"{100 * self._disagreeing:.0f} % of the landmarks seen are not where they should be: much of the view moves on "
+                "its own, or camera and IMU do not belong together as calibrated"
+            )
+        if self._imu_ratio > _IMU_RATIO:
+            sentences.append(
+                f"the IMU disagrees with the cameras by {self._imu_ratio:.1f} times what its noise explains: check its noise, "
+                "its clock, and how the cameras are mounted"
+            )
+        if self._fit_ratio > _FIT_RATIO:
+            sentences.append(
+                f"landmarks fit to {self._fit_ratio * self.config.pixel_sigma:.1f} px, where {self.config.pixel_sigma:g} px are "
+                "expected: check the calibration of the cameras"
+            )
+        if tracks.pixels.shape[1] > 1 and len(tracks) >= _ENOUGH and (tracks.contrast > _FLAT).all():
+            partners = np.isfinite(tracks.pixels[:, 1:, 0]).any(axis=1).mean()
+            self._partners += new * (float(partners) - self._partners)
+        if self._partners < _LEAST_PARTNERS:
+            sentences.append(
+                f"{100 * self._partners:.0f} % of the corners are found in a second camera, where it should see them: check "
+                "which camera is which, and T_imu_camera"
+            )
+        return sentences
+
+    def _view(self, tracks: Tracks) -> str:
+        """What the images themselves say about it."""
+        brightness, contrast = float(tracks.brightness[0]), float(tracks.contrast[0])
+        if np.isnan(brightness):
+            return "; the first camera delivered no image"
+        if contrast < _FLAT or brightness < _DARK:
+            what = "dark or covered" if brightness < 2.0 * _DARK else "without texture"
+            return f"; the image is {what}: mean {brightness:.0f}, standard deviation {contrast:.1f} of 255"
+        return f" ({len(tracks)} corners were followed)"
+
+
+def position_sigma(covariance: NDArray[np.float64]) -> float:
+    """Standard deviation of the position, all axes together, from a covariance (15, 15) in the order of `VioEstimate` [m]."""
+    return float(np.sqrt(max(np.trace(covariance[3:6, 3:6]), 0.0)))

@@ -1,0 +1,113 @@
+"""Corners followed through images whose motion is known, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from boxplus import InputError, Pinhole
+from boxplus.manifolds import so3
+from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, grey_8_bit
+
+SIZE = (320, 240)
+CAMERA = Pinhole(220.0, 220.0, 159.5, 119.5)
+BASELINE, DEPTH = 0.12, 3.0
+
+
+def mounting(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def stereo() -> Rig:
+    return Rig.of([CAMERA] * 2, [mounting(0.0), mounting(BASELINE)], [SIZE] * 2)
+
+
+def wall(seed: int = 0) -> np.ndarray:
+    cv2 = pytest.importorskip("cv2")
+    rng = np.random.default_rng(seed)
+    picture = sum(cv2.resize(rng.uniform(0, 1, (n, n)).astype(np.float32), (1800, 1800), interpolation=2) for n in (40, 120, 300))
+    return cv2.normalize(picture, None, 10, 245, cv2.NORM_MINMAX)
+
+
+def seen(picture: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """The wall z = DEPTH, 300 pixels of the picture a metre, seen from (R, p) by the camera."""
+    cv2 = pytest.importorskip("cv2")
+    to_picture = np.array([[300.0, 0, 900.0], [0, 300.0, 900.0], [0, 0, 1.0]])
+    # X = p + s R K⁻¹ u with X_z = DEPTH
+    H = np.array([[DEPTH - p[2], 0, p[0]], [0, DEPTH - p[2], p[1]], [0, 0, 1.0]])
+    G = to_picture @ H @ R @ np.linalg.inv(CAMERA.K)
+    image = cv2.warpPerspective(picture, G, SIZE, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def pair(picture: np.ndarray, R: np.ndarray, p: np.ndarray) -> dict[int, np.ndarray]:
+    return {0: seen(picture, R, p), 1: seen(picture, R, p + R @ [BASELINE, 0, 0])}
+
+
+def where(pixels: np.ndarray, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(n, 3) points of the wall at pixels of the first camera."""
+    rays = CAMERA.unproject(pixels)[0] @ R.T
+    return p + rays * ((DEPTH - p[2]) / rays[:, 2])[:, None]
+
+
+def test_corners_stay_on_their_points_through_turns_that_the_gyroscope_knows() -> None:
+    picture, tracker = wall(), FeatureTracker(VioConfig(features=80, cell_size=30), stereo())
+    R, p = np.eye(3), np.zeros(3)
+    tracks = tracker.detect(tracker.track(0, pair(picture, R, p), np.eye(3)))
+    assert 50 < len(tracks) <= 80 and tracks.is_new.all()
+    assert np.isfinite(tracks.pixels[:, 1, 0]).mean() > 0.7
+    points = dict(zip(tracks.ids.tolist(), where(tracks.pixels[:, 0], R, p), strict=True))
+    for k in range(1, 6):
+        turn, step = so3.exp(np.array([0.05, -0.12, 0.08]) * (-1) ** k), np.array([0.03, 0.01, 0.05])
+        R_now, p_now = R @ turn, p + step
+        tracks = tracker.track(k, pair(picture, R_now, p_now), turn, R.T @ step)
+        R, p = R_now, p_now
+    assert len(tracks) > 25 and not tracks.is_new.any()
+    truth = np.array([points[k] for k in tracks.ids.tolist()])
+    off = [
+        np.linalg.norm(CAMERA.project((truth - p - R @ [x, 0, 0]) @ R)[0] - tracks.pixels[:, c], axis=1)
+        for c, x in enumerate((0.0, BASELINE))
+    ]
+    assert np.median(off[0]) < 0.2 and np.nanmedian(off[1]) < 0.2
+    assert np.allclose(CAMERA.unproject(tracks.pixels[:, 0])[0], tracks.rays[:, 0])
+    again = tracker.detect(tracks)
+    fresh = again.pixels[again.is_new, 0]
+    assert len(fresh) > 5
+    away = np.abs(fresh[:, None] - tracks.pixels[None, :, 0]).max(axis=2).min(axis=1)
+    assert away.min() >= 15.0 - 1.0 and not np.isin(again.ids[again.is_new], tracks.ids).any()
+    tracker.forget(again.ids[::2])
+    assert tracker.track(9, pair(picture, R, p), np.eye(3)).ids.tolist() == again.ids[1::2].tolist()
+
+
+def test_a_second_image_that_does_not_belong_to_the_first_gives_no_partners() -> None:
+    picture, tracker = wall(), FeatureTracker(VioConfig(features=80), stereo())
+    R, p = np.eye(3), np.zeros(3)
+    images = pair(picture, R, p)
+    swapped = tracker.detect(tracker.track(0, {0: images[1], 1: images[0]}, np.eye(3)))
+    assert np.isfinite(swapped.pixels[:, 1, 0]).mean() < 0.1
+    lower = tracker.track(1, {0: images[0], 1: np.roll(images[1], 6, axis=0)}, np.eye(3))
+    assert np.isfinite(lower.pixels[:, 1, 0]).mean() < 0.2 and lower.rejected["off its epipolar line"] > 5
+
+
+def test_without_an_image_or_in_the_dark_corners_are_lost_and_counted() -> None:
+    picture, tracker = wall(), FeatureTracker(VioConfig(features=60), stereo())
+    R, p = np.eye(3), np.zeros(3)
+    count = len(tracker.detect(tracker.track(0, pair(picture, R, p), np.eye(3))))
+    dark = tracker.track(1, {c: np.zeros((240, 320), np.uint8) for c in range(2)}, np.eye(3))
+    assert len(dark) == 0 and sum(dark.rejected.values()) == count and dark.contrast[0] == 0.0
+    assert len(tracker.detect(dark)) == 0
+    tracker.detect(tracker.track(2, pair(picture, R, p), np.eye(3)))
+    none = tracker.track(3, {}, np.eye(3))
+    assert len(none) == 0 and none.rejected["no image of the first camera"] > 20 and np.isnan(none.brightness).all()
+
+
+def test_sixteen_bits_become_eight_and_opencv_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert grey_8_bit(np.array([[0, 256, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(InputError, match=r"boxplus\[vision\]"):
+        FeatureTracker(VioConfig(), stereo())
