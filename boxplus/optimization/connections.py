@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -92,6 +93,7 @@ def check_connections(residual: Residual, rows: Sequence[VariableRows], groups: 
         used.append((type(residual).__name__, role, connection))
 
 
+@lru_cache(maxsize=1024)
 def _meaning(role: str) -> str | None:
     """What a role says of its variable; None where it says nothing that another role could contradict."""
     for pattern, meaning in _MEANINGS:

@@ -27,7 +27,7 @@ _FEW = 4  # variables of a residual whose products are worth a call each
 
 def piece(items: int, threads: int) -> int:
     """How many of `items` a thread takes in one go, where the results do not depend on it."""
-    return max(1, -(-items // (_PIECES * threads)))
+    return max(1, items if threads == 1 else -(-items // (_PIECES * threads)))
 
 
 @dataclass(frozen=True, slots=True)

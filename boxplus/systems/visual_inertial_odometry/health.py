@@ -18,6 +18,7 @@ from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _ENOUGH = 15  # landmarks that agree; fewer leave directions to the IMU
 _ANY = 6  # landmarks without which a frame counts as blind
+_CORNERS_HOLD = 5.0  # times as long as the IMU alone
 _DISAGREE = 0.35  # share of a frame's landmarks that is more than outliers
 _IMU_RATIO = 1.5  # residuals of the IMU over what its noise explains
 _FIT_RATIO = 2.5  # residuals of the corners over what their noise explains
@@ -48,21 +49,25 @@ class Health:
         """A start was found."""
         self._seen_ns = self._agreed_ns = time_ns
 
-    def judge(self, tracks: Tracks, fit: Fit, position_sigma: float) -> tuple[Status, tuple[str, ...]]:
+    def judge(self, tracks: Tracks, fit: Fit, rests: bool, position_sigma: float) -> tuple[Status, tuple[str, ...]]:
         """The status of a frame, and why it is not "ok".
 
         Args:
+            rests: the images stand still, so that the pose is held without landmarks.
             position_sigma: standard deviation of the position, all axes together [m].
         """
         time_ns, reasons = tracks.time_ns, []
-        if fit.agreed >= _ANY:
+        if fit.agreed >= _ANY or rests:
             self._seen_ns = time_ns
         blind_s = (time_ns - self._seen_ns) * 1e-9
-        if fit.agreed < _ENOUGH:
+        if fit.agreed < _ENOUGH and not rests:
             reasons.append(f"{fit.agreed} landmarks agree with the frame, of at least {_ENOUGH}{self._view(tracks)}")
-        if blind_s > self.config.max_blind:
+        # Corners without a depth, as one camera has them before it moves, hold the attitude and bound what position does.
+        has_corners = fit.agreed + fit.not_agreed < _ANY and len(tracks) >= _ENOUGH
+        is_lost = blind_s > self.config.max_blind * (_CORNERS_HOLD if has_corners else 1.0)
+        if is_lost:
             reasons.append(
-                f"nothing was seen for {blind_s:.1f} s, and the IMU holds the pose for {self.config.max_blind:g} s; its standard "
+                f"no landmark was seen for {blind_s:.1f} s; the IMU holds the pose for {self.config.max_blind:g} s, its standard "
                 f"deviation is {position_sigma:.2f} m by now"
             )
         contradictions = self._contradictions(tracks, fit)
@@ -72,7 +77,7 @@ class Health:
             self.contradiction = contradictions[0]
         status: Status = "ok"
         if reasons or contradictions:
-            status = "lost" if blind_s > self.config.max_blind else "weak"
+            status = "lost" if is_lost else "weak"
         return status, (*reasons, *contradictions)
 
     def _contradictions(self, tracks: Tracks, fit: Fit) -> list[str]:

@@ -30,7 +30,7 @@ from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
 from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
-from boxplus.systems.visual_inertial_odometry.window import Window
+from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _OUTLIER = 4.0  # standard deviations
 _LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
@@ -125,7 +125,8 @@ class VisualInertialOdometry:
         estimates = []
         for time_ns in sorted(self._images):
             complete = len(self._images[time_ns]) == len(self.rig.cameras) or final or time_ns < max(self._images)
-            if not complete or not len(self._imu) or self._imu.time_ns[-1] < time_ns:
+            until = time_ns + self.window.cut_ns + (SPARE_NS if self.config.time_offset_estimation and not final else 0)
+            if not complete or not len(self._imu) or self._imu.time_ns[-1] < until:
                 break
             images = self._images.pop(time_ns)
             if self._imu.time_ns[0] > time_ns:
@@ -146,12 +147,15 @@ class VisualInertialOdometry:
         if is_keyframe:
             tracks = self._tracker.detect(tracks)
         self.window.add(tracks, pose, state, is_keyframe, self._imu)
+        rests = self.window.rests()
+        if rests:
+            self.window.hold_still()
         self.window.solve()
         fit = self.window.reject(_OUTLIER)
         self._tracker.forget(fit.given_up)
-        estimate = self._estimate(tracks, is_keyframe, fit)
+        estimate = self._estimate(tracks, is_keyframe, fit, rests)
         self.window.shrink()
-        oldest = int(np.searchsorted(self._imu.time_ns, self.window.frames[0].time_ns)) - 2
+        oldest = int(np.searchsorted(self._imu.time_ns, self.window.frames[0].time_ns + self.window.cut_ns - 2 * SPARE_NS)) - 2
         if oldest > 0:
             self._imu = ImuSamples(self._imu.time_ns[oldest:], self._imu.gyro[oldest:], self._imu.accel[oldest:])
         return estimate
@@ -179,7 +183,7 @@ class VisualInertialOdometry:
         fit = self.window.reject(_OUTLIER)
         self._tracker.forget(fit.given_up)
         self._health.begin(tracks.time_ns)
-        return self._estimate(tracks, True, fit)
+        return self._estimate(tracks, True, fit, start.kind == "at rest")
 
     def _nothing(self, tracks: Tracks, reason: str) -> VioEstimate:
         nan = np.full(3, np.nan)
@@ -205,18 +209,16 @@ class VisualInertialOdometry:
             timing_s={},
         )
 
-    def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit) -> VioEstimate:
+    def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit, rests: bool) -> VioEstimate:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = quaternion.to_matrix(pose[:4]), pose[4:]
         ids, landmarks, sigmas = self.window.landmarks()
         covariance = self.window.covariance[np.ix_(_ORDER, _ORDER)]
-        status, reasons = self._health.judge(tracks, fit, position_sigma(covariance))
+        status, reasons = self._health.judge(tracks, fit, rests, position_sigma(covariance))
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,
             reasons=reasons,
-            T_world_imu=T,
+            T_world_imu=_matrices(pose[None])[0],
             velocity_world=state[:3].copy(),
             gyro_bias=state[6:].copy(),
             accel_bias=state[3:6].copy(),
@@ -229,7 +231,14 @@ class VisualInertialOdometry:
             landmark_ids=ids,
             landmarks=landmarks,
             landmark_sigmas=sigmas,
-            T_imu_camera=np.array([camera.T_imu_camera for camera in self.rig.cameras]),
-            time_offset_s=0.0,
+            T_imu_camera=_matrices(self.window.mountings.values),
+            time_offset_s=float(self.window.offset.values[0, 0]),
             timing_s={"opencv": self._tracker.opencv_s},
         )
+
+
+def _matrices(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4, 4) of (n, 7)."""
+    matrices = np.tile(np.eye(4), (len(T), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = quaternion.to_matrix(T[:, :4]), T[:, 4:]
+    return matrices

@@ -40,6 +40,10 @@ _KNOWN = 1e-4  # rad, m: of the first yaw and position, which are known by defin
 _COST_TOLERANCE = 1e-3
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
+_REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
+_LEAST_RHO = 0.1  # 1/m, for what is not known to be nearer
+_RECUT_NS = 1_000_000
+SPARE_NS = 20_000_000  # of IMU samples on both sides of the intervals, where these follow the clocks' offset
 _BEHIND = -0.02  # 1/m, of a landmark that is not only far
 
 
@@ -49,6 +53,7 @@ class Window:
     Attributes:
         problem: poses `bodies`, velocities and biases `states` [v, b_a, b_g], camera mountings, `points` [x, y, ρ] in the first
             camera of their anchor.
+        offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
         frames: in order of time.
         covariance: (15, 15) of the newest frame, [θ, p, v, b_a, b_ω].
         leak: what the last prior claims to know of position and yaw.
@@ -67,6 +72,13 @@ class Window:
             self.problem.add_residuals(Prior(BodyPose, rig.mountings, sigma=sigma), self.mountings, name="drawing")
         else:
             self.problem.fix(self.mountings)
+        self.offset = self.problem.add_variables(Euclidean(1), [0.0], name="time offset")
+        if config.time_offset_estimation:
+            clock = Prior(Euclidean(1), [0.0], sigma=config.time_offset_sigma)
+            self.problem.add_residuals(clock, self.offset, name="clock")
+        else:
+            self.problem.fix(self.offset)
+        self.cut_ns = 0
         self._gauge = world_gauge({self.bodies: "world_from_body", self.states: "velocity_first"}, rotation="yaw")
         self.leak: Leak | None = None
         self.covariance = np.zeros((15, 15))
@@ -106,18 +118,29 @@ class Window:
         return pose[0], state[0]
 
     def _step(self, time_ns: int, imu: ImuSamples) -> Preintegration:
-        state, since = self.states.values[-1], self.frames[-1].time_ns
-        first = max(int(np.searchsorted(imu.time_ns, since, side="right")) - 1, 0)
-        last = int(np.searchsorted(imu.time_ns, time_ns, side="left")) + 1
+        """What the IMU measured from the newest frame to a time of the cameras' clock."""
+        state = self.states.values[-1]
+        since, until = self.frames[-1].time_ns + self.cut_ns, time_ns + self.cut_ns
+        spare = SPARE_NS if self._config.time_offset_estimation else 0
+        first = max(int(np.searchsorted(imu.time_ns, since - spare, side="right")) - 1, 0)
+        last = int(np.searchsorted(imu.time_ns, until + spare, side="left")) + 1
         return Preintegration.integrate(
             imu.time_ns[first:last],
             imu.gyro[first:last],
             imu.accel[first:last],
             noise=self._noise,
-            intervals_ns=[since, time_ns],
+            intervals_ns=[since, until],
             bias_accel=state[3:6],
             bias_gyro=state[6:],
         )
+
+    def _follow_clock(self) -> None:
+        """Cut the IMU's intervals anew where the clocks' offset moved away from that they were cut at."""
+        late_ns = round(float(self.offset.values[0, 0]) * 1e9) - self.cut_ns
+        if self._imu is not None and abs(late_ns) > _RECUT_NS:
+            step = max(min(late_ns, SPARE_NS // 2), -SPARE_NS // 2)
+            self._imu = self._imu.shifted(step)
+            self.cut_ns += step
 
     def add(self, tracks: Tracks, pose: Floats, state: Floats, is_keyframe: bool, imu: ImuSamples) -> None:
         """The next frame, at its predicted pose and state; what it saw of landmarks, and for a keyframe new landmarks."""
@@ -141,14 +164,28 @@ class Window:
         self.problem.extend(self.states, state)
         self.frames.append(Frame(number, tracks.time_ns, tracks, is_keyframe))
 
-    def add_rest(self, sigma: float) -> None:
-        """The newest frame stands still."""
+    def rests(self) -> bool:
+        """Whether nothing has moved in the images since the last keyframe or longer, as far as corners can tell."""
+        newest = self.frames[-1].tracks
+        before = next((f for f in reversed(self.frames[:-1]) if newest.time_ns - f.time_ns > _REST_NS), None)
+        if before is None:
+            return False
+        _, then, now = np.intersect1d(before.tracks.ids, newest.ids, assume_unique=True, return_indices=True)
+        if len(now) < _REST_CORNERS:
+            return False
+        moved = np.linalg.norm(newest.pixels[now, 0] - before.tracks.pixels[then, 0], axis=1)
+        # All corners of a scene that turns or nears move; noise of a few does not make motion.
+        return float(np.quantile(moved, 0.8)) < _REST_PX
+
+    def hold_still(self) -> None:
+        """The velocity of the newest frame is zero, as far as corners that stand still say."""
+        depth = float(np.median(1.0 / np.maximum(self.points.values[:, 2], _LEAST_RHO))) if len(self.points) else 1.0 / _LEAST_RHO
+        sigma = _REST_PX / self._rig.cameras[0].model.fx * depth / (1e-9 * _REST_NS)
         information = np.zeros((9, 9))
         information[range(3), range(3)] = 1.0 / sigma**2
         number = self.frames[-1].number
-        self.problem.add_residuals(
-            Prior(Euclidean(9), np.zeros(9), information=information), self.states[number], name=f"rest {number}"
-        )
+        zero = Prior(Euclidean(9), np.zeros(9), information=information)
+        self.problem.add_residuals(zero, self.states[number], name=f"rest {number}")
 
     def _found_landmarks(self) -> None:
         """New landmarks for the corners that have none, where what keyframes saw of them gives a depth."""
@@ -210,6 +247,7 @@ class Window:
 
     def solve(self) -> Solution:
         """Minimise over the window, from where it is."""
+        self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
         solution = self.problem.solve(max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, examine=False)
         self.problem.set_values(solution)
@@ -245,14 +283,16 @@ class Window:
             stale = self._imu.is_stale(state[:, 3:6], state[:, 6:])
             if stale.any():
                 self._imu = self._imu.reintegrated(state[:, 3:6], state[:, 6:], stale)
-            self._imu_group = self.problem.add_residuals(
-                ImuPreintegration(self._imu if intervals == len(self._imu) else self._imu[:intervals], gravity=self._gravity),
-                self.bodies[:intervals],
-                self.states[:intervals],
-                self.bodies[1 : intervals + 1],
-                self.states[1 : intervals + 1],
-                name="imu",
+            follows = self._config.time_offset_estimation
+            residual = ImuPreintegration(
+                self._imu if intervals == len(self._imu) else self._imu[:intervals],
+                gravity=self._gravity,
+                time_offset=follows,
+                time_offset_s=1e-9 * self.cut_ns,
             )
+            begin, end = slice(0, intervals), slice(1, intervals + 1)
+            states = self.bodies[begin], self.states[begin], self.bodies[end], self.states[end]
+            self._imu_group = self.problem.add_residuals(residual, *states, *([self.offset[:]] if follows else []), name="imu")
 
     def reject(self, threshold: float) -> Fit:
         """Leave out observations whose residual is larger, and landmarks that too few agree on.

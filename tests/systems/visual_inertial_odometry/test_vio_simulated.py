@@ -118,7 +118,7 @@ def test_a_dark_while_is_weak_then_lost_and_the_map_frame_is_kept() -> None:
     assert (status[(time > 4.6) & (time < 5.25)] == "lost").all()
     assert (status[time > 5.6] == "ok").all()
     dark = [e for e in known if e.status == "lost"]
-    assert "dark or covered" in dark[0].reasons[0] and "nothing was seen for 1." in dark[0].reasons[1]
+    assert "dark or covered" in dark[0].reasons[0] and "no landmark was seen for 1." in dark[0].reasons[1]
     sigma = np.array([np.sqrt(np.trace(e.covariance[3:6, 3:6])) for e in known])
     assert sigma[time < 5.2][-1] > 3.0 * sigma[time < 3.45][-1]
     error, covariance = position_and_yaw_error(flight, known[0], known[-1])
