@@ -94,6 +94,61 @@ def linearize(
 
 
 @kernel
+def cell_scores(
+    T_21: NDArray[np.float64],
+    gain: float,
+    offset: float,
+    pixels_1: NDArray[np.float64],
+    rays_1: NDArray[np.float64],
+    inverse_depth_1: NDArray[np.float64],
+    grey_1: NDArray[np.float64],
+    J_1: NDArray[np.float64],
+    image_2: NDArray[np.float32],
+    c: NDArray[np.float64],
+    z_min: float,
+    loss_code: int,
+    loss_scale: float,
+    sigma: float,
+    cell: float,
+    across: int,
+    scores: NDArray[np.float64],
+) -> tuple[float, float]:
+    """scores (cells, 8): Σ ρ' Jᵀe/σ² over the pixels of each square cell of the keyframe, row by row, `across` of them in one.
+
+    Returns:
+        Σ ρ' and Σ (ρ' + 2 ρ'' e²/σ²), whose ratio is that of the weights to the slope of the influence ρ' e.
+    """
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+    scores[:] = 0.0
+    information, weights, slopes = 1.0 / (sigma * sigma), 0.0, 0.0
+    for n in range(np.uint64(len(grey_1))):
+        mx, my, rho = rays_1[n, 0], rays_1[n, 1], inverse_depth_1[n]
+        x = r00 * mx + r01 * my + r02 + rho * T_21[4]
+        y = r10 * mx + r11 * my + r12 + rho * T_21[5]
+        z = r20 * mx + r21 * my + r22 + rho * T_21[6]
+        if not (z > z_min * rho and z > LEAST_Y_Z):
+            continue
+        u, v, _, _, _, _, _, _ = project_point(x, y, z, fx, fy, cx, cy, k1, k2, p1, p2, k3)
+        found, value, _, _ = sample_bilinear(image_2, u, v)
+        if not found:
+            continue
+        grey = grey_1[n]
+        error = grey - gain * value - offset
+        square = error * error * information
+        _, slope, curvature = loss_at(loss_code, loss_scale, square)
+        weights += slope
+        slopes += slope + 2.0 * curvature * square
+        row = np.uint64(pixels_1[n, 1] / cell) * np.uint64(across) + np.uint64(pixels_1[n, 0] / cell)
+        pull = slope * information * error
+        for i in range(6):
+            scores[row, i] += pull * J_1[n, i]
+        scores[row, 6] += pull * grey
+        scores[row, 7] += pull
+    return weights, slopes
+
+
+@kernel
 def _sigma(e: NDArray[np.float64], count: int, least: float) -> float:
     """Robust standard deviation of e[:count] by the median of |e|."""
     step = max(count // _SCALED_ON, 1)

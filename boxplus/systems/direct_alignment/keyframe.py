@@ -28,6 +28,8 @@ from boxplus.sensors.image import Image, half_camera
 from boxplus.systems.direct_alignment.keyframe_kernel import half_depth, pixel_jacobians, select_pixels
 
 FEWEST_PIXELS = 100
+_NOISE_STEP = 4  # rows of the image from one that its noise is measured in to the next
+_QUARTER_OF_NORMAL = 0.31864  # |x| below which a quarter of a normal distribution lies
 _STEPS_ABOVE = 2  # octaves; pixels at steps of the depth stay, as on coarse levels nearly all of them are at one
 
 
@@ -40,6 +42,7 @@ class Level:
         pixels: (n, 2) u, v; rays: (n, 2) of z = 1; inverse_depth: (n,) [1/m]; grey: (n,) of the keyframe.
         J: (n, 6) of the keyframe's grey values by ξ = [w, v] [grey values/rad, grey values/m].
         intrinsics: (9,) of the camera at this level.
+        gradient_noise: variance that noise of the image gives to a component of the gradients, chosen as they are [1/px²].
     """
 
     octave: int
@@ -49,6 +52,7 @@ class Level:
     grey: NDArray[np.float64]
     J: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
+    gradient_noise: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +142,21 @@ def _level(octave: int, grey: NDArray[np.float32], depth: NDArray[np.float32], c
     inverse_depth = 1.0 / values[:count][seen, 1]
     J, c = np.empty((len(rays), 6)), camera.padded_parameters
     pixel_jacobians(rays, inverse_depth, gradients[:count][seen], c, J)
-    return Level(octave, pixels[:count][seen], rays, inverse_depth, np.ascontiguousarray(values[:count][seen, 0]), J, c)
+    # Half the variance of grey values; the steepest of m gradients of noise is longer by the m-th harmonic number (exponential).
+    gradient_noise = 0.5 * image_noise(grey) ** 2 * float(np.sum(1.0 / np.arange(1.0, cell * cell + 1.0)))
+    grey_1 = np.ascontiguousarray(values[:count][seen, 0])
+    return Level(octave, pixels[:count][seen], rays, inverse_depth, grey_1, J, c, gradient_noise)
+
+
+def image_noise(grey: NDArray[np.float32]) -> float:
+    """Standard deviation of the noise of grey values, by the quarter of the image that is smoothest.
+
+    Source: Immerkær, Fast Noise Variance Estimation, CVIU 1996: a difference of two Laplacians is blind to planes of grey values.
+    """
+    rows = [grey[k : len(grey) - 2 + k : _NOISE_STEP] for k in range(3)]
+    across = [row[:, :-2] - 2.0 * row[:, 1:-1] + row[:, 2:] for row in rows]
+    rough = np.abs(across[0] - 2.0 * across[1] + across[2])
+    return float(np.quantile(rough, 0.25)) / _QUARTER_OF_NORMAL / 6.0 if rough.size else 0.0
 
 
 def _checked_depth(depth_1: ArrayLike, image: Image) -> NDArray[np.float32]:

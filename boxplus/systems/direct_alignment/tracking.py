@@ -8,7 +8,8 @@ only: far from the solution it would turn off what has to move, so that the leve
 levels the brightness stands still, as otherwise it takes a share of what motion has to explain; it is either none or that which
 makes medians and spreads of the two images the same, whichever leaves less.
 
-Source: Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Baker and Matthews, IJCV 2004.
+Source: Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Baker and Matthews, Lucas-Kanade 20
+Years On, IJCV 2004; the covariance: Liang and Zeger, Longitudinal Data Analysis using Generalized Linear Models, Biometrika 1986.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from boxplus.systems.direct_alignment.alignment_kernel import (
     LITTLE_OVERLAP,
     NO_GRADIENT,
     align_level,
+    cell_scores,
 )
 from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe, Level
 from boxplus.systems.direct_alignment.keyframe_kernel import motion_of_seen
@@ -43,6 +45,10 @@ _LEAST_CURVATURE = 1e-9  # smallest over largest eigenvalue of H, translations m
 # their weakest direction, right ones 13 in the median, and below 2 only where much of the image was saturated. A mean of 4 is a
 # standard deviation of the residuals worth one pixel.
 _LEAST_SIGNAL, _LEAST_MEAN_SIGNAL = 2.0, 4.0
+_FEWEST_ABOVE = 40  # pixels at levels above the finest, which only bring the pose closer; with fewer it stays
+_CELLS = 48  # of the image, whose errors are taken for independent of each other
+_LEAST_SLOPE = 0.1  # of the influence, by the weights
+_NOISE_ALONE = 1.3  # signal up to which next to nothing is left of H without noise
 _SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
 
 Status = Literal["converged", "iteration limit", "little overlap", "unobservable", "large residual"]
@@ -55,8 +61,9 @@ class Alignment:
 
     Attributes:
         T_21: (7,) wxyz and xyz, maps points in camera 1, of the keyframe, to camera 2.
-        covariance: (6, 6) of ξ = [w, v] in Exp(ξ) T_21 [rad², rad·m, m²], as if pixels were independent and depth exact, which
-            makes it too small by a factor; NaN where the grey values do not support the pose, whatever the status.
+        covariance: (6, 6) of ξ = [w, v] in Exp(ξ) T_21 [rad², rad·m, m²], from how differently 48 parts of the image pull, so
+            that errors of neighbouring pixels and of depth may be alike; errors that all parts share (wrong intrinsics, a wrong
+            scale of the depth) are not in it. NaN where a direction of the pose is not above noise, whatever the status.
         brightness: (a, b) of image 2 [-, grey values], I₁ = eᵃ I₂ + b.
         cost: mean of ρ over the pixels that count, in units of σ².
         sigma: robust standard deviation of the residuals [grey values of image 1].
@@ -99,7 +106,7 @@ def track(
     Args:
         keyframe: camera 1.
         image: grey values (H, W), or colours, of the keyframe's camera: camera 2.
-        T_21: (7,) start, by default no motion.
+        T_21: (7,) start, by default no motion; or (n, 7), of which that is followed which fits best at the coarsest level.
         loss: of e/σ at the finest level; by default `Tukey(4.685)`. Levels above have `Huber(1.345)` where the loss given turns
             outliers off.
         brightness: whether image 2 may be brighter, affinely, than image 1.
@@ -131,19 +138,19 @@ def track(
         )
     if max_iterations < 1:
         raise InputError("max_iterations at least 1", f"{max_iterations}", "leave it out for 50")
-    pose = SE3Left.check("T_21", T_21)[0].copy()
+    starts = SE3Left.check("T_21", T_21)
+    if not len(starts):
+        raise InputError("at least one start T_21", "none", "leave it out to begin without motion")
     pyramid = second.pyramid(keyframe.halvings + 1)
-    descent = _Descent(keyframe, Tukey(4.685) if loss is None else loss, brightness, pose)
-    if len(keyframe.levels) > 1 or search_deg > 0.0:
+    descent = _Descent(keyframe, Tukey(4.685) if loss is None else loss, brightness, starts[0].copy())
+    if len(keyframe.levels) > 1 or len(starts) > 1 or search_deg > 0.0:
         coarsest = keyframe.levels[0]
-        descent.search(coarsest, pyramid[coarsest.octave], search_deg, min(max_iterations, _SEARCH_ITERATIONS))
+        descent.search(coarsest, pyramid[coarsest.octave], starts, search_deg, min(max_iterations, _SEARCH_ITERATIONS))
     iterations: list[int] = []
     for level in keyframe.levels:
         is_free = brightness and (level.octave < _BRIGHTNESS_BELOW or level is keyframe.levels[-1])
         code = descent.refine(level, pyramid[level.octave], max_iterations, tolerance * 2.0**level.octave, is_free)
         iterations.append(int(descent.figures[5]))
-        if code == LITTLE_OVERLAP:
-            break
     return _judged(descent, level, pyramid[level.octave], code, tuple(iterations), tolerance)
 
 
@@ -161,7 +168,7 @@ class _Descent:
         """Align at one level; returns the code of `align_level`."""
         is_far = level.octave > 0 and self.loss.is_redescending
         loss = _FAR_LOSS if is_far else self.loss
-        fewest = int(np.ceil(max(FEWEST_PIXELS, _LEAST_OVERLAP * len(level.grey))))
+        fewest = int(np.ceil(max(FEWEST_PIXELS if level.octave == 0 else _FEWEST_ABOVE, _LEAST_OVERLAP * len(level.grey))))
         code: int = align_level(
             self.T_21, self.light, level.rays, level.inverse_depth, level.grey, level.J, image.grey, level.intrinsics,
             self.z_min, loss.code, loss.scale, is_free, max_iterations, tolerance, self.reach, self.least_sigma, fewest,
@@ -175,17 +182,32 @@ class _Descent:
         motion_of_seen(self.T_21, level.rays, level.inverse_depth, level.intrinsics, self.z_min, *image.shape, N)
         return N
 
-    def search(self, level: Level, image: Image, search_deg: float, max_iterations: int) -> None:
+    def spread_of_score(self, level: Level, image: Image) -> Matrix:
+        """(8, 8) covariance of Jᵀe/σ² as the cells of the keyframe scatter it, in units in which H is that of its mean slope."""
+        height, width = image.shape
+        cell = float(np.sqrt(height * width / _CELLS))
+        across, down = int(np.ceil(width / cell)), int(np.ceil(height / cell))
+        scores = np.empty((across * down, 8))
+        weights, slopes = cell_scores(
+            self.T_21, *self.light, level.pixels, level.rays, level.inverse_depth, level.grey, level.J, image.grey,
+            level.intrinsics, self.z_min, self.loss.code, self.loss.scale, self.figures[4], cell, across, scores,
+        )  # fmt: skip
+        seen = int(scores.any(axis=1).sum())
+        missing = seen / max(seen - 8, 1)  # the eight unknowns follow the cells they are found from
+        spread: Matrix = scores.T @ scores * (missing * (weights / max(slopes, _LEAST_SLOPE * weights)) ** 2)
+        return spread
+
+    def search(self, level: Level, image: Image, starts: Matrix, search_deg: float, max_iterations: int) -> None:
         """Go on from that of several starts which leads to the smallest mean of |e|, where enough of the image is seen."""
         most = search_deg // _SEARCH_STEP_DEG
         steps = np.radians(_SEARCH_STEP_DEG * np.arange(-most, most + 1.0))
         grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
         grid = grid[np.linalg.norm(grid, axis=1) <= np.radians(search_deg) + 1e-12]
-        T_start, best, least = self.T_21, (self.T_21, self.light), np.inf
+        turns = se3.exp(np.concatenate([grid, np.zeros_like(grid)], axis=1))
+        best, least = (self.T_21, self.light), np.inf
         for light in _lights(level.grey, image.grey) if self.brightness else (self.light,):
-            for rotation in grid:
-                self.T_21 = se3.compose(se3.exp(np.concatenate([rotation, np.zeros(3)])), T_start)
-                self.light = light.copy()
+            for start in (se3.compose(turn, start) for start in starts for turn in turns):
+                self.T_21, self.light = start, light.copy()
                 code = self.refine(level, image, max_iterations, _SEARCH_TOLERANCE, False)
                 count, total = self.figures[0], self.figures[2]
                 if code in (CONVERGED, ITERATION_LIMIT) and total < least * count:
@@ -214,7 +236,8 @@ def _signal(information: Matrix, noise: Matrix) -> Matrix:
 
     Noise of residuals of variance σ², half of it from image 1, is noise of variance σ²/4 in its central differences, and
     has a Hessian as well: σ²/4 Σ ρ' PᵀP/σ², taken here with the mean of ρ'. These are the generalised eigenvalues of the two,
-    which do not depend on where the pixels lie or how far they are away.
+    which do not depend on where the pixels lie or how far they are away. The noise of image 1 alone is less, but it also made
+    pixels steep that were chosen for it: both are asked.
     """
     L = np.linalg.cholesky(noise)
     half = np.linalg.solve(L, information)
@@ -231,7 +254,8 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
     reason = ""
     unit = np.array([1.0, 1.0, 1.0, descent.reach, descent.reach, descent.reach])
     information = (_without_brightness(descent.H) if descent.brightness else descent.H[:6, :6]) * unit[:, None] * unit
-    noise = descent.motion_of_seen(level, image) * unit[:, None] * unit * (0.25 * weights / count)
+    motion = descent.motion_of_seen(level, image) * unit[:, None] * unit * (weights / count)
+    noise, image_noise = 0.25 * motion, level.gradient_noise / sigma**2 * motion
     if code == LITTLE_OVERLAP:
         status = "little overlap"
         reason = (
@@ -243,7 +267,9 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         reason = "a direction of motion changes no grey value: the image has no texture along it"
     else:
         signal = _signal(information, noise)
-        is_right_place, is_known = signal.mean() >= _LEAST_MEAN_SIGNAL, signal[0] >= _LEAST_SIGNAL
+        above_image = np.inf if level.gradient_noise == 0.0 else float(_signal(information, image_noise)[0])
+        is_right_place = signal.mean() >= _LEAST_MEAN_SIGNAL
+        is_known = signal[0] >= _LEAST_SIGNAL and above_image >= _LEAST_SIGNAL
         if code == ITERATION_LIMIT:
             status = "iteration limit"
             reason = f"after {iterations[-1]} linearisations a step was still larger than the tolerance, {tolerance:g}"
@@ -256,12 +282,11 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         elif not is_known:
             status = "unobservable"
             reason = (
-                f"along one direction of motion grey values say {signal[0]:.2g} times what noise would ({_LEAST_SIGNAL:g} at "
-                "least): the image has no texture along it, or the residuals are too large"
+                f"along one direction of motion grey values say {min(signal[0], above_image):.2g} times what noise would "
+                f"({_LEAST_SIGNAL:g} at least): the image has no texture along it, or the residuals are too large"
             )
-        if is_right_place and is_known:
-            Ad = se3.adjoint(descent.T_21) * unit
-            covariance = Ad @ np.linalg.inv(information) @ Ad.T
+        if is_right_place and signal[0] > 1.0 and above_image > _NOISE_ALONE:
+            covariance = _covariance(descent, level, image, unit, image_noise)
     return Alignment(
         T_21=descent.T_21,
         covariance=covariance,
@@ -275,6 +300,20 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         status=status,
         reason=reason,
     )
+
+
+def _covariance(descent: _Descent, level: Level, image: Image, unit: Matrix, noise: Matrix) -> Matrix:
+    """(6, 6) of ξ in Exp(ξ) T_21: (H − N)⁻¹ S (H − N)⁻¹, S the scatter between cells, N what noise adds to H."""
+    dof = 8 if descent.brightness else 6
+    scale = np.concatenate([unit, 1.0 / np.sqrt(np.maximum(np.diag(descent.H)[6:], 1e-300))])[:dof]
+    H = descent.H[:dof, :dof] * scale[:, None] * scale
+    H[:6, :6] -= noise
+    inverse = np.linalg.inv(H)
+    spread = descent.spread_of_score(level, image)[:dof, :dof] * scale[:, None] * scale
+    of_keyframe = (inverse @ spread @ inverse)[:6, :6]
+    Ad = se3.adjoint(descent.T_21) * unit
+    covariance: Matrix = Ad @ of_keyframe @ Ad.T
+    return 0.5 * (covariance + covariance.T)
 
 
 def _is_definite(matrix: Matrix) -> bool:

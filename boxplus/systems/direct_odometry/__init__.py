@@ -1,0 +1,5 @@
+"""Direct (photometric) odometry of RGB-D and stereo cameras."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,301 @@
+"""Direct odometry of an RGB-D or a stereo camera: poses from grey values, without features.
+
+For every frame:
+
+1. **Track** it against the keyframe that sees most of the same, coarse to fine, from the motion so far going on and from
+   standstill; where that fails, from half and double of it, small turns, and against the other keyframes.
+2. **Judge** the alignment: a pose that the images do not support is not a pose.
+3. Where the image moved far enough, or its brightness changed, it becomes a **keyframe**: with its depths it enters the window,
+   whose poses, brightness and inverse depths are adjusted together (`window.py`).
+
+Source: Engel, Koltun and Cremers, Direct Sparse Odometry, TPAMI 2018; Kerl, Sturm and Cremers, Dense Visual SLAM for RGB-D
+Cameras, IROS 2013; docs/direct_odometry.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.cameras.model import CameraModel, check_pinhole
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.se3 import SE3
+from boxplus.sensors.image import Image
+from boxplus.systems.direct_alignment.keyframe import Keyframe
+from boxplus.systems.direct_alignment.tracking import Alignment, track
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+from boxplus.systems.direct_odometry.estimate import Estimate, Status
+from boxplus.systems.direct_odometry.image_motion import image_motion
+from boxplus.systems.direct_odometry.patches import choose_patches
+from boxplus.systems.direct_odometry.sensed_depth import SensedDepth, StereoPair, rgbd_depth
+from boxplus.systems.direct_odometry.verdict import Verdict, Watch
+from boxplus.systems.direct_odometry.window import Window
+from boxplus.systems.direct_odometry.window_system import WindowKeyframe
+from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
+
+Matrix = NDArray[np.float64]
+
+_STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+_WORLD = np.diag([1e-5**2] * 6)  # of the first pose, which is the world's
+_TURN_DEG = 3.0  # of the starts that are tried when tracking failed
+_SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lost
+_STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
+_LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
+
+
+class Tracked(NamedTuple):
+    """A frame aligned to a keyframe."""
+
+    keyframe: WindowKeyframe
+    alignment: Alignment
+    verdict: Verdict
+
+
+class DirectOdometry:
+    """Direct odometry, frame by frame.
+
+    Args:
+        camera: of the images; without IMU, the camera is the body. A pinhole, with lens distortion or without.
+        config: settings.
+        stereo: the second camera, for `push_stereo`.
+        T_world_camera: (7,) pose of the first frame; by default the world is the first frame's camera.
+
+    Raises:
+        InputError: a camera that is no pinhole, a pose that is none.
+
+    Example:
+        >>> odometry = DirectOdometry(Pinhole(525.0, 525.0, 319.5, 239.5))       # doctest: +SKIP
+        >>> for time_ns, grey, depth in frames:                                  # doctest: +SKIP
+        ...     estimate = odometry.push_rgbd(time_ns, grey, depth)
+        ...     print(estimate.status, estimate.T_world_camera)
+    """
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        config: DirectOdometryConfig | None = None,
+        *,
+        stereo: StereoPair | None = None,
+        T_world_camera: ArrayLike = _STANDSTILL,
+    ) -> None:
+        self.camera = check_pinhole(camera, "direct odometry")
+        self.config = config or DirectOdometryConfig()
+        self.stereo = stereo
+        self.window = Window(self.camera, self.config.window)
+        self.keyframes = 0
+        """Keyframes so far."""
+        self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
+        self._covariance: Matrix = _WORLD
+        self._velocity, self._velocity_s = _STANDSTILL, 0.0
+        self._reference: WindowKeyframe | None = None
+        self._time_ns: int | None = None
+        self._seen_ns: int | None = None
+        self._watch = Watch(self.config)
+
+    def push_rgbd(self, time_ns: int, image: Image | ArrayLike, depth: ArrayLike) -> Estimate:
+        """A frame of an RGB-D camera.
+
+        Args:
+            time_ns: later than that of the frame before [ns].
+            image: grey values (H, W), or colours.
+            depth: (H, W) along the optical axis [m], registered to the image; 0 or NaN where there is none.
+
+        Raises:
+            InputError: arrays of another shape or not finite, a time that does not go on, depths that are no metres.
+        """
+        grey = image if isinstance(image, Image) else Image.from_array(image)
+        return self._push(time_ns, grey, lambda: rgbd_depth(depth, grey, self.config.depth_noise))
+
+    def push_stereo(self, time_ns: int, left: Image | ArrayLike, right: Image | ArrayLike) -> Estimate:
+        """A frame of a stereo camera: poses are those of the left one.
+
+        Args:
+            time_ns: later than that of the frame before [ns].
+            left, right: grey values (H, W), or colours, taken at the same time.
+
+        Raises:
+            InputError: no second camera was given, images of another shape or not finite, a time that does not go on.
+        """
+        if self.stereo is None:
+            raise InputError("the second camera", "none", "give it as DirectOdometry(camera, stereo=StereoPair(…))")
+        stereo = self.stereo
+        one, two = (each if isinstance(each, Image) else Image.from_array(each) for each in (left, right))
+        return self._push(time_ns, one, lambda: stereo.depth(one, two, self.camera))
+
+    def _push(self, time_ns: int, image: Image, depth_of: Callable[[], SensedDepth]) -> Estimate:
+        if self._time_ns is not None and time_ns <= self._time_ns:
+            raise InputError(
+                "frames in the order of time", f"{time_ns} ns after {self._time_ns} ns", "sort them, or drop this one"
+            )
+        watch = Stopwatch()
+        if self._reference is None:
+            return self._begin(time_ns, image, depth_of, watch)
+        elapsed_s = (time_ns - (self._time_ns or time_ns)) * 1e-9
+        self._time_ns = time_ns
+        keyframe, alignment, verdict = self._track(image, self._predicted(elapsed_s))
+        watch.lap("tracking")
+        if verdict.status == "lost":
+            return self._lost(time_ns, image, depth_of, keyframe, alignment, verdict, watch)
+        T_camera_keyframe = alignment.T_21
+        T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
+        Ad = se3.adjoint(T_camera_keyframe)
+        covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
+        is_keyframe = self._asks_for_keyframe(keyframe, alignment)
+        if is_keyframe:
+            added = self._keyframe(time_ns, image, depth_of(), T, keyframe.log_gain - alignment.brightness[0])
+            is_keyframe = added is not None
+            if added is not None:
+                watch.lap("keyframe")
+                self.window.add(added, covariance)
+                if self.config.adjustments:
+                    self.window.adjust(self.config.adjustments)
+                T, covariance = added.T_world_camera, self.window.covariance(added)
+                self._reference = added
+                watch.lap("adjustment")
+        if elapsed_s > 0.0:
+            self._velocity, self._velocity_s = se3.compose(se3.inverse(self._T), T), self._unseen_s(time_ns)
+        self._T, self._covariance, self._seen_ns = T, covariance, time_ns
+        return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
+
+    def _begin(self, time_ns: int, image: Image, depth_of: Callable[[], SensedDepth], watch: Stopwatch) -> Estimate:
+        """The first frame, or the first after the view was lost for good."""
+        keyframe = self._keyframe(time_ns, image, depth_of(), self._T, 0.0)
+        self._time_ns = time_ns
+        reasons = list(self._watch.past_reasons)
+        status: Status = "weak" if reasons else "ok"
+        if keyframe is None:
+            status, reasons = "lost", ["fewer than 100 pixels have a gradient and a depth: there is nothing to track"]
+        else:
+            self.window.begin(keyframe, self._covariance)
+            self._reference, self._seen_ns = keyframe, time_ns
+            self._velocity_s = 0.0
+        watch.lap("keyframe")
+        number = -1 if keyframe is None else keyframe.number
+        return self._estimate(time_ns, number, keyframe is not None, None, Verdict(status, tuple(reasons), np.nan), watch)
+
+    def _predicted(self, elapsed_s: float) -> Matrix:
+        """Where the camera is if its motion goes on."""
+        if self._velocity_s <= 0.0:
+            return self._T
+        share = min(elapsed_s / self._velocity_s, 2.0)
+        return se3.compose(self._T, se3.exp(share * se3.log(self._velocity)))
+
+    def _track(self, image: Image, T_predicted: Matrix) -> Tracked:
+        """The frame against the keyframe closest to where the camera should be; with more starts where that fails."""
+        near = self._nearest(T_predicted)
+        others = [keyframe for keyframe in reversed(self.window.keyframes) if keyframe is not near]
+        attempts = [(near, False)] + [(keyframe, True) for keyframe in (near, *others)]
+        tracked: list[Tracked] = []
+        for keyframe, is_hard in attempts:
+            if is_hard and self._watch.lost:
+                starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, False)[1:], _SEARCH_DEG
+            else:
+                starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, is_hard), 0.0
+            alignment = track(keyframe.tracker, image, T_21=starts, search_deg=search_deg)
+            verdict = self._watch.judge(alignment, keyframe.tracker.median_depth)
+            tracked.append(Tracked(keyframe, alignment, verdict))
+            if verdict.status != "lost":
+                self._reference = keyframe
+                break
+        else:
+            tracked = tracked[:1]
+        self._watch.keep(tracked[-1].alignment, tracked[-1].verdict)
+        return tracked[-1]
+
+    def _nearest(self, T_world_camera: Matrix) -> WindowKeyframe:
+        """The keyframe whose pixels move least; the one that was tracked last, unless another is clearly closer."""
+        wanted = {
+            k.number: self._distance(k, T_world_camera) * (_STAYS if k is self._reference else 1.0) for k in self.window.keyframes
+        }
+        return min(self.window.keyframes, key=lambda k: wanted[k.number])
+
+    def _distance(self, keyframe: WindowKeyframe, T_world_camera: Matrix) -> float:
+        """From 1 on a keyframe is asked for."""
+        motion = image_motion(keyframe.tracker, se3.compose(se3.inverse(T_world_camera), keyframe.T_world_camera))
+        by_flow = motion.flow / self.config.keyframe_flow + motion.by_translation / self.config.keyframe_flow_translation
+        missing = (1.0 - motion.overlap) / (1.0 - self.config.keyframe_overlap)
+        return max(0.5 * by_flow, missing)
+
+    def _asks_for_keyframe(self, keyframe: WindowKeyframe, alignment: Alignment) -> bool:
+        T = se3.compose(keyframe.T_world_camera, se3.inverse(alignment.T_21))
+        by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
+        missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
+        return max(self._distance(keyframe, T) + by_brightness, missing) > 1.0
+
+    def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
+        """None where too little has a depth and a gradient."""
+        try:
+            tracker = Keyframe.prepare(image, depth.z, self.camera, levels=self.config.levels, points=self.config.pixels)
+        except InputError:
+            return None
+        patches = choose_patches(image.grey, depth.z, depth.sigma, self.camera, self.config.patches)
+        self.keyframes += 1
+        return WindowKeyframe(self.keyframes - 1, time_ns, image.grey, T, log_gain, tracker, patches)
+
+    def _unseen_s(self, time_ns: int) -> float:
+        """Time since the last frame with a pose [s]."""
+        return 0.0 if self._seen_ns is None else (time_ns - self._seen_ns) * 1e-9
+
+    def _unseen_covariance(self, time_ns: int) -> Matrix:
+        """(6, 6) of the last pose, and of what the camera may have done since."""
+        since_s = self._unseen_s(time_ns)
+        turned, moved = min(_LOST_TURN * since_s, np.pi), _LOST_SPEED * since_s
+        covariance: Matrix = self._covariance + np.diag([turned**2] * 3 + [moved**2] * 3)
+        return covariance
+
+    def _lost(
+        self,
+        time_ns: int,
+        image: Image,
+        depth_of: Callable[[], SensedDepth],
+        keyframe: WindowKeyframe,
+        alignment: Alignment,
+        verdict: Verdict,
+        watch: Stopwatch,
+    ) -> Estimate:
+        """No pose: the last one stays; after a while, begin anew from it."""
+        self._velocity, self._velocity_s = _STANDSTILL, 0.0
+        gone_s = self._unseen_s(time_ns)
+        if gone_s > self.config.lost_s:
+            self._watch.begin_anew(gone_s)
+            self._covariance = self._unseen_covariance(time_ns)
+            self._reference = None
+            return self._begin(time_ns, image, depth_of, watch)
+        return self._estimate(time_ns, keyframe.number, False, alignment, verdict, watch)
+
+    def _estimate(
+        self, time_ns: int, keyframe: int, is_keyframe: bool, alignment: Alignment | None, verdict: Verdict, watch: Stopwatch
+    ) -> Estimate:
+        covariance = self._unseen_covariance(time_ns) if verdict.status == "lost" else self._covariance
+        turn = np.eye(6)
+        turn[3:, 3:] = quaternion.to_matrix(self._T[:4])
+        return Estimate(
+            time_ns=time_ns,
+            T_world_camera=self._T.copy(),
+            pose_covariance=turn @ covariance @ turn.T,
+            status=verdict.status,
+            reasons=verdict.reasons,
+            keyframe=keyframe,
+            is_keyframe=is_keyframe,
+            overlap=1.0 if alignment is None else alignment.overlap,
+            pixels=0 if alignment is None else alignment.pixels,
+            sigma=0.0 if alignment is None else alignment.sigma,
+            residual_ratio=verdict.residual_ratio,
+            brightness=(0.0, 0.0) if alignment is None else alignment.brightness,
+            timing_s=watch.laps,
+        )
+
+
+def _starts(T_last: Matrix, T_predicted: Matrix, T_world_keyframe: Matrix, is_hard: bool) -> Matrix:
+    """Starts T_camera_keyframe (n, 7): the motion going on, and standstill; then half and double of it, and small turns."""
+    poses = [T_predicted, T_last]
+    if is_hard:
+        step = se3.log(se3.compose(se3.inverse(T_last), T_predicted))
+        poses += [se3.compose(T_last, se3.exp(share * step)) for share in (0.5, 2.0)]
+        turns = np.radians(_TURN_DEG) * np.vstack([np.eye(3), -np.eye(3)])
+        poses += [se3.compose(T_predicted, se3.exp(np.concatenate([turn, np.zeros(3)]))) for turn in turns]
+    return np.array([se3.compose(se3.inverse(pose), T_world_keyframe) for pose in poses])

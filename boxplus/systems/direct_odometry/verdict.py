@@ -1,0 +1,85 @@
+"""Whether to believe the alignment of a frame: what it says of itself, and how it compares with the frames before."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from boxplus.systems.direct_alignment.tracking import Alignment
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+from boxplus.systems.direct_odometry.estimate import Status
+
+_MEMORY = 50  # frames
+_FEWEST = 5
+_LOST_RATIO = 2.0  # times the ratio that makes a pose weak
+
+
+class Verdict(NamedTuple):
+    """Of one frame; see `Estimate`."""
+
+    status: Status
+    reasons: tuple[str, ...]
+    residual_ratio: float
+
+
+class Watch:
+    """The residuals of the frames so far.
+
+    Attributes:
+        lost: whether the frame before had no pose.
+        past_reasons: why no pose since can be believed.
+    """
+
+    def __init__(self, config: DirectOdometryConfig) -> None:
+        self._config = config
+        self._sigmas: deque[float] = deque(maxlen=_MEMORY)
+        self.lost = False
+        self.past_reasons: list[str] = []
+
+    def judge(self, alignment: Alignment, median_depth: float) -> Verdict:
+        """Status and reasons of a frame with this alignment, to a keyframe of this depth [m]."""
+        ratio = np.nan
+        if len(self._sigmas) >= _FEWEST and alignment.pixels:
+            ratio = alignment.sigma / float(np.median(self._sigmas))
+        if alignment.status in ("little overlap", "large residual") or not np.isfinite(alignment.covariance).all():
+            return Verdict("lost", (alignment.reason,), ratio)
+        reasons = [*self.past_reasons]
+        if alignment.status == "iteration limit":
+            reasons.append(alignment.reason)
+        reasons += self._doubts_of_covariance(alignment, median_depth)
+        if ratio > self._config.residual_ratio:
+            reasons.append(
+                f"grey values differ by {alignment.sigma:.3g}, {ratio:.1f} times as much as in the frames before "
+                f"({self._config.residual_ratio:g} at most): something moves, light changed unevenly, or the image is blurred"
+            )
+            if ratio > _LOST_RATIO * self._config.residual_ratio:
+                return Verdict("lost", tuple(reasons), ratio)
+        return Verdict("weak" if reasons else "ok", tuple(reasons), ratio)
+
+    def _doubts_of_covariance(self, alignment: Alignment, median_depth: float) -> list[str]:
+        turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(alignment.covariance[:3, :3])[-1])))
+        share = float(np.sqrt(np.linalg.eigvalsh(alignment.covariance[3:, 3:])[-1])) / median_depth
+        most_deg, most = self._config.weak_rotation_deg, self._config.weak_translation
+        if turn_deg <= most_deg and share <= most:
+            return []
+        return [
+            f"the image determines the rotation to {turn_deg:.2g} degrees ({most_deg:g} at most) and the translation to "
+            f"{share:.2g} of the depth ({most:g} at most): there is little texture, or none along one direction"
+        ]
+
+    def keep(self, alignment: Alignment, verdict: Verdict) -> None:
+        """This was the frame's alignment."""
+        self.lost = verdict.status == "lost"
+        if verdict.status == "ok" or (verdict.status == "weak" and not verdict.residual_ratio > self._config.residual_ratio):
+            self._sigmas.append(alignment.sigma)
+
+    def begin_anew(self, gone_s: float) -> None:
+        """Nothing connects the poses that follow with those before."""
+        self.lost = False
+        self._sigmas.clear()
+        self.past_reasons = [
+            f"for {gone_s:.1f} s no pose followed from the images: how the camera moved then is a guess, "
+            "and all poses since rest on it"
+        ]

@@ -1,0 +1,206 @@
+"""Whole runs in a rendered room: accuracy, covariance, light, loss and return; and short cuts of recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion, se3
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
+from boxplus.systems.direct_odometry.estimate import Estimate
+from boxplus.systems.direct_odometry.sensed_depth import StereoPair
+from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Drive, Room, drive, errors
+
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+Matrix = NDArray[np.float64]
+
+
+def run(seen: Drive, config: DirectOdometryConfig | None = None) -> tuple[DirectOdometry, list[Estimate]]:
+    odometry = DirectOdometry(CAMERA, config)
+    return odometry, [odometry.push_rgbd(t, g, z) for t, g, z in zip(seen.time_ns, seen.grey, seen.depth, strict=True)]
+
+
+def nees(estimate: Estimate, T_true: Matrix) -> float:
+    """Of the pose, rotation on the right, position along the world's axes."""
+    turned = se3.log(se3.compose(se3.inverse(T_true), estimate.T_world_camera))[:3]
+    e = np.concatenate([turned, estimate.p_world_camera - T_true[4:]])
+    return float(e @ np.linalg.solve(estimate.pose_covariance, e))
+
+
+@pytest.fixture(scope="module")
+def drives() -> list[Drive]:
+    return [drive(seed, 22) for seed in range(20, 26)]
+
+
+def test_poses_are_true_and_covariances_honest(drives: list[Drive]) -> None:
+    """Rotation and translation parallel to a wall are hard to tell apart: 2 cm at 3 m are 0.4 degrees."""
+    of_end = []
+    for seen in drives:
+        odometry, estimates = run(seen)
+        assert [e.status for e in estimates] == ["ok"] * len(estimates)
+        degrees, metres = errors(estimates[-1].T_world_camera, seen.T[-1])
+        assert degrees < 0.4
+        assert metres < 0.02
+        assert odometry.keyframes == sum(e.is_keyframe for e in estimates) >= 1
+        of_end.append(nees(estimates[-1], seen.T[-1]) / 6.0)
+    # 36 degrees of freedom have a mean of 0.6 to 1.5 in 95 %; the interpolation's own errors come on top.
+    assert 0.3 < np.mean(of_end) < 3.0
+
+
+def test_changing_light_costs_little(drives: list[Drive]) -> None:
+    """Root mean square over runs, against the same images at their mean brightness."""
+    squares = {"unchanged": 0.0, "changing": 0.0}
+    for seen in drives:
+        gains = {"unchanged": np.ones(len(seen.T)), "changing": 1.0 + 0.3 * np.sin(0.5 * np.arange(len(seen.T)))}
+        for name, gain in gains.items():
+            grey = [np.clip(np.rint(0.7 * g * k), 0.0, 255.0) for g, k in zip(seen.grey, gain, strict=True)]
+            estimates = run(Drive(seen.time_ns, seen.T, grey, seen.depth))[1]
+            assert {e.status for e in estimates} == {"ok"}
+            squares[name] += sum(errors(e.T_world_camera, T)[1] ** 2 for e, T in zip(estimates, seen.T, strict=True))
+    assert squares["changing"] < 1.3**2 * squares["unchanged"]
+
+
+def test_back_at_the_start_the_pose_is_the_start(drives: list[Drive]) -> None:
+    """The first keyframe is still in the window, and is tracked again."""
+    seen = drives[1]
+    back = Drive(
+        seen.time_ns + [t + seen.time_ns[-1] + 33_000_000 for t in seen.time_ns[:-1]],
+        np.concatenate([seen.T, seen.T[-2::-1]]),
+        seen.grey + [g + np.random.default_rng(k).normal(0.0, 2.0, SHAPE) for k, g in enumerate(seen.grey[-2::-1])],
+        seen.depth + seen.depth[-2::-1],
+    )
+    odometry, estimates = run(back)
+    degrees, metres = errors(estimates[-1].T_world_camera, back.T[-1])
+    assert degrees < 0.05
+    assert metres < 0.002
+    assert odometry.keyframes < len(back.T) // 4
+
+
+def test_a_covered_lens_is_lost_and_comes_back(drives: list[Drive]) -> None:
+    seen = drives[2]
+    rng = np.random.default_rng(0)
+    covered = [np.rint(rng.normal(8.0, 2.0, SHAPE)) if 8 <= k < 14 else g for k, g in enumerate(seen.grey)]
+    _, estimates = run(Drive(seen.time_ns, seen.T, covered, seen.depth))
+    assert [e.status for e in estimates] == ["ok"] * 8 + ["lost"] * 6 + ["ok"] * 8
+    assert all(e.reasons for e in estimates[8:14])
+    lost = [np.trace(e.pose_covariance) for e in estimates[8:14]]
+    assert np.all(np.diff(lost) > 0.0)
+    degrees, metres = errors(estimates[-1].T_world_camera, seen.T[-1])
+    assert degrees < 0.4
+    assert metres < 0.02
+    assert nees(estimates[13], seen.T[13]) < 20.0
+
+
+def test_a_view_that_never_comes_back_begins_anew_and_says_so(drives: list[Drive]) -> None:
+    first, other = drives[3], drives[4]
+    grey, depth = first.grey[:6] + other.grey[6:], first.depth[:6] + other.depth[6:]
+    _, estimates = run(Drive(first.time_ns, first.T, grey, depth), DirectOdometryConfig(lost_s=0.2))
+    statuses = [e.status for e in estimates]
+    assert statuses[:6] == ["ok"] * 6
+    assert statuses[6:12] == ["lost"] * 6
+    assert set(statuses[13:]) == {"weak"}
+    assert "is a guess" in estimates[-1].reasons[0]
+    assert np.sqrt(estimates[-1].pose_covariance[3, 3]) > 0.2
+
+
+def test_a_wall_without_texture_gives_no_pose() -> None:
+    seen = drive(30, 8, texture=0.5, noise=1.0)
+    _, estimates = run(seen)
+    assert all(e.status != "ok" for e in estimates[1:])
+
+
+def test_texture_along_one_direction_gives_no_pose() -> None:
+    stripes = np.tile(120.0 + 40.0 * np.sin(0.3 * np.arange(SHAPE[1])), (SHAPE[0], 1))
+    rng = np.random.default_rng(0)
+    grey = [np.rint(stripes + rng.normal(0.0, 2.0, SHAPE)) for _ in range(4)]
+    seen = Drive([k * 33_000_000 for k in range(4)], np.tile(se3.SE3.identity(), (4, 1)), grey, [np.full(SHAPE, 2.0)] * 4)
+    _, estimates = run(seen)
+    assert all(e.status != "ok" for e in estimates[1:])
+
+
+def test_stereo_poses_are_metric() -> None:
+    room, seen = Room(40), drive(40, 12)
+    T_right_left = np.array([1.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0])
+    rng = np.random.default_rng(4)
+    odometry = DirectOdometry(CAMERA, stereo=StereoPair(CAMERA, T_right_left))
+    for k, time_ns in enumerate(seen.time_ns):
+        right = room.render(se3.compose(seen.T[k], se3.inverse(T_right_left)))[0] + rng.normal(0.0, 2.0, SHAPE)
+        estimate = odometry.push_stereo(time_ns, seen.grey[k], right)
+        assert estimate.status == "ok"
+    assert np.linalg.norm(seen.T[-1, 4:]) > 0.1
+    degrees, metres = errors(estimate.T_world_camera, seen.T[-1])
+    assert degrees < 0.5
+    assert metres < 0.03
+
+
+def test_wrong_input_is_refused() -> None:
+    seen = drive(50, 2)
+    odometry = DirectOdometry(CAMERA)
+    odometry.push_rgbd(10, seen.grey[0], seen.depth[0])
+    with pytest.raises(InputError, match="frames in the order of time"):
+        odometry.push_rgbd(10, seen.grey[1], seen.depth[1])
+    with pytest.raises(InputError, match="the second camera"):
+        odometry.push_stereo(20, seen.grey[1], seen.grey[1])
+
+
+def test_without_depth_there_is_nothing_to_track() -> None:
+    odometry = DirectOdometry(CAMERA)
+    estimate = odometry.push_rgbd(0, np.zeros(SHAPE), np.zeros(SHAPE))
+    assert estimate.status == "lost"
+    assert "have a gradient and a depth" in estimate.reasons[0]
+    seen = drive(51, 1)
+    assert odometry.push_rgbd(1, seen.grey[0], seen.depth[0]).status == "ok"
+
+
+def read_grey(file: Path) -> Matrix:
+    from PIL import Image as Picture
+
+    return np.asarray(Picture.open(file).convert("L")).astype(np.float64)
+
+
+def pose(T: Matrix) -> Matrix:
+    return np.concatenate([quaternion.from_matrix(T[:3, :3]), T[:3, 3]])
+
+
+def test_recorded_rgbd_frames() -> None:
+    """Every third of 7-Scenes: the poses given are those of KinectFusion, good to about 5 mm."""
+    from PIL import Image as Picture
+
+    folder = SHARED / "rgbd" / "7scenes_60"
+    if not folder.is_dir():
+        pytest.skip("no recording beside the repository")
+    odometry, true = DirectOdometry(Pinhole(585.0, 585.0, 320.0, 240.0)), []
+    for k in range(0, 31, 3):
+        stem = str(folder / f"frame-{k:06d}")
+        depth = np.asarray(Picture.open(stem + ".depth.png")).astype(np.float64) / 1000.0
+        depth[depth > 10.0] = 0.0
+        true.append(pose(np.loadtxt(stem + ".pose.txt")))
+        estimate = odometry.push_rgbd(k * 33_333_333, read_grey(Path(stem + ".color.jpg")), depth)
+        assert estimate.status == "ok"
+    T_true = se3.compose(se3.inverse(true[0]), true[-1])
+    assert np.linalg.norm(T_true[4:]) > 0.04
+    degrees, metres = errors(estimate.T_world_camera, T_true)
+    assert metres < 0.015
+    assert degrees < 0.7
+
+
+def test_recorded_stereo_frames() -> None:
+    """Nine frames of KITTI: 9.6 m."""
+    folder = SHARED / "cameras" / "kitti_stereo_36"
+    if not folder.is_dir():
+        pytest.skip("no recording beside the repository")
+    camera = Pinhole(707.0912, 707.0912, 601.8873, 183.1104)
+    odometry = DirectOdometry(camera, stereo=StereoPair(camera, (1, 0, 0, 0, -0.53715, 0, 0)))
+    true = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+    left, right = (sorted((folder / f"image_{side}").iterdir()) for side in "lr")
+    for k in range(9):
+        estimate = odometry.push_stereo(k * 100_000_000, read_grey(left[k]), read_grey(right[k]))
+        assert estimate.status == "ok"
+    length = np.linalg.norm(true[8][:, 3])
+    assert abs(np.linalg.norm(estimate.p_world_camera) - length) < 0.01 * length
