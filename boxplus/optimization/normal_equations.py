@@ -177,11 +177,11 @@ class NormalEquations:
                 number = np.concatenate(numbers)
                 joint.append((group, number, (number[:, None] >= number) & (number >= 0)))
                 continue
-            for a, number_a in enumerate(numbers):
+            moving = [(a, number) for a, number in enumerate(numbers) if (number >= 0).any()]
+            for a, number_a in moving:
                 free = np.flatnonzero(number_a >= 0)
-                if len(free):
-                    self._gradients.append(Gather.sorted_by(group, a, a, number_a[free], layout.start[:-1], free))
-                for b, number_b in enumerate(numbers):
+                self._gradients.append(Gather.sorted_by(group, a, a, number_a[free], layout.start[:-1], free))
+                for b, number_b in moving:
                     # The lower triangle; a residual connected to the same variable twice adds both its cross products.
                     lower = (number_a > number_b) | (number_a == number_b)
                     selected = np.flatnonzero((number_a >= 0) & (number_b >= 0) & lower)

@@ -32,9 +32,9 @@ from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tr
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
+_START_ITERATIONS = 20
 _OUTLIER = 4.0  # standard deviations
 _LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
-_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 13, 14, 9, 10, 11]  # [θ, p, v, b_a, b_ω] → [θ, p, v, b_ω, b_a]
 
 
 class VisualInertialOdometry:
@@ -179,7 +179,7 @@ class VisualInertialOdometry:
         self.start, self.start_problem = start, None
         self._waiting.clear()
         self.window.begin(start, [seen[k] for k in start.frames], self._imu)
-        self.window.solve()
+        self.window.solve(_START_ITERATIONS)
         fit = self.window.reject(_OUTLIER)
         self._tracker.forget(fit.given_up)
         self._health.begin(tracks.time_ns)
@@ -212,7 +212,7 @@ class VisualInertialOdometry:
     def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit, rests: bool) -> VioEstimate:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
         ids, landmarks, sigmas = self.window.landmarks()
-        covariance = self.window.covariance[np.ix_(_ORDER, _ORDER)]
+        covariance = self.window.covariance
         status, reasons = self._health.judge(tracks, fit, rests, position_sigma(covariance))
         return VioEstimate(
             time_ns=tracks.time_ns,

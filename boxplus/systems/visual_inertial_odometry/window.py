@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds import se3
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.group import Group
@@ -20,23 +20,22 @@ from boxplus.optimization.losses import Huber
 from boxplus.optimization.marginalization.leak import Leak, world_gauge
 from boxplus.optimization.marginalization.marginalize import marginalize
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solution import Solution
 from boxplus.residuals.camera.inverse_depth import InverseDepthReprojection
 from boxplus.residuals.camera.on_body import OnBody
 from boxplus.residuals.inertial.imu import ImuPreintegration
-from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.visual_inertial_odometry.beginning import TO_STATE_ORDER, beginning
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
-from boxplus.systems.visual_inertial_odometry.start.start import Start
+from boxplus.systems.visual_inertial_odometry.start.start import Start, imu_noise
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax, triangulate
 
 _HUBER = 1.5  # standard deviations
-_KNOWN = 1e-4  # rad, m: of the first yaw and position, which are known by definition
+_LEAVING = 2  # keyframes at most, for every one that is new
 _COST_TOLERANCE = 1e-3
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
@@ -55,12 +54,12 @@ class Window:
             camera of their anchor.
         offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
         frames: in order of time.
-        covariance: (15, 15) of the newest frame, [θ, p, v, b_a, b_ω].
+        covariance: (15, 15) of the newest frame, [θ, p, v, b_ω, b_a].
         leak: what the last prior claims to know of position and yaw.
     """
 
     def __init__(self, config: VioConfig, rig: Rig) -> None:
-        self._config, self._rig, self._noise = config, rig, _noise_of(config, rig)
+        self._config, self._rig, self._noise = config, rig, imu_noise(rig, config)
         self._gravity = (0.0, 0.0, -config.gravity)
         self.problem = Problem()
         self.bodies = self.problem.add_variables(BodyPose, np.zeros((0, 7)), name="bodies")
@@ -95,19 +94,10 @@ class Window:
 
     def begin(self, start: Start, seen: list[Tracks], imu: ImuSamples) -> None:
         """The first frames, as a start found them: `seen` are those of `start.frames`."""
-        pose, sigma = start.T_world_imu[0], start.sigma
-        R = quaternion.to_matrix(pose[:4])
-        covariance = np.zeros((6, 6))
-        tilt = max(float(sigma[:3].max()), _KNOWN)
-        covariance[:3, :3] = R.T @ np.diag(np.square([tilt, tilt, _KNOWN])) @ R
-        covariance[3:, 3:] = np.eye(3) * _KNOWN**2
         for k, tracks in enumerate(seen):
             state = np.concatenate([start.velocity_world[k], start.accel_bias, start.gyro_bias])
             self._add(tracks, start.T_world_imu[k], state, True, imu)
-            if not k:
-                self.problem.add_residuals(Prior(BodyPose, pose, covariance=covariance), self.bodies[0], name="first pose")
-                known = Prior(Euclidean(9), state, sigma=np.maximum(sigma[[6, 7, 8, 12, 13, 14, 9, 10, 11]], 1e-6))
-                self.problem.add_residuals(known, self.states[0], name="first state")
+        self.problem.add_residuals(beginning(start), self.bodies[0], self.states[0], name="beginning")
         self._found_landmarks()
         self._founded = len(self._track)
 
@@ -245,15 +235,15 @@ class Window:
     def _row(self, number: int) -> int:
         return int(np.searchsorted(self.bodies.ids, number))
 
-    def solve(self) -> Solution:
-        """Minimise over the window, from where it is."""
+    def solve(self, max_iterations: int | None = None) -> None:
+        """Minimise over the window, from where it is; with as many steps as the settings say, if left out."""
         self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
         solution = self.problem.solve(max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, examine=False)
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        self.covariance = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
-        return solution
+        P = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
+        self.covariance = P[np.ix_(TO_STATE_ORDER, TO_STATE_ORDER)]
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
         """Residuals of these observations, one group for each camera, and of the IMU's first intervals; of no others."""
@@ -355,8 +345,10 @@ class Window:
             if self._imu is not None:
                 self._imu = self._imu.merge(k - 1)
             del self.frames[k]
-        while sum(f.is_keyframe for f in self.frames) > self._config.keyframes:
-            self._let_go()
+        # A start may bring more keyframes than the window holds; the first to go are linearised where they are known best.
+        for _ in range(_LEAVING if self.frames[-1].is_keyframe else 0):
+            if sum(f.is_keyframe for f in self.frames) > self._config.keyframes:
+                self._let_go()
 
     def _let_go(self) -> None:
         """Marginalise the oldest keyframe and the landmarks it found."""
@@ -380,10 +372,3 @@ class Window:
         if self._imu is not None:
             self._imu = self._imu[1:]
         del self.frames[0]
-
-
-def _noise_of(config: VioConfig, rig: Rig) -> ImuNoise:
-    c, n = config, rig.noise
-    return ImuNoise(
-        c.gyro_noise or n.gyro, c.accel_noise or n.accel, c.gyro_bias_walk or n.gyro_walk, c.accel_bias_walk or n.accel_walk
-    )
