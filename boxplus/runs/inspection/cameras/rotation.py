@@ -29,6 +29,7 @@ _OFFSET_S = 0.005
 _ANGLE_DEG = 1.5
 _UNLIKE, _ANOTHER_UNIT = 0.5, 3.0
 _OVERLAP = 3  # rotations share images with so many others
+_NO_CORNERS = np.zeros((0, 2))
 
 
 @dataclass(slots=True)
@@ -40,6 +41,8 @@ class Turns:
         rotation: Log(R_begin_end), camera frame [rad].
         images: the latest images and their times, oldest first.
         tried: pairs of images looked at.
+        before, after: for each rotation the pixels (N, 2) of its corners in both images.
+        followed: corners followed, for each pair of images looked at.
     """
 
     begin_ns: list[int] = field(default_factory=list)
@@ -47,9 +50,21 @@ class Turns:
     rotation: list[NDArray[np.float64]] = field(default_factory=list)
     images: deque[tuple[int, NDArray[np.uint8]]] = field(default_factory=deque)
     tried: int = 0
+    before: list[NDArray[np.float64]] = field(default_factory=list)
+    after: list[NDArray[np.float64]] = field(default_factory=list)
+    followed: list[int] = field(default_factory=list)
 
-    def add(self, begin_ns: int, end_ns: int, R_end_begin: NDArray[np.float64]) -> None:
+    def add(
+        self,
+        begin_ns: int,
+        end_ns: int,
+        R_end_begin: NDArray[np.float64],
+        before: NDArray[np.float64] = _NO_CORNERS,
+        after: NDArray[np.float64] = _NO_CORNERS,
+    ) -> None:
         """Note one."""
+        self.before.append(before)
+        self.after.append(after)
         self.begin_ns.append(begin_ns)
         self.end_ns.append(end_ns)
         self.rotation.append(Rotation.from_matrix(R_end_begin.T).as_rotvec())
@@ -57,11 +72,19 @@ class Turns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """R_imu_camera (3, 3); offset to add to the camera's times [s] and its standard deviation, infinite at the end of the
-    search; share of the camera's rotation
-    that the gyroscope does not explain; standard deviation of the rotation, largest axis [rad]."""
+    """How camera and gyroscope turn alike.
+
+    Attributes:
+        R_imu_camera: (3, 3).
+        bias: of the gyroscope (3,) [rad/s].
+        offset_s: to add to the camera's times [s].
+        offset_std_s: standard deviation, infinite at the end of the search [s].
+        unlike: share of the camera's rotation that the gyroscope does not explain.
+        rotation_std: standard deviation of the rotation, largest axis [rad].
+    """
 
     R_imu_camera: NDArray[np.float64]
+    bias: NDArray[np.float64]
     offset_s: float
     offset_std_s: float
     unlike: float
@@ -96,7 +119,7 @@ def align(turns: Turns, imu: ImuSamples) -> Alignment | str:
     for _ in range(3):
         misfit = np.array([_misfit(gyro_over(offset)[kept], camera[kept])[1] for offset in offsets])
         best = int(np.argmin(misfit))
-        R, _, errors = _fit(gyro_over(offsets[best]), camera, kept)
+        R, bias, errors = _fit(gyro_over(offsets[best]), camera, kept)
         scale = 1.4826 * float(np.median(errors))
         kept = errors < max(_OUTLIERS * scale, 1e-6)
     offset, at, curvature = offsets[best], misfit[best], 0.0
@@ -112,6 +135,7 @@ def align(turns: Turns, imu: ImuSamples) -> Alignment | str:
     information = spread * np.eye(3) - centred.T @ centred
     return Alignment(
         R_imu_camera=R,
+        bias=bias,
         offset_s=float(offset),
         offset_std_s=float(np.sqrt(2.0 * variance / curvature) * _STEP_S) if curvature > 0.0 else float("inf"),
         unlike=float(np.sqrt(at / spread)),
@@ -136,13 +160,12 @@ def _fit(
     return R, bias, np.linalg.norm(gyro - camera @ R.T - bias, axis=1)
 
 
-def check_rotation(camera: CameraStream, turns: Turns, imu: ImuSamples) -> list[Evidence]:
+def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidence]:
     """Findings about the clocks and the mounting of this camera."""
     offset_key, rotation_key = f"{camera.name}_imu_time_offset", f"R_imu_{camera.name}"
     if camera.model is None:
         text = f"the intrinsics of {camera.name} are not known, so its rotation cannot be compared with the gyroscope"
         return [Evidence(rotation_key, "unchecked", "warning", text)]
-    found = align(turns, imu)
     if isinstance(found, str):
         return [Evidence(rotation_key, "unchecked", "ok", f"{found}; clocks and mounting are not checked")]
     if found.unlike > _UNLIKE:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,21 @@ _WINDOW = (21, 21)
 _LEVELS = 4
 _THERE_AND_BACK_PX = 0.5
 _FEWEST = 50
+
+
+class Turned(NamedTuple):
+    """How a camera turned between two images, and what shows it.
+
+    Attributes:
+        R_2_1: (3, 3) directions in the frame of the first image to that of the second.
+        before, after: (N, 2) pixels of the corners that agree on it.
+        followed: how many corners were followed.
+    """
+
+    R_2_1: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    followed: int
 
 
 def grey_8_bit(grey: NDArray[Any]) -> NDArray[np.uint8]:
@@ -39,18 +54,20 @@ def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray
     return corners.reshape(-1, 2)[kept].astype(np.float64), there.reshape(-1, 2)[kept].astype(np.float64)
 
 
-def rotation_between(model: CameraModel, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float64] | None:
-    """R_2_1 (3, 3) of a camera between two images, from the essential matrix; None where too few corners agree on one."""
+def rotation_between(model: CameraModel, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Turned | int:
+    """The rotation between two images, from the essential matrix; where too few corners agree on one, how many were followed."""
     cv2 = opencv("corners of images")
     before, after = follow(first, second)
     rays_1, found_1 = model.unproject(before)
     rays_2, found_2 = model.unproject(after)
     found = found_1 & found_2
-    if found.sum() < _FEWEST:
-        return None
+    followed = int(found.sum())
+    if followed < _FEWEST:
+        return followed
     a, b = np.ascontiguousarray(rays_1[found, :2]), np.ascontiguousarray(rays_2[found, :2])
     E, inliers = cv2.findEssentialMat(a, b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=1.0 / model.fx)
-    if E is None or E.shape != (3, 3) or inliers.sum() < 0.7 * found.sum():
-        return None
+    if E is None or E.shape != (3, 3) or inliers.sum() < 0.7 * followed:
+        return followed
+    agreed = inliers.ravel() == 1
     _, R, _, _ = cv2.recoverPose(E, a, b, np.eye(3), mask=inliers)
-    return np.asarray(R, np.float64)
+    return Turned(np.asarray(R, np.float64), before[found][agreed], after[found][agreed], followed)

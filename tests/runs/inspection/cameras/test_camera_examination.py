@@ -81,7 +81,7 @@ def test_findings_of_a_right_and_of_wrong_calibrations() -> None:
     turns, imu = turning(1, 0.0, R)
 
     def said(camera: CameraStream, turns: Turns = turns, imu: ImuSamples = imu) -> dict[str, Evidence]:
-        return {evidence.key: evidence for evidence in check_rotation(camera, turns, imu)}
+        return {evidence.key: evidence for evidence in check_rotation(camera, align(turns, imu))}
 
     right = said(stream(R))
     assert [evidence.verdict for evidence in right.values()] == ["ok", "ok"]
