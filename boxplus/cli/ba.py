@@ -14,7 +14,6 @@ from boxplus.cli.optimization_terminal import (
     LinearSolverChoice,
     LinearSolverOption,
     LossOption,
-    MaxIterationsOption,
     MethodChoice,
     MethodOption,
     NoReportOption,
@@ -25,7 +24,7 @@ from boxplus.cli.optimization_terminal import (
 )
 
 if TYPE_CHECKING:
-    from boxplus.formats.reconstruction import Reconstruction
+    from boxplus.formats.reconstruction import Reconstruction, ReconstructionFormat
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
     from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentResult
@@ -38,55 +37,92 @@ class FormatChoice(StrEnum):
     auto = "auto"
     bal = "bal"
     colmap = "colmap"
+    lines = "lines"
     gbp = "gbp"
+
+
+_POINT_FORMATS: dict[FormatChoice, ReconstructionFormat] = {
+    FormatChoice.auto: "auto",
+    FormatChoice.bal: "bal",
+    FormatChoice.colmap: "colmap",
+    FormatChoice.gbp: "gbp",
+}
 
 
 def ba(
     ctx: typer.Context,
-    file: Annotated[Path, typer.Argument(help="BAL file (plain or .bz2), or the folder of a COLMAP model (text or binary).")],
+    file: Annotated[
+        Path, typer.Argument(help="BAL file (plain or .bz2), the folder of a COLMAP model or of a line set (*.P, *.lines).")
+    ],
     output: OutputOption = None,
     loss: LossOption = "none",
-    sigma: Annotated[float, typer.Option("--sigma", min=1e-9, help="Standard deviation of a pixel measurement [px].")] = 1.0,
+    sigma: Annotated[
+        float | None,
+        typer.Option("--sigma", min=1e-9, help="Standard deviation of a pixel measurement [px]; 1, of segments 0.3."),
+    ] = None,
     refine_intrinsics: Annotated[
         bool, typer.Option("--refine-intrinsics", help="Of COLMAP's cameras: focal lengths and distortion; BAL's always are.")
     ] = False,
     refine_principal_point: Annotated[
         bool, typer.Option("--refine-principal-point", help="Of COLMAP's cameras, with --refine-intrinsics.")
     ] = False,
+    points: Annotated[bool, typer.Option("--points/--no-points", help="Of a line set: adjust its points with its lines.")] = True,
+    triangulate: Annotated[
+        bool, typer.Option("--triangulate", help="Of a line set: find the lines from the segments, whatever the files say.")
+    ] = False,
     method: MethodOption = MethodChoice.levenberg_marquardt,
     linear_solver: LinearSolverOption = LinearSolverChoice.auto,
-    max_iterations: MaxIterationsOption = 100,
+    max_iterations: Annotated[
+        int | None, typer.Option("--max-iterations", min=0, help="Steps tried at most; 100, of line sets 1000.")
+    ] = None,
     time_limit: TimeLimitOption = None,
     threads: ThreadsOption = None,
     format: Annotated[FormatChoice, typer.Option("--format", help="Of the file; auto looks into it.")] = FormatChoice.auto,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Adjust cameras and points so that they explain best where the points were seen.
+    """Adjust cameras, and points or lines, so that they explain best where these were seen.
 
     The result is written in the format of the input, and as scene.ply (points and camera centres). Exit codes: 0 done, 1 the
     problem does not determine its variables or the results could not be written, 2 bad input, 3 finished but not to be trusted
     (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
     """
+    from boxplus.cli.ba_lines import adjust_line_set, is_line_set
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
+    from boxplus.errors import InputError
     from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
     from boxplus.runs.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
     from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+    from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
-    config = BundleAdjustmentConfig(sigma_px=sigma)
+    if format is FormatChoice.lines or (format is FormatChoice.auto and is_line_set(file)):
+        if refine_intrinsics or refine_principal_point:
+            raise InputError("--refine-intrinsics with points", "a line set", "the intrinsics of line sets are held")
+        line_config = LineAdjustmentConfig(use_points=points, triangulate=triangulate)
+        if sigma is not None:
+            line_config = line_config.model_copy(update={"sigma_px": sigma, "sigma_point_px": sigma})
+        solver = solver_options(line_config.solver, method, linear_solver, max_iterations, time_limit, threads)
+        line_config = line_config.model_copy(update={"solver": solver})
+        adjust_line_set(ctx, file, output, line_config, robust, method, no_report=no_report, overwrite=overwrite)
+        return
+    if triangulate or not points:
+        raise InputError("--triangulate and --no-points with a line set", f"{file}", "leave them out")
+    config = BundleAdjustmentConfig(sigma_px=1.0 if sigma is None else sigma)
     config = config.model_copy(
         update={
             "intrinsics": "refined" if refine_intrinsics or refine_principal_point else "held",
             "principal_point": "refined" if refine_principal_point else "held",
-            "solver": solver_options(config.solver, method, linear_solver, max_iterations, time_limit, threads),
+            "solver": solver_options(
+                config.solver, method, linear_solver, 100 if max_iterations is None else max_iterations, time_limit, threads
+            ),
         }
     )
     with terminal.console.status("reading"):
-        start = read_reconstruction(file, format.value)
+        start = read_reconstruction(file, _POINT_FORMATS[format])
     folder = output or Path(f"{file.resolve().name.removesuffix('.bz2').removesuffix('.txt')}_boxplus")
     files, folders = _own_files(folder)
     held = output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite)

@@ -2,13 +2,14 @@
 
 A folder holds for every view a camera `*.P` (3 × 4, up to scale) and segments `*.lines` (x0 y0 x1 y1, then columns that are
 not used), and for all views `*l3d` (x0 y0 z0 x1 y1 z1, a row a line) and `*nview-lines` (a row a line, a column a view: the
-row of the segment in that view, or * where there is none).
+row of the segment in that view, or * where there is none). Points are there as well in most sets: `*.corners` (x y) of every
+view, `*p3d` (x y z) and `*nview-corners`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from boxplus.manifolds import quaternion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VggLines:
-    """V views of L lines in N observations.
+    """V views of L lines in N observations, and of P points in M.
 
     Attributes:
         names: of the views, their camera files without ending.
@@ -30,6 +31,11 @@ class VggLines:
         end_points_world: (L, 6) two points of each line.
         view_of, line_of: (N,) the view and the line of each observation.
         segments: (N, 4) u_start, v_start, u_end, v_end [px].
+        points_world: (P, 3); none where the folder has no points.
+        point_view_of, point_of: (M,) the view and the point of each observation of a point.
+        pixels: (M, 2) [px].
+        reflected: the files have the world behind the cameras, a mirror image; it was reflected through the origin, which no
+            image shows, so that z is forward.
     """
 
     names: tuple[str, ...]
@@ -39,6 +45,11 @@ class VggLines:
     view_of: NDArray[np.uint32]
     line_of: NDArray[np.uint32]
     segments: NDArray[np.float64]
+    points_world: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    point_view_of: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
+    point_of: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
+    pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    reflected: bool = False
 
 
 def read_vgg_lines(folder: str | Path) -> VggLines:
@@ -56,7 +67,7 @@ def read_vgg_lines(folder: str | Path) -> VggLines:
     if not cameras:
         raise InputError("a camera file *.P for every view", f"none in {root}", "check the path")
     P = np.stack([_read_camera(file) for file in cameras])
-    segments = [_read_table(_existing(file.with_suffix(".lines")), 4) for file in cameras]
+    segments = [_read_table(_existing(file.with_suffix(".lines"), "segment"), 4) for file in cameras]
     lines = sorted(root.glob("*l3d"))
     if len(lines) != 1:
         raise InputError("one file *l3d of 3D lines", f"{len(lines)} in {root}", "check the path")
@@ -69,8 +80,17 @@ def read_vgg_lines(folder: str | Path) -> VggLines:
             f"{len(matches)} of {[file.name for file in candidates]} in {root}",
             "remove the files of another reconstruction",
         )
-    view_of, line_of, observed = _read_matches(matches[0], segments)
+    view_of, line_of, observed = _read_matches(matches[0], segments, "segment")
+    points, point_view_of, point_of, pixels = _read_points(root, cameras)
     K, T_camera_world = _decompose(P)
+    # A camera matrix is known up to its sign, and so is which side of a camera the world lies on.
+    R = quaternion.to_matrix(T_camera_world[:, :4].copy())
+    middle = 0.5 * (end_points[:, :3] + end_points[:, 3:])[line_of]
+    depth = np.einsum("ni,ni->n", R[view_of, 2], middle) + T_camera_world[view_of, 6]
+    reflected = bool(len(depth) and np.median(depth) < 0.0)
+    if reflected:
+        T_camera_world[:, 4:] *= -1.0
+        end_points, points = -end_points, -points
     return VggLines(
         names=tuple(file.stem for file in cameras),
         K=K,
@@ -78,13 +98,40 @@ def read_vgg_lines(folder: str | Path) -> VggLines:
         end_points_world=end_points,
         view_of=view_of,
         line_of=line_of,
-        segments=observed,
+        segments=observed.reshape(-1, 4),
+        points_world=points,
+        point_view_of=point_view_of,
+        point_of=point_of,
+        pixels=pixels.reshape(-1, 2),
+        reflected=reflected,
     )
 
 
-def _existing(file: Path) -> Path:
+def _read_points(
+    root: Path, cameras: list[Path]
+) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.float64]]:
+    """Points, and view, point and pixel of each of their observations; nothing where the folder has no points."""
+    points, matches = sorted(root.glob("*p3d")), sorted(root.glob("*nview-corners"))
+    if not points and not matches:
+        return np.zeros((0, 3)), np.zeros(0, np.uint32), np.zeros(0, np.uint32), np.zeros((0, 2))
+    if len(points) != 1 or len(matches) != 1:
+        raise InputError(
+            "one file *p3d of points and one *nview-corners of their matches, or neither",
+            f"{len(points)} and {len(matches)} in {root}",
+            "remove the files of another reconstruction",
+        )
+    p_world = _read_table(points[0], 3)
+    corners = [_read_table(_existing(file.with_suffix(".corners"), "corner"), 2) for file in cameras]
+    view_of, point_of, pixels = _read_matches(matches[0], corners, "corner")
+    count = sum(1 for _ in _rows(matches[0]))
+    if count != len(p_world):
+        raise InputError(f"{len(p_world)} rows in {matches[0].name}, one for each point", f"{count}", "take both files anew")
+    return p_world, view_of, point_of, pixels
+
+
+def _existing(file: Path, kind: str) -> Path:
     if not file.is_file():
-        raise InputError(f"the segments of the view in {file.name}", "no such file", "put it beside the camera file")
+        raise InputError(f"the {kind}s of the view in {file.name}", "no such file", "put it beside the camera file")
     return file
 
 
@@ -122,30 +169,30 @@ def _read_camera(file: Path) -> NDArray[np.float64]:
 
 
 def _read_matches(
-    file: Path, segments: list[NDArray[np.float64]]
+    file: Path, features: list[NDArray[np.float64]], kind: str
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.float64]]:
     view_of, line_of, observed = [], [], []
     for line, (number, words) in enumerate(_rows(file)):
         is_match = [word == "*" or word.isdecimal() for word in words]
-        if len(words) != len(segments) or not all(is_match):
+        if len(words) != len(features) or not all(is_match):
             raise InputError(
-                f"{len(segments)} row numbers or *, one for each view",
+                f"{len(features)} row numbers or *, one for each view",
                 f"{' '.join(words)!r} ({file}, line {number})",
                 "repair the line or take the file anew",
             )
         for view, word in enumerate(words):
             if word == "*":
                 continue
-            if int(word) >= len(segments[view]):
+            if int(word) >= len(features[view]):
                 raise InputError(
-                    f"a segment from 0 to {len(segments[view]) - 1} in view {view}",
+                    f"a {kind} from 0 to {len(features[view]) - 1} in view {view}",
                     f"{word} ({file}, line {number})",
-                    "the matches belong to other segments",
+                    f"the matches belong to other {kind}s",
                 )
             view_of.append(view)
             line_of.append(line)
-            observed.append(segments[view][int(word)])
-    return np.array(view_of, np.uint32), np.array(line_of, np.uint32), np.array(observed, np.float64).reshape(-1, 4)
+            observed.append(features[view][int(word)])
+    return np.array(view_of, np.uint32), np.array(line_of, np.uint32), np.array(observed, np.float64)
 
 
 def _decompose(P: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,6 +9,7 @@ import pytest
 
 from boxplus.errors import InputError
 from boxplus.formats.vgg_lines import read_vgg_lines
+from boxplus.formats.vgg_writer import write_vgg_lines
 from boxplus.manifolds import lines, quaternion
 from boxplus.residuals.camera.line_reprojection import LineReprojection
 
@@ -97,3 +98,43 @@ def test_published_sets_have_the_stated_residuals(
     assert linear.valid.all()
     # Stated as the median over the observations of the root mean square of their two distances.
     assert float(np.median(np.sqrt((linear.residuals**2).mean(axis=1)))) == pytest.approx(median, abs=0.005)
+
+
+def test_points_are_read_with_the_lines(folder: Path) -> None:
+    for view in range(2):
+        (folder / f"{view:03d}.corners").write_text("10 20\n30 40\n")
+    (folder / "set.p3d").write_text("0 0 0\n1 1 1\n2 2 2\n")
+    (folder / "set.nview-corners").write_text("1 *\n0 1\n* *\n")
+    data = read_vgg_lines(folder)
+    np.testing.assert_array_equal(data.points_world, [[0, 0, 0], [1, 1, 1], [2, 2, 2]])
+    assert data.point_view_of.tolist() == [0, 0, 1] and data.point_of.tolist() == [0, 1, 1]
+    np.testing.assert_array_equal(data.pixels, [[30, 40], [10, 20], [30, 40]])
+    (folder / "set.nview-corners").write_text("1 *\n0 1\n")
+    with pytest.raises(InputError, match=r"3 rows in set\.nview-corners, one for each point – got 2"):
+        read_vgg_lines(folder)
+    (folder / "set.nview-corners").unlink()
+    with pytest.raises(InputError, match=r"one file \*p3d of points and one \*nview-corners"):
+        read_vgg_lines(folder)
+
+
+def test_a_world_behind_the_cameras_is_reflected(folder: Path, tmp_path: Path) -> None:
+    data = read_vgg_lines(folder)
+    assert not data.reflected
+    for view in range(2):
+        P = np.loadtxt(folder / f"{view:03d}.P") @ np.diag([-1.0, -1.0, -1.0, 1.0])
+        np.savetxt(folder / f"{view:03d}.P", P)
+    np.savetxt(folder / "set.l3d", -data.end_points_world)
+    mirrored = read_vgg_lines(folder)
+    assert mirrored.reflected
+    np.testing.assert_allclose(mirrored.end_points_world, data.end_points_world)
+    np.testing.assert_allclose(mirrored.T_camera_world, data.T_camera_world, atol=1e-12)
+
+
+def test_what_is_written_is_read_again(folder: Path, tmp_path: Path) -> None:
+    data = read_vgg_lines(folder)
+    again = read_vgg_lines(write_vgg_lines(tmp_path / "out", data))
+    for name in ("K", "T_camera_world", "end_points_world"):
+        np.testing.assert_allclose(getattr(again, name), getattr(data, name), atol=1e-12)
+    order, other = (np.lexsort((d.view_of, d.line_of)) for d in (data, again))
+    np.testing.assert_array_equal(data.segments[order], again.segments[other])
+    assert (data.line_of[order] == again.line_of[other]).all() and not again.reflected and len(again.points_world) == 0

@@ -1,4 +1,4 @@
-"""Bundle adjustment: the cameras and points that fit all observations best."""
+"""Bundle adjustment: the cameras, and points or lines, that fit all observations best."""
 
 import lazy_loader
 

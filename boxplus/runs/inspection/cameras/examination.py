@@ -63,7 +63,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
             found += check_views(camera.name, views[camera.index])
             found += check_blur(camera.name, views[camera.index])
     if pictures:
-        found += check_corners(pictures[0].name, turns.followed, views[pictures[0].index].size)
+        found += check_corners(pictures[0].name, turns.followed, views[pictures[0].index])
     if len(pictures) > 1:
         found.append(check_synchronisation(pictures[:2], [views[camera.index].time_ns for camera in pictures[:2]]))
         found.append(check_calibration(pictures[:2], corners))

@@ -16,6 +16,7 @@ _BLOCK = 8
 _EMPTY, _EMPTY_SHARE = 1.0, 0.25  # grey values between neighbouring blocks, and of the recording's median
 _COVERED_AT_LEAST_S = 0.2
 _FEW_CORNERS, _FEW_A_PIXEL = 80.0, 0.0008
+_LITTLE_STRUCTURE = 3.0
 _BLURRED = 0.35
 _MANY_BLURRED = 0.1
 
@@ -150,13 +151,19 @@ def check_blur(name: str, views: Views) -> list[Evidence]:
     return [Evidence(f"{name}_sharpness", f"{sharpest:.2f}", "ok", text)]
 
 
-def check_corners(name: str, followed: list[int], size: tuple[int, int]) -> list[Evidence]:
-    """A finding about how many corners can be followed from image to image; `size` of the images [px], small ones have fewer."""
+def check_corners(name: str, followed: list[int], views: Views) -> list[Evidence]:
+    """A finding about how many corners can be followed from image to image; small images have fewer.
+
+    Surroundings without structure leave corners of noise: there, twice as many are few.
+    """
     if not followed:
         return []
     median = float(np.median(followed))
     text = f"corners of the first image found again in the second, median of {len(followed)} pairs, at most 300 are looked for"
-    if median < min(_FEW_CORNERS, _FEW_A_PIXEL * size[0] * size[1]):
+    few = min(_FEW_CORNERS, _FEW_A_PIXEL * views.size[0] * views.size[1])
+    if float(np.median(views.structure)) > _LITTLE_STRUCTURE:
+        few *= 0.5
+    if median < few:
         text += ": few corners, surroundings with little texture, blur or darkness"
         return [Evidence(f"{name}_corners", f"{median:.0f}", "warning", text)]
     return [Evidence(f"{name}_corners", f"{median:.0f}", "ok", text)]

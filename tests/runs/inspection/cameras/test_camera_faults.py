@@ -173,9 +173,13 @@ def test_what_images_show() -> None:
     smeared = [np.mean([np.roll(p.astype(float), k, 1) for k in range(-4, 5)], axis=0).astype(np.uint8) for p in sharp[:12]]
     blurred = said_of(smeared + sharp[12:])["cam0_sharpness"]
     assert blurred.verdict == "warning" and "blur" in blurred.text
-    assert check_corners("cam0", [], (752, 480)) == []
-    assert check_corners("cam0", [40, 50, 60], (752, 480))[0].verdict == "warning"
-    assert check_corners("cam0", [40, 50, 60], (226, 144))[0].verdict == "ok"
+    small, large = noted(sharp), dataclasses.replace(noted(sharp), size=(752, 480))
+    assert check_corners("cam0", [], large) == []
+    assert check_corners("cam0", [20, 30, 35], large)[0].verdict == "warning"
+    assert check_corners("cam0", [20, 30, 35], small)[0].verdict == "ok"
+    bare = dataclasses.replace(large, structure=[1.5] * len(large.structure))
+    assert check_corners("cam0", [60, 70, 75], large)[0].verdict == "ok"
+    assert "few corners" in check_corners("cam0", [60, 70, 75], bare)[0].text
 
 
 @pytest.fixture(scope="module")

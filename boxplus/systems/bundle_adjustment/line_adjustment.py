@@ -1,0 +1,250 @@
+"""Bundle adjustment on straight lines, and on points with them (SPEC.md 6)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
+from boxplus.formats.vgg_lines import VggLines
+from boxplus.manifolds import lines as line_manifold
+from boxplus.manifolds import quaternion
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.lines import Line3D
+from boxplus.manifolds.se3 import SE3Left
+from boxplus.optimization.losses import Loss
+from boxplus.optimization.minimize import Callback
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import Variables
+from boxplus.residuals.camera.line_reprojection import LineReprojection
+from boxplus.residuals.camera.reprojection import Reprojection
+from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, triangulate_lines
+
+Floats = NDArray[np.float64]
+
+_BAD_SHARE = 0.005  # of the observations that may lie behind their cameras before a result is not to be trusted
+_MOST_SIGMAS = 5.0  # of the errors' root mean square, in standard deviations
+
+
+class LineAdjustmentConfig(BaseModel):
+    """Options of `adjust_lines`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sigma_px: float = Field(0.3, gt=0, description="[px] standard deviation of a segment's end across the segment")
+    sigma_point_px: float = Field(0.5, gt=0, description="[px] standard deviation of a point's pixel")
+    use_points: bool = Field(True, description="adjust the points with the lines, where there are any")
+    triangulate: bool = Field(False, description="take only cameras and segments from the input, and find the lines from them")
+    solver: SolverOptions = Field(
+        SolverOptions(max_iterations=1000, cost_tolerance=1e-9),
+        description="see SolverOptions; lines that are hardly determined creep on for many steps",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LineAdjustmentResult:
+    """Adjusted cameras, lines and points.
+
+    Attributes:
+        data: like the input, with adjusted cameras, end points of the lines (moved onto the adjusted lines) and points.
+        errors_start, errors: (N,) root mean square of the distances of a segment's two ends from its projected line [px], NaN
+            where the line is not determined or cannot be projected.
+        point_errors_start, point_errors: (M,) distance of a pixel from its projected point [px], NaN where that is impossible;
+            empty where points are not used.
+        triangulation: of the lines, by the cameras of the start: which of them the segments determine, and why not.
+        notes: what a user should know, one sentence each.
+        doubt: why the result is not to be trusted; None where nothing speaks against it.
+        solution: with history, covariance, and why it stopped.
+        cameras, lines, points: the variables of `solution`; `points` is None where they are not used.
+        time_s: seconds, set-up included.
+    """
+
+    data: VggLines
+    errors_start: Floats
+    errors: Floats
+    point_errors_start: Floats
+    point_errors: Floats
+    triangulation: LineTriangulation
+    notes: tuple[str, ...]
+    doubt: str | None
+    solution: Solution
+    cameras: Variables
+    lines: Variables
+    points: Variables | None
+    time_s: float
+
+
+def adjust_lines(
+    data: VggLines,
+    config: LineAdjustmentConfig | None = None,
+    *,
+    loss: Loss | None = None,
+    callback: Callback | None = None,
+) -> LineAdjustmentResult:
+    """Minimise ½ Σ ρ(‖e/σ‖²) over cameras, lines and points: distances of segments' ends from projected lines, and of pixels.
+
+    The first camera is held: where the world is, no image tells. Its size is not told either; damping keeps it. Lines of
+    which the images determine nothing but a plane (seen once, or from cameras that move along them) are named; damping keeps
+    them near their start in what is not determined. With `triangulate` they have no start and are left out, and so are lines
+    behind cameras and those that their segments contradict.
+
+    Raises:
+        InputError: no line that the segments determine; a method without damping.
+
+    Example:
+        >>> result = adjust_lines(read_vgg_lines("Corridor"))                      # doctest: +SKIP
+        >>> print(f"{np.nanmedian(result.errors):.3f} px", *result.notes, sep="; ")   # doctest: +SKIP
+    """
+    config = config if config is not None else LineAdjustmentConfig()
+    if config.solver.method == "gauss_newton":
+        raise InputError(
+            "a method that damps its steps", "gauss_newton, though the size of the world is not determined", "use another"
+        )
+    begin = time.perf_counter()
+    found = triangulate_lines(
+        data.K, data.T_camera_world, data.segments, data.view_of, data.line_of, len(data.end_points_world), config.sigma_px
+    )
+    used = found.found if config.triangulate else np.ones(len(found.states), dtype=np.bool_)
+    long = np.hypot(*(data.segments[:, 2:] - data.segments[:, :2]).T) >= 1.0
+    seen = np.flatnonzero(used[data.line_of] & long)
+    if not len(seen):
+        why = " ".join(found.notes()) or "no segment"
+        raise InputError("segments that determine a line", why, "give views from places beside the lines")
+    problem = Problem()
+    cameras = problem.add_variables(SE3Left, data.T_camera_world, name="cameras")
+    world = _start_lines(data, found, used, config.triangulate)
+    lines = problem.add_variables(Line3D, world, name="lines")
+    segments = LineReprojection(data.K[data.view_of[seen]], data.segments[seen], sigma=config.sigma_px)
+    problem.add_residuals(segments, cameras[data.view_of[seen]], lines[data.line_of[seen]], loss=loss, name="segments")
+    problem.fix(cameras[0])
+    # What no residual takes is held where it is.
+    problem.fix(lines[np.setdiff1d(np.arange(len(used)), np.unique(data.line_of[seen]))])
+    points = _add_points(problem, cameras, data, config, loss) if config.use_points and len(data.pixels) else None
+    start = [block.values for block in problem.blocks]
+    solution = problem.solve(config.solver, callback=callback)
+    values = list(solution.values)
+    adjusted = _adjusted(data, solution[cameras], solution[lines], None if points is None else solution[points], used)
+    errors_start, errors = (_line_errors(data, v[cameras.number], v[lines.number], seen) for v in (start, values))
+    empty = np.zeros(0)
+    point_errors_start, point_errors = (
+        empty if points is None else _point_errors(data, v[cameras.number], v[points.number]) for v in (start, values)
+    )
+    # From a start that is off, segments of a line may disagree; what the adjustment makes of given lines decides about these.
+    notes = found.notes() if config.triangulate else found.notes(("one view", "along the line"))
+    if data.reflected:
+        notes.append("the input has the world behind the cameras, as a mirror image; it was reflected through its origin")
+    if not long.all():
+        notes.append(f"{int((~long).sum())} segments shorter than 1 px have no direction and were left out")
+    return LineAdjustmentResult(
+        data=adjusted,
+        errors_start=errors_start,
+        errors=errors,
+        point_errors_start=point_errors_start,
+        point_errors=point_errors,
+        triangulation=found,
+        notes=tuple(notes),
+        doubt=_doubt(adjusted, errors, seen, config),
+        solution=solution,
+        cameras=cameras,
+        lines=lines,
+        points=points,
+        time_s=time.perf_counter() - begin,
+    )
+
+
+def _start_lines(data: VggLines, found: LineTriangulation, used: NDArray[np.bool_], triangulated: bool) -> Floats:
+    """(L, 5): those that were triangulated, or those given; a line that stands for nothing where there is none."""
+    lines = np.tile(Line3D.identity(), (len(used), 1))
+    if triangulated:
+        lines[used] = found.lines[used]
+    elif used.any():
+        ends = data.end_points_world[used]
+        lines[used] = line_manifold.from_points(ends[:, :3], ends[:, 3:])
+    return lines
+
+
+def _add_points(
+    problem: Problem, cameras: Variables, data: VggLines, config: LineAdjustmentConfig, loss: Loss | None
+) -> Variables:
+    points = problem.add_variables(Euclidean(3), data.points_world, name="points")
+    for view, K in enumerate(data.K):
+        rows = np.flatnonzero(data.point_view_of == view)
+        if not len(rows):
+            continue
+        camera, pixels, information = _without_skew(K, data.pixels[rows], config.sigma_point_px)
+        residual = Reprojection(camera, pixels, information=information)
+        problem.add_residuals(
+            residual,
+            cameras[np.full(len(rows), view)],
+            points[data.point_of[rows]],
+            loss=loss,
+            name=f"points of {data.names[view]}",
+        )
+    seen = np.unique(data.point_of)
+    if len(seen) < len(data.points_world):
+        problem.fix(points[np.setdiff1d(np.arange(len(data.points_world)), seen)])
+    return points
+
+
+def _without_skew(K: Floats, pixels: Floats, sigma_px: float) -> tuple[Pinhole, Floats, Floats]:
+    """A camera with right angles, pixels (n, 2) as it has them, and their information (2, 2); M = [[1, −s/fy], [0, 1]]."""
+    M = np.array([[1.0, -K[0, 1] / K[1, 1]], [0.0, 1.0]])
+    moved = pixels @ M.T
+    moved[:, 0] += K[0, 1] * K[1, 2] / K[1, 1]
+    back = np.linalg.inv(M)
+    return Pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), moved, back.T @ back / sigma_px**2
+
+
+def _line_errors(data: VggLines, poses: Floats, lines: Floats, seen: NDArray[np.intp]) -> Floats:
+    errors = np.full(len(data.segments), np.nan)
+    residual = LineReprojection(data.K[data.view_of[seen]], data.segments[seen])
+    r = residual.evaluate(poses[data.view_of[seen]], lines[data.line_of[seen]])
+    errors[seen] = np.sqrt((r**2).mean(axis=1))
+    return errors
+
+
+def _point_errors(data: VggLines, poses: Floats, points: Floats) -> Floats:
+    R = quaternion.to_matrix(np.ascontiguousarray(poses[data.point_view_of, :4]))
+    p = np.einsum("nij,nj->ni", R, points[data.point_of]) + poses[data.point_view_of, 4:]
+    image = np.einsum("nij,nj->ni", data.K[data.point_view_of], p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.linalg.norm(image[:, :2] / image[:, 2:] - data.pixels, axis=1)
+    errors[p[:, 2] <= 0.0] = np.nan
+    return np.asarray(errors)
+
+
+def _adjusted(data: VggLines, poses: Floats, lines: Floats, points: Floats | None, used: NDArray[np.bool_]) -> VggLines:
+    """The data with the solution's values; the ends of a line are the points of the adjusted one nearest to where they were."""
+    ends = data.end_points_world.copy()
+    L = line_manifold.to_plucker(lines)
+    d2 = (L[:, 3:] ** 2).sum(axis=1, keepdims=True)
+    foot = np.cross(L[:, 3:], L[:, :3]) / d2
+    for k in (0, 3):
+        along = ((ends[:, k : k + 3] - foot) * L[:, 3:]).sum(axis=1, keepdims=True) / d2
+        ends[:, k : k + 3] = np.where(used[:, None], foot + along * L[:, 3:], ends[:, k : k + 3])
+    p_world = data.points_world if points is None else points
+    return replace(data, T_camera_world=poses, end_points_world=ends, points_world=p_world)
+
+
+def _doubt(adjusted: VggLines, errors: Floats, seen: NDArray[np.intp], config: LineAdjustmentConfig) -> str | None:
+    views, own = adjusted.view_of[seen], adjusted.line_of[seen]
+    R = quaternion.to_matrix(np.ascontiguousarray(adjusted.T_camera_world[:, :4]))
+    ends = adjusted.end_points_world[own].reshape(-1, 2, 3)
+    depth = np.einsum("ni,nki->nk", R[views, 2], ends) + adjusted.T_camera_world[views, 6][:, None]
+    behind = int((depth.max(axis=1) <= 0.0).sum())
+    if behind > _BAD_SHARE * len(seen):
+        return f"{behind} of {len(seen)} segments show lines that lie behind their cameras: the start is too far off"
+    rms = float(np.sqrt(np.mean(errors[seen][np.isfinite(errors[seen])] ** 2))) if np.isfinite(errors[seen]).any() else np.inf
+    if rms > _MOST_SIGMAS * config.sigma_px:
+        return (
+            f"the ends of the segments are {rms:.2f} px from their lines (root mean square), with a standard deviation of "
+            f"{config.sigma_px:g} px: segments are matched wrongly, or the noise is larger (--sigma)"
+        )
+    return None
