@@ -49,24 +49,26 @@ def lidar_path_backwards(scans: Sequence[Scan], config: RegistrationConfig, gues
     ]
     back = lidar_path(mirrored, config, [_mirrored(guess, turned) for guess in guesses])
     R, p = back.R_path_lidar[::-1].copy(), back.p_path_lidar[::-1].copy()
-    information, weak, misfit = back.information[::-1].copy(), back.weak[::-1].copy(), back.misfit[::-1].copy()
+    information, weak = back.information[::-1].copy(), back.weak[::-1].copy()
+    misfit, cost = back.misfit[::-1].copy(), back.cost[::-1].copy()
     segment = (back.segment.max(initial=0) - back.segment)[::-1].copy()
     for number in np.unique(segment):
         index = np.flatnonzero(segment == number)
         first, last = index[0], index[-1]
         if len(index) > 1:
             # What defined the frame is known as well as its neighbour is, from now on against the first pose.
-            information[last], weak[last], misfit[last] = information[last - 1], weak[last - 1], misfit[last - 1]
+            for of_pose in (information, weak, misfit, cost):
+                of_pose[last] = of_pose[last - 1]
         R_first, p_first = R[first].copy(), p[first].copy()
         turn = np.eye(6)
         turn[3:, 3:] = R_first
         R[index], p[index] = R_first.T @ R[index], (p[index] - p_first) @ R_first
         information[index] = turn.T @ information[index] @ turn
-        information[first], weak[first], misfit[first] = 0.0, False, 0.0
+        information[first], weak[first], misfit[first], cost[first] = 0.0, False, 0.0, 0.0
     # Half a nanosecond is rounded the other way round.
     middle_ns = {middle_of(turned_scan): middle_of(scan) for turned_scan, scan in zip(mirrored, scans[::-1], strict=True)}
     time_ns = np.array([middle_ns[time] for time in back.time_ns[::-1].tolist()], np.int64)
-    return LidarPath(time_ns, R, p, information, segment, weak, misfit, back.failed)
+    return LidarPath(time_ns, R, p, information, segment, weak, misfit, cost, back.failed)
 
 
 def _mirrored(guess: Turning, turned_ns: int) -> Turning:

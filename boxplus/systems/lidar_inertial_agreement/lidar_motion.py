@@ -43,7 +43,7 @@ _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
 _FEWEST_USED = 60
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
-_LEAST_SHARE = 0.25  # of the points lie on the map, or the scan is not registered
+_LEAST_SHARE = 0.1  # of the points lie on the map, or the scan is not registered; in an open field a fifth of them do at rest
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
@@ -67,6 +67,7 @@ class LidarPath:
         segment: (K,) int64.
         weak: (K,) bool, whether the scene left a direction undetermined.
         misfit: (K,) float64, rms distance of the points from their planes [m].
+        cost: (K,) float64, mean squared distance, points without a plane counted as far off [m²].
         failed: scans that could not be registered.
     """
 
@@ -77,6 +78,7 @@ class LidarPath:
     segment: NDArray[np.int64]
     weak: NDArray[np.bool_]
     misfit: NDArray[np.float64]
+    cost: NDArray[np.float64]
     failed: int
 
     def __len__(self) -> int:
@@ -97,6 +99,7 @@ class LidarPath:
             self.segment[chosen],
             self.weak[chosen],
             self.misfit[chosen],
+            self.cost[chosen],
             self.failed,
         )
 
@@ -180,6 +183,7 @@ class LidarMotion:
             np.array([pose.segment for pose in poses], np.int64),
             np.array([pose.weak for pose in poses], bool),
             np.array([pose.misfit for pose in poses], np.float64),
+            np.array([pose.cost for pose in poses], np.float64),
             self._failed,
         )
 
@@ -216,7 +220,7 @@ class LidarMotion:
             return
         self._usual = fit.misfit if self._usual == 0.0 else 0.9 * self._usual + 0.1 * fit.misfit
         self._x, self._rate, self._velocity = fit.x, fit.rate, fit.velocity
-        self._keep(middle_ns, fit.information, fit.weak, fit.misfit)
+        self._keep(middle_ns, fit.information, bool(fit.weak.size), fit.misfit, fit.cost)
         self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
         self._previous_ns = middle_ns
 
@@ -269,12 +273,12 @@ class LidarMotion:
     def _begin(self, scan: Scan, middle_ns: int) -> None:
         self._previous_ns = middle_ns
         self._first = scan
-        self._keep(middle_ns, np.zeros((6, 6)), np.zeros((6, 0)), 0.0)
+        self._keep(middle_ns, np.zeros((6, 6)), False, 0.0, 0.0)
         self._tree.insert(self._map_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
 
-    def _keep(self, middle_ns: int, information: NDArray[np.float64], weak: NDArray[np.float64], misfit: float) -> None:
+    def _keep(self, middle_ns: int, information: NDArray[np.float64], weak: bool, misfit: float, cost: float) -> None:
         R_path_lidar, p_path_lidar = self._x[R : R + 9].reshape(3, 3).copy(), self._x[P : P + 3].copy()
-        self._poses.append(_Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, bool(weak.size), misfit))
+        self._poses.append(_Pose(middle_ns, R_path_lidar, p_path_lidar, information, self._segment, weak, misfit, cost))
 
     def _best(self, scan: Scan, middle_ns: int, step_s: float, expected: Twist | None) -> _Fit | None:
         """The registration that fits best, from constant velocity, from the guesses and, if need be, from other speeds."""
@@ -380,6 +384,7 @@ class _Pose:
     segment: int
     weak: bool
     misfit: float
+    cost: float
 
 
 @dataclass(frozen=True, slots=True)

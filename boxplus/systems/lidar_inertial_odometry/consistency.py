@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.iterated_update import Posterior
-from boxplus.filtering.nav_state import PL, RL, TANGENT, P, R, V, boxminus_into
+from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, TANGENT, P, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
@@ -30,6 +30,7 @@ _LOST_STREAK = 3
 _LEAST_FITTING = 0.6  # of the points with a plane lie on it; 0.92 at least on sound runs
 _SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
 _FASTEST_M_S = 120.0
+_LARGEST_BIAS = 0.1, 0.7  # rad/s, m/s²: more than an inertial sensor in order has, and as known as three deviations
 _MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
 
 
@@ -98,6 +99,7 @@ class Consistency:
         warnings = self._span(frame)
         warnings += self._innovate(frame, x_prior, cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
+        warnings += self._biases(x, posterior.cov)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -179,6 +181,23 @@ class Consistency:
             "'boxplus inspect'), or most of what is seen moves"
         )
         return [self._innovation_text]
+
+    def _biases(self, x: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[str]:
+        """Whether the biases are those of a sensor in order: at a steady turn they take up whatever else is wrong."""
+        found = []
+        for at, tangent, most in ((BW, T_BW, _LARGEST_BIAS[0]), (BA, T_BA, _LARGEST_BIAS[1])):
+            bias = x[at : at + 3]
+            size = float(np.linalg.norm(bias))
+            axis = bias / max(size, 1e-12)
+            sigma = float(np.sqrt(axis @ covariance[tangent : tangent + 3, tangent : tangent + 3] @ axis))
+            found.append(size - 3.0 * sigma > most)
+        if not any(found) or not self._once("bias"):
+            return []
+        gyro, accel = np.degrees(np.linalg.norm(x[BW : BW + 3])), np.linalg.norm(x[BA : BA + 3])
+        return [
+            f"the IMU's biases came to {gyro:.1f} deg/s and {accel:.2f} m/s², more than a sensor in order has: its scale or "
+            "T_imu_lidar is wrong, which biases take up as long as the platform turns steadily, or the sensor is bad"
+        ]
 
     def _once(self, key: str) -> bool:
         new = key not in self._told

@@ -51,8 +51,8 @@ class Estimate:
             takes the map for exact: the pose is meant relative to the map around it.
         pose_covariance: (6, 6) float64 of the pose `[θ, p]`, order and axes as above, relative to the first pose: with what the
             map has taken over from the errors of earlier poses. It grows with the way (see `filtering.map_datum`).
-        status: "ok"; "weak": some directions were predicted only (see `weak_directions`); "lost": no update was possible, or too
-            few points fit the map, scan after scan.
+        status: "ok"; "weak": over half a second most scans left a direction open, which was predicted only; "lost": no update was
+            possible, or too few points fit the map, scan after scan.
         weak_directions: the directions the scan did not determine.
         lidar_share: (6,) for each of `AXES`, how much of the information came from the LiDAR: 1 − posterior / prior
             variance. 1 is measured, 0 is predicted only.

@@ -34,6 +34,7 @@ from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
+from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 
 _LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # shared: see `MapDatum`, what random recordings need
@@ -66,6 +67,7 @@ class LidarInertialOdometry:
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
+        self._weak_spell = WeakSpell()
         self._consistency = Consistency(self.config, self._declared())
         self._saturation = Saturation()
         self._warnings: list[str] = []
@@ -233,7 +235,8 @@ class LidarInertialOdometry:
         if taken or len(self.map) == 0 or self._consistency.lost:
             self._insert(map_points_world)
         clock.lap("map insertion")
-        return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior), clock.laps)
+        status = self._weak_spell.status(frame.scan.end_ns, posterior, taken)
+        return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior, status), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
@@ -367,12 +370,7 @@ class _Outcome:
     posterior: Posterior
     taken: bool
     cov_prior: NDArray[np.float64]
-
-    @property
-    def status(self) -> Status:
-        if not self.taken:
-            return "lost"
-        return "weak" if self.posterior.last.directions.weak.any() else "ok"
+    status: Status
 
     @property
     def weak_directions(self) -> tuple[WeakDirection, ...]:

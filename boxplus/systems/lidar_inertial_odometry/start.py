@@ -28,6 +28,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import (
     ARM,
@@ -47,6 +48,7 @@ _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
+_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
 _MIN_MOVING_SCANS = 8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
@@ -135,7 +137,7 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
             f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: its unit, its "
             "sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little; waiting for more data"
         )
-    quiet = gyro_std < _QUIET_GYRO and accel_std < _QUIET_ACCEL and len(imu) > 10
+    quiet = gyro_std < _QUIET_GYRO and (accel_std < _QUIET_ACCEL or _shaken_only(imu)) and len(imu) > 10
     if rest.at_rest and (quiet or rest.determined):
         low, high = _REST_ACCEL_NORM
         if not low <= norm <= high:
@@ -178,8 +180,21 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
             f"not at rest ({evidence}), and the surroundings do not show how fast the platform moves along {_axis_text(axis)} "
             f"(LiDAR axes): {sigma:.0f} m/s more or less; waiting for more data"
         )
+    other = other_speed(path, scans, config, guesses)
+    if other is not None:
+        return (
+            f"not at rest ({evidence}), and the surroundings do not show how fast the platform moves: the scans fit about as "
+            f"well at {np.linalg.norm(other):.1f} m/s as at {speed:.1f} m/s; waiting for more data"
+        )
     text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {evidence}; batch over {len(frames)} scans fits to {fit.sigma * 100:.1f} cm"
     return Start("moving", frames[0].scan.end_ns, state, covariance, duration, text)
+
+
+def _shaken_only(imu: ImuSamples) -> bool:
+    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree."""
+    parts = np.array_split(imu.accel, _PARTS)
+    means = np.array([part.mean(axis=0) for part in parts if len(part)])
+    return bool(means.std(axis=0).max() < _STEADY_ACCEL)
 
 
 def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -33,7 +33,7 @@ def true_path(simulation: Simulation, scans: list[Scan]) -> LidarPath:
     R, p = true_poses(simulation, time_ns)
     K = len(scans)
     flags, zeros = np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)
-    return LidarPath(time_ns, R, p, np.tile(1e6 * np.eye(6), (K, 1, 1)), zeros, flags, np.zeros(K), 0)
+    return LidarPath(time_ns, R, p, np.tile(1e6 * np.eye(6), (K, 1, 1)), zeros, flags, np.zeros(K), np.zeros(K), 0)
 
 
 def true_poses(simulation: Simulation, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ def frozen(path: LidarPath) -> LidarPath:
     """A path that has not left its first pose."""
     K = len(path)
     R, p = np.tile(path.R_path_lidar[:1], (K, 1, 1)), np.tile(path.p_path_lidar[:1], (K, 1))
-    return LidarPath(path.time_ns, R, p, path.information, path.segment, path.weak, path.misfit, path.failed)
+    return LidarPath(path.time_ns, R, p, path.information, path.segment, path.weak, path.misfit, path.cost, path.failed)
 
 
 def test_a_path_that_stays_while_the_platform_moves_explains_less() -> None:

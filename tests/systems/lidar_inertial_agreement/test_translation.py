@@ -22,7 +22,7 @@ def fit(seed: int, bend_m: float = 0.0, at: float = 0.5, length: float = 1.0) ->
     noise = 1e-3 * np.random.default_rng(seed).normal(size=(len(path), 3))
     aside = bend_m * np.exp(-0.5 * ((seconds - at * seconds[-1]) / 0.25) ** 2)[:, None] * [0.8, -0.5, 0.3]
     p = length * path.p_path_lidar + aside + noise
-    bent = LidarPath(path.time_ns, path.R_path_lidar, p, path.information, path.segment, path.weak, path.misfit, 0)
+    bent = LidarPath(path.time_ns, path.R_path_lidar, p, path.information, path.segment, path.weak, path.misfit, path.cost, 0)
     found = compare_accelerations(bent, imu, simulation.T_imu_lidar[:3, :3], np.zeros(3), 0.0, wide_prior())
     assert found is not None
     return found

@@ -1,0 +1,52 @@
+"""Whether scans fit as well at another speed: what a registration alone cannot know, which ends in the minimum next to its start.
+
+Over open ground the rings of a LiDAR go along with it. A scan that is laid upon the one before it, ring upon ring, fits about as
+well as one that is laid where it was seen; which of the two a registration finds is decided by where it began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, lidar_path
+
+_SURE_M = 0.01  # standard deviation of a pose below which no other minimum is looked for
+_APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
+_DEVIATIONS, _ANOTHER_M_S = 5.0, 0.3  # beyond both another speed is another
+_AS_WELL = 1.1  # times the cost
+
+
+def other_speed(
+    path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning]
+) -> NDArray[np.float64] | None:
+    """Another mean velocity (3,) [m/s] at which the scans fit about as well, in the frame of the path's first pose, or None.
+
+    Args:
+        path: of one segment, found from `scans`, undistorted with the first of `guesses`.
+        scans, config, guesses: as for `lidar_path`.
+    """
+    positions = path.information[1:, 3:, 3:]
+    axes = np.linalg.eigh(positions.mean(axis=0))[1]
+    strong = np.linalg.eigvalsh(positions)
+    least = np.where(strong > 1e-9 * strong[:, -1:], strong, np.inf).min(axis=1)
+    if 1.0 / np.sqrt(np.median(least)) < _SURE_M:
+        return None
+    seconds = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
+    velocity = (path.p_path_lidar[-1] - path.p_path_lidar[0]) / seconds
+    for away in _APART_M_S:
+        for axis in (axes[:, 0], -axes[:, 0], axes[:, 1], -axes[:, 1]):
+            start = velocity + away * axis
+            other = lidar_path(scans, config, guesses, undistort=True, velocity=start, unbroken=True)
+            if other.failed or len(other) != len(path):
+                continue
+            apart = other.p_path_lidar[-1] - path.p_path_lidar[-1]
+            sure = apart @ path.information[-1, 3:, 3:] @ apart > _DEVIATIONS**2
+            if sure and np.linalg.norm(apart) > _ANOTHER_M_S * seconds and other.cost.sum() < _AS_WELL * path.cost.sum():
+                found: NDArray[np.float64] = (other.p_path_lidar[-1] - other.p_path_lidar[0]) / seconds
+                return found
+    return None
