@@ -33,6 +33,7 @@ from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
+from boxplus.systems.lidar_inertial_odometry.unknown_mounting import UnknownMounting
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 
@@ -76,6 +77,7 @@ class LidarInertialOdometry:
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._datum = MapDatum(NavState.identity().pack(), self._cov, _SHARED_ERRORS)
+        self._mounting = UnknownMounting(NavState.identity().pack(), self.config)
         self._gap: str | None = None
         self._time_ns = 0
         c = self.config
@@ -193,6 +195,7 @@ class LidarInertialOdometry:
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov), _SHARED_ERRORS)
+        self._mounting = UnknownMounting(self._x, self.config)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
@@ -314,10 +317,7 @@ class LidarInertialOdometry:
         return frame.largest_gap_s > self.config.max_imu_gap
 
     def _is_astray(self, frame: Frame, on_map: float) -> bool:
-        """Whether what fits the map may fit it by chance.
-
-        After a gap of the IMU nothing but the points says where the platform is: too few of them say nothing.
-        """
+        """Whether what fits the map may fit it by chance: after a gap of the IMU nothing but the points says where it is."""
         return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
@@ -340,11 +340,12 @@ class LidarInertialOdometry:
                 f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
                 "motion taken from the LiDAR alone, covariance widened"
             )
+        pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,
             state=NavState.unpack(self._x),
             covariance=self._unshown.widened(self._cov, self._time_ns),
-            pose_covariance=self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns),
+            pose_covariance=self._mounting.widened(pose, self._x),
             status=outcome.status if outcome else "ok" if self._gap is None else "lost",
             weak_directions=outcome.weak_directions if outcome else (),
             lidar_share=outcome.lidar_share(self._cov) if outcome else np.zeros(6),
