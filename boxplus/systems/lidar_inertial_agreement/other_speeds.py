@@ -15,7 +15,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, lidar_path
 
-_SURE_M = 0.01  # standard deviation of a pose below which no other minimum is looked for
+_SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no other minimum is looked for
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
 _DEVIATIONS, _ANOTHER_M_S = 5.0, 0.3  # beyond both another speed is another
 _AS_WELL = 1.1  # times the cost
@@ -30,12 +30,10 @@ def other_speed(
         path: of one segment, found from `scans`, undistorted with the first of `guesses`.
         scans, config, guesses: as for `lidar_path`.
     """
-    positions = path.information[1:, 3:, 3:]
-    axes = np.linalg.eigh(positions.mean(axis=0))[1]
-    strong = np.linalg.eigvalsh(positions)
-    least = np.where(strong > 1e-9 * strong[:, -1:], strong, np.inf).min(axis=1)
-    if 1.0 / np.sqrt(np.median(least)) < _SURE_M:
+    information = path.information[1:, 3:, 3:]
+    if 1.0 / np.sqrt(max(float(np.median(np.linalg.eigvalsh(information)[:, 0])), 1e-12)) < _SURE_M:
         return None
+    axes = np.linalg.eigh(information.mean(axis=0))[1]
     seconds = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
     velocity = (path.p_path_lidar[-1] - path.p_path_lidar[0]) / seconds
     for away in _APART_M_S:

@@ -56,6 +56,7 @@ _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _SLOPE_STD = 0.01  # of the scale of an accelerometer in order
 _ACCEL_BIAS_STD = 0.15  # m/s²
+_LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
 _MOUNTING_STD = 0.01  # rad
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
 _MEAN_ACCEL_STD = 2.0  # m/s²
@@ -169,6 +170,11 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     if fit.sigma > _LARGEST_MISFIT_M:
         return (
             f"not at rest ({evidence}), and LiDAR and IMU do not fit better than {fit.sigma * 100:.1f} cm; waiting for more data"
+        )
+    if np.linalg.norm(fit.bias) > _LARGEST_ACCEL_BIAS:
+        return (
+            f"not at rest ({evidence}), and the path of the LiDAR asks for a bias of the accelerometer of "
+            f"{np.linalg.norm(fit.bias):.2f} m/s²: it sees too little, or the accelerometer is bad; waiting for more data"
         )
     state, covariance = _moving_state(frames, path, imu, fit, extrinsic, config)
     speed = float(np.linalg.norm(state.v_world_imu))
