@@ -135,17 +135,27 @@ class _Folder:
     def __init__(self, images: ImageFormat) -> None:
         self._suffix = images
         self._imu: list[str] = []
+        self._exposures: dict[int, dict[str, float]] = {}
 
     def samples(self, samples: ImuSamples) -> None:
         for time_ns, gyro, accel in zip(samples.time_ns.tolist(), samples.gyro.tolist(), samples.accel.tolist(), strict=True):
             self._imu.append(f"{time_ns}," + ",".join(map(repr, (*gyro, *accel))) + "\n")
 
     def _encoded(self, image: CameraImage) -> bytes:
+        if image.exposure_s is not None:
+            self._exposures.setdefault(image.time_ns, {})[image.name] = image.exposure_s
         pixels = image.pixels
         if image.is_depth:
             counts = np.rint(image.depth().astype(np.float64) * _TUM_COUNTS_A_METRE)
             pixels = np.where(np.isfinite(counts) & (counts <= 65535.0), counts, 0.0).astype(np.uint16)
         return encode_image(pixels, self._suffix)  # type: ignore[arg-type]
+
+    def _exposure_table(self, names: list[str]) -> str:
+        """Exposure times by camera, in the form that the readers take."""
+        rows = ["#timestamp [ns]," + ",".join(f"{name} shutter [s]" for name in names) + "\n"]
+        for time_ns, told in sorted(self._exposures.items()):
+            rows.append(f"{time_ns}," + ",".join(repr(told[name]) if name in told else "" for name in names) + "\n")
+        return "".join(rows)
 
     def _write(self, file: Path, text: str) -> None:
         make_folder(file.parent)
@@ -174,6 +184,7 @@ class _Euroc(_Folder):
         for name, rows in self._rows.items():
             self._write(self._root / name / "data.csv", "".join(rows))
         self._write(self._root / "imu0" / "data.csv", _IMU_HEAD + "".join(self._imu))
+        self._write(self._root / "exposure.csv", self._exposure_table(list(self._rows)))
         self._write(self._root / "state_groundtruth_estimate0" / "data.csv", _STATE_HEAD + _states(self._recorded.simulation))
 
 
@@ -212,6 +223,7 @@ class _Tum(_Folder):
         for name, rows in self._rows.items():
             self._write(self._root / f"{name}.txt", "".join(rows))
         self._write(self._root / "imu.csv", _IMU_HEAD + "".join(self._imu))
+        self._write(self._root / "exposure.csv", self._exposure_table(["cam0"]))
         T = self._simulation.T_world_camera(0, np.array(self._stamps, np.int64)) if self._stamps else np.zeros((0, 4, 4))
         q_wxyz = quaternion.from_matrix(T[:, :3, :3])
         self._write(self._root / "groundtruth.txt", "".join(map(tum_row, self._stamps, T[:, :3, 3], q_wxyz)))

@@ -88,10 +88,13 @@ class CameraSimulation:
         self._period_ns = round(1e9 / scenario.rig.rate_hz)
         self.image_count = max((self.end_ns - self.start_ns - _FIRST_IMAGE_NS - _LAST_MARGIN_NS) // self._period_ns, 0)
         self.imu = SimulatedImu(scenario.imu, scenario.imu_trajectory or trajectory, seed, duration)
-        self._surfaces = Surfaces(scenario.world, seed, scenario.pixel_m, scenario.contrast)
 
     def _random(self, stream: int, *index: int) -> np.random.Generator:
         return np.random.Generator(np.random.SFC64([self.config.seed, stream, *index]))
+
+    @functools.cached_property
+    def _surfaces(self) -> Surfaces:
+        return Surfaces(self.scenario.world, self.config.seed, self.scenario.pixel_m, self.scenario.contrast)
 
     @functools.cached_property
     def _renderers(self) -> list[Renderer]:

@@ -90,6 +90,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, format: CameraFormat, kind
                 assert np.nanmax(np.abs(one.depth() - other.depth())) <= (1.01e-4 if format == "tum" else 0.0)
             else:
                 assert (one.pixels == other.pixels).all()
+                assert one.exposure_s == (None if format.startswith("ros") else other.exposure_s)
     assert (imu.time_ns == expected.time_ns).all() and np.allclose(imu.gyro, expected.gyro, atol=1e-12)
     stem = path.with_suffix("") if format == "ros1" else path
     trajectory = read_trajectory(Path(f"{stem}.gt.tum"))

@@ -1,0 +1,79 @@
+"""The campaign of camera recordings: draws that repeat, and a judge that knows what it was told."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from boxplus.recordings.info import Evidence
+from boxplus.simulation.cameras import CAMERA_FAULTS
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def campaign() -> Iterator[SimpleNamespace]:
+    """The script and its draws, which are no package of the library; they leave no trace."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        draws = importlib.import_module("vio_campaign.draws")
+        yield SimpleNamespace(draws=draws, script=importlib.import_module("camera_campaign"))
+    finally:
+        sys.path.remove(str(FOLDER))
+        for name in [name for name in sys.modules if name.partition(".")[0] in ("vio_campaign", "camera_campaign")]:
+            del sys.modules[name]
+
+
+def test_every_kind_is_drawn_and_fits(campaign: SimpleNamespace) -> None:
+    kinds = [campaign.draws.draw_kinds(seed) for seed in range(600)]
+    assert {kind.fault for kind in kinds} == {"none", *CAMERA_FAULTS}
+    assert 0.3 < np.mean([kind.fault == "none" for kind in kinds]) < 0.5
+    for kind in kinds:
+        assert kind.world in campaign.draws.MOTIONS[kind.motion]
+        assert kind.rig == "stereo" or kind.fault not in campaign.draws.STEREO_FAULTS
+    assert kinds[7] == campaign.draws.draw_kinds(7) and kinds[7].matches({"world": kinds[7].world})
+
+
+def test_a_seed_repeats_and_its_motion_is_free_of_obstacles(campaign: SimpleNamespace) -> None:
+    for seed in range(12):
+        one, other = campaign.draws.draw(seed), campaign.draws.draw(seed)
+        assert one.duration_s == other.duration_s and one.scenario.rig == other.scenario.rig
+        assert (one.fault is None) == (one.kinds.fault == "none")
+        truth = one.truth()
+        path = truth.ground_truth(np.arange(truth.start_ns, truth.end_ns, 10**8)).p_world_imu
+        assert (path == other.truth().ground_truth(np.arange(truth.start_ns, truth.end_ns, 10**8)).p_world_imu).all()
+        assert truth.scenario.world.distance(path).min() > 0.2
+
+
+def drawn(campaign: SimpleNamespace, **only: str) -> Any:
+    return campaign.draws.draw(next(seed for seed in range(5000) if campaign.draws.draw_kinds(seed).matches(only)))
+
+
+def test_the_judge(campaign: SimpleNamespace) -> None:
+    judge = campaign.script.judge
+    fine = Evidence("cam0_view", "10", "ok", "dark or covered")
+    sound, dark = drawn(campaign, fault="none", light="steady"), drawn(campaign, fault="darkness", light="steady")
+    said = Evidence("cam0_brightness", "90", "warning", "7 of 100 images are almost black")
+    assert judge(sound, [fine]) == "right" and judge(sound, [said]) == "false alarm"
+    assert judge(dark, [said]) == "right cause" and judge(dark, [fine]) == "silent"
+    assert judge(dark, [Evidence("imu_gaps", "1", "warning", "gap")]) == "flagged"
+    assert judge(drawn(campaign, fault="wrong_baseline"), [fine]) == "not for inspect"
+    late = drawn(campaign, fault="imu_clock_offset")
+    assert judge(late, [Evidence("R_imu_cam0", "unchecked", "ok", "turns too little")]) == "unchecked"
+    jumping = drawn(campaign, fault="none", light="jumping")
+    assert judge(jumping, [said]) == "right"
+
+
+def test_tables_of_earlier_runs(campaign: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"seed": k, "fault": fault, "verdict": "right cause"} for k, fault in enumerate(("darkness", "darkness", "drop_imu"))]
+    (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    campaign.script.main(["--merge", str(tmp_path / "a.jsonl"), "--only", "fault=darkness"])
+    assert capsys.readouterr().out.split() == ["darkness", "2", "right", "cause", "all", "2", "right", "cause"]
