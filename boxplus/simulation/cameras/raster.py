@@ -28,6 +28,7 @@ _COARSE_SHARE = 0.35
 _SUN = (0.42, 0.31, 0.85)
 _AMBIENT, _DIFFUSE = 0.62, 0.38
 _SUBPIXELS = 3
+_WIDEST = 1.5  # opening of a cone up to which planes touch it [rad]
 
 
 @kernel(inline=True)
@@ -72,6 +73,16 @@ def _cone(
 
 
 @kernel(inline=True)
+def _local(solid: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A vector of the world in the frame of a solid."""
+    return (
+        solid[4] * x + solid[7] * y + solid[10] * z,
+        solid[5] * x + solid[8] * y + solid[11] * z,
+        solid[6] * x + solid[9] * y + solid[12] * z,
+    )
+
+
+@kernel(inline=True)
 def _distance_before(
     solids: Floats, k: int, ox: float, oy: float, oz: float, ax: float, ay: float, az: float, opening: float, wander: float
 ) -> float:
@@ -79,12 +90,38 @@ def _distance_before(
     rx, ry, rz = solids[k, 1] - ox, solids[k, 2] - oy, solids[k, 3] - oz
     distance = math.sqrt(rx * rx + ry * ry + rz * rz)
     radius = solids[k, 16] + wander
-    if distance <= radius:
-        return 0.0
-    largest = opening + math.asin(radius / distance)
-    if largest < math.pi and (rx * ax + ry * ay + rz * az) < distance * math.cos(largest):
-        return -1.0
-    near: float = distance - radius
+    near: float = max(distance - radius, 0.0)
+    if near > 0.0:
+        largest = opening + math.asin(radius / distance)
+        if largest < math.pi and (rx * ax + ry * ay + rz * az) < distance * math.cos(largest):
+            return -1.0
+    if solids[k, 0] != BOX:
+        return near
+    # A long box fills little of its ball: is it beyond one of four planes that touch the cone, and how far is it?
+    solid = solids[k]
+    lx, ly, lz = _local(solid, rx, ry, rz)
+    ex, ey, ez = max(abs(lx) - solid[13], 0.0), max(abs(ly) - solid[14], 0.0), max(abs(lz) - solid[15], 0.0)
+    near = max(near, math.sqrt(ex * ex + ey * ey + ez * ez) - wander)
+    if opening < _WIDEST:
+        bx, by, bz = _local(solid, ax, ay, az)
+        s, c = math.sin(opening), math.cos(opening)
+        # Two directions across the axis, from the coordinate that it has least of.
+        if abs(bx) <= abs(by) and abs(bx) <= abs(bz):
+            ux, uy, uz = 0.0, -bz, by
+        elif abs(by) <= abs(bz):
+            ux, uy, uz = bz, 0.0, -bx
+        else:
+            ux, uy, uz = -by, bx, 0.0
+        scale = 1.0 / math.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux * scale, uy * scale, uz * scale
+        vx, vy, vz = by * uz - bz * uy, bz * ux - bx * uz, bx * uy - by * ux
+        for side in range(4):
+            sign = 1.0 - 2.0 * (side & 1)
+            tx, ty, tz = (ux, uy, uz) if side < 2 else (vx, vy, vz)
+            nx, ny, nz = sign * c * tx - s * bx, sign * c * ty - s * by, sign * c * tz - s * bz
+            reach = abs(nx) * solid[13] + abs(ny) * solid[14] + abs(nz) * solid[15]
+            if nx * lx + ny * ly + nz * lz - reach > wander:
+                return -1.0
     return near
 
 
@@ -175,16 +212,6 @@ def _face(solid: Floats, lx: float, ly: float, lz: float) -> int:
             return 0
         return 1 if ay >= az else 2
     return 2 if solid[15] - abs(lz) < solid[13] - math.sqrt(lx * lx + ly * ly) else 3
-
-
-@kernel(inline=True)
-def _local(solid: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A vector of the world in the frame of a solid."""
-    return (
-        solid[4] * x + solid[7] * y + solid[10] * z,
-        solid[5] * x + solid[8] * y + solid[11] * z,
-        solid[6] * x + solid[9] * y + solid[12] * z,
-    )
 
 
 @kernel(borrow=True)

@@ -95,7 +95,7 @@ def visible(
     return here[flat], there[flat]
 
 
-@pytest.mark.parametrize("name", ["room", "hall", "stairs", "drive"])
+@pytest.mark.parametrize("name", ["room", "hall", "stairs", "drive", "warehouse", "walk"])
 def test_depths_are_those_the_lidar_measures(name: str) -> None:
     """The same surfaces, met by the caster of the LiDAR's rays."""
     simulation = small(name, lens="equidistant")
