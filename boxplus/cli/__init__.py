@@ -15,6 +15,7 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_UNTRUSTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
+    "vo": ("boxplus.cli.vo:vo", "Turn a recording of an RGB-D or a stereo camera into a trajectory and a report."),
     "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),
     "pgo": ("boxplus.cli.pgo:pgo", "Optimise the poses of a g2o or TORO pose graph."),
     "inspect": ("boxplus.cli.inspect:inspect", "Examine a recording: topics, rates, gaps, times, units, extrinsic."),

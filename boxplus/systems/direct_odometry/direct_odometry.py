@@ -88,6 +88,8 @@ class DirectOdometry:
         self.window = Window(self.camera, self.config.window)
         self.keyframes = 0
         """Keyframes so far."""
+        self.gaps = 0
+        """How often the view was lost for so long that the poses since are a guess."""
         self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
         self._covariance: Matrix = _WORLD
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
@@ -261,6 +263,7 @@ class DirectOdometry:
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
         gone_s = self._unseen_s(time_ns)
         if gone_s > self.config.lost_s:
+            self.gaps += 1
             self._watch.begin_anew(gone_s)
             self._covariance = self._unseen_covariance(time_ns)
             self._reference = None

@@ -1,0 +1,133 @@
+"""Two streams of a camera recording as frames: an image with its depth, or left with right."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import RecordingError
+from boxplus.manifolds import quaternion
+from boxplus.recordings.cameras.events import CameraEvent
+from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
+from boxplus.sensors.camera_image import CameraImage
+from boxplus.systems.direct_odometry.sensed_depth import StereoPair
+
+_SAME_PLACE = 1e-6
+_SHARE_OF_PERIOD = 0.5  # stamps of two streams may differ by this much of the time between images
+_MOST_WAITING = 20
+
+Kind = Literal["rgbd", "stereo"]
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenCameras:
+    """Which streams an odometry takes, and what it has to know of them.
+
+    Attributes:
+        kind: `rgbd` or `stereo`.
+        first, second: the images that have the poses; their depths, or the right images.
+        camera: of the first; stereo: of the second, None for depths.
+    """
+
+    kind: Kind
+    first: CameraStream
+    second: CameraStream
+    camera: Pinhole
+    stereo: StereoPair | None
+
+    @property
+    def tolerance_ns(self) -> int:
+        """By how much stamps of a frame may differ [ns]."""
+        rate_hz = self.first.rate_hz if np.isfinite(self.first.rate_hz) else 10.0
+        return round(_SHARE_OF_PERIOD * 1e9 / rate_hz)
+
+
+def choose_cameras(info: CameraRecordingInfo) -> ChosenCameras:
+    """Depth with the first camera where there is depth, else the first two cameras.
+
+    Raises:
+        RecordingError: neither depth nor a second camera; calibration that is not known; depths that are not registered.
+    """
+    intensity = [camera for camera in info.cameras if camera.kind == "intensity"]
+    depths = [camera for camera in info.cameras if camera.kind == "depth"]
+    if not intensity or (not depths and len(intensity) < 2):
+        raise RecordingError(
+            "images with depth, or of two cameras",
+            f"{', '.join(f'{camera.name} ({camera.kind})' for camera in info.cameras) or 'none'}",
+            "one camera alone does not tell how far it moved: record depth, a second camera or an IMU",
+        )
+    first = intensity[0]
+    one = first.calibrated()
+    if not isinstance(one.model, Pinhole):
+        raise RecordingError(
+            f"a pinhole for {first.name}", type(one.model).__name__, "undistort the images to those of a pinhole"
+        )
+    if depths:
+        second = depths[0]
+        _check_registered(first, second)
+        return ChosenCameras("rgbd", first, second, one.model, None)
+    second = intensity[1]
+    two = second.calibrated()
+    T_right_left = np.linalg.inv(two.T_body_camera) @ one.T_body_camera
+    pose = np.concatenate([quaternion.from_matrix(T_right_left[:3, :3]), T_right_left[:3, 3]])
+    return ChosenCameras("stereo", first, second, one.model, StereoPair(two.model, pose))
+
+
+def _check_registered(first: CameraStream, depth: CameraStream) -> None:
+    """Refuse depths that are known to lie on other pixels than the images'."""
+    if (first.width, first.height) != (depth.width, depth.height):
+        raise RecordingError(
+            f"depths of {first.width}x{first.height} pixels, as {first.name}",
+            f"{depth.width}x{depth.height}",
+            "register the depth to the images: each depth belongs to the pixel of the image",
+        )
+    same = True
+    if first.T_body_camera is not None and depth.T_body_camera is not None:
+        same = bool(np.abs(first.T_body_camera - depth.T_body_camera).max() < _SAME_PLACE)
+    if isinstance(first.model, Pinhole) and isinstance(depth.model, Pinhole):
+        same = same and np.allclose(first.model.padded_parameters, depth.model.padded_parameters)
+    if not same:
+        raise RecordingError(
+            f"depths that are registered to {first.name}",
+            f"{depth.name} with another calibration",
+            "take the registered topic of the driver, or register the depth first",
+        )
+
+
+def frame_pairs(
+    events: Iterable[CameraEvent], cameras: ChosenCameras, rejected: Counter[str]
+) -> Iterator[tuple[CameraImage, CameraImage]]:
+    """Images of the two streams whose stamps are closest, in the order of time; what has no partner is counted."""
+    waiting: dict[int, deque[CameraImage]] = {cameras.first.index: deque(), cameras.second.index: deque()}
+    first, second = waiting[cameras.first.index], waiting[cameras.second.index]
+    for event in events:
+        if not isinstance(event, CameraImage) or event.camera not in waiting:
+            continue
+        waiting[event.camera].append(event)
+        yield from _matched(first, second, cameras, rejected, False)
+    yield from _matched(first, second, cameras, rejected, True)
+
+
+def _matched(
+    first: deque[CameraImage], second: deque[CameraImage], cameras: ChosenCameras, rejected: Counter[str], is_end: bool
+) -> Iterator[tuple[CameraImage, CameraImage]]:
+    while first:
+        time_ns = first[0].time_ns
+        # A closer partner may still come until one is there that is as late as the image.
+        if not is_end and (not second or second[-1].time_ns < time_ns) and len(first) < _MOST_WAITING:
+            return
+        closest = min(second, key=lambda image: abs(image.time_ns - time_ns), default=None)
+        if closest is None or abs(closest.time_ns - time_ns) > cameras.tolerance_ns:
+            rejected[f"images of {cameras.first.name} without one of {cameras.second.name}"] += 1
+            first.popleft()
+            continue
+        while second[0] is not closest:
+            rejected[f"images of {cameras.second.name} without one of {cameras.first.name}"] += 1
+            second.popleft()
+        second.popleft()
+        yield first.popleft(), closest
