@@ -1,6 +1,6 @@
 """Direct odometry of an RGB-D camera, frame by frame: here frames of a painted wall that the program draws itself.
 
-    python examples/direct_odometry.py
+python examples/direct_odometry.py
 """
 
 from __future__ import annotations

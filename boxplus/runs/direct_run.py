@@ -233,6 +233,8 @@ class _Run:
     def _contradiction(self) -> str | None:
         frames = max(len(self._ms), 1)
         lost, doubted = self._status["lost"] / frames, (self._status["lost"] + self._status["weak"]) / frames
+        if self._odometry.contradiction:
+            return self._odometry.contradiction
         if self._odometry.gaps:
             return (
                 f"{self._odometry.gaps} times the view was lost for so long that poses after it are not related to those before"

@@ -27,6 +27,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
+from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.estimate import Estimate, Status
 from boxplus.systems.direct_odometry.image_motion import image_motion
@@ -96,7 +97,12 @@ class DirectOdometry:
         self._reference: WindowKeyframe | None = None
         self._time_ns: int | None = None
         self._seen_ns: int | None = None
-        self._watch = Watch(self.config)
+        self._watch, self._calibration = Watch(self.config), CalibrationWatch()
+
+    @property
+    def contradiction(self) -> str:
+        """Why no pose is to be trusted, whatever the status: the intrinsics that the grey values contradict; empty where none."""
+        return self._watch.contradiction
 
     def push_rgbd(self, time_ns: int, image: Image | ArrayLike, depth: ArrayLike) -> Estimate:
         """A frame of an RGB-D camera.
@@ -148,6 +154,9 @@ class DirectOdometry:
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
         is_keyframe = self._asks_for_keyframe(keyframe, alignment)
         if is_keyframe:
+            if self.stereo is None:  # depths of a stereo pair change with its intrinsics
+                self._calibration.add(keyframe, image.grey, alignment)
+            self._watch.contradiction = self._calibration.contradiction
             added = self._keyframe(time_ns, image, depth_of(), T, keyframe.log_gain - alignment.brightness[0])
             is_keyframe = added is not None
             if added is not None:

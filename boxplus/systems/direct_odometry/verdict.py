@@ -30,6 +30,7 @@ class Watch:
     Attributes:
         lost: whether the frame before had no pose.
         past_reasons: why no pose since can be believed.
+        contradiction: why no pose at all can be.
     """
 
     def __init__(self, config: DirectOdometryConfig) -> None:
@@ -37,6 +38,7 @@ class Watch:
         self._sigmas: deque[float] = deque(maxlen=_MEMORY)
         self.lost = False
         self.past_reasons: list[str] = []
+        self.contradiction = ""
 
     def judge(self, alignment: Alignment, median_depth: float) -> Verdict:
         """Status and reasons of a frame with this alignment, to a keyframe of this depth [m]."""
@@ -45,7 +47,7 @@ class Watch:
             ratio = alignment.sigma / float(np.median(self._sigmas))
         if alignment.status in ("little overlap", "large residual") or not np.isfinite(alignment.covariance).all():
             return Verdict("lost", (alignment.reason,), ratio)
-        reasons = [*self.past_reasons]
+        reasons = [*self.past_reasons, *([self.contradiction] if self.contradiction else [])]
         if alignment.status == "iteration limit":
             reasons.append(alignment.reason)
         reasons += self._doubts_of_covariance(alignment, median_depth)

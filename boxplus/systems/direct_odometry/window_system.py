@@ -128,6 +128,21 @@ class System:
         return total
 
 
+class _Between:
+    """T_th (n, n, 7) from every keyframe h to every t, now and at first estimates, and adjoints (n, n, 6, 6) of the latter."""
+
+    def __init__(self, keyframes: Sequence[WindowKeyframe]) -> None:
+        self.now = _relative(np.array([k.T_world_camera for k in keyframes]))
+        self.first = _relative(np.array([k.first_pose for k in keyframes]))
+        n = len(keyframes)
+        self.adjoints = se3.adjoint(self.first.reshape(-1, 7)).reshape(n, n, 6, 6)
+
+
+def _relative(T_world_camera: Matrix) -> Matrix:
+    n = len(T_world_camera)
+    return se3.compose(np.repeat(se3.inverse(T_world_camera), n, axis=0), np.tile(T_world_camera, (n, 1))).reshape(n, n, 7)
+
+
 def linearize(
     keyframes: Sequence[WindowKeyframe],
     camera: Pinhole,
@@ -140,6 +155,7 @@ def linearize(
     """The patches of all keyframes, or of those at `hosts`, in all others; their information divided by `spread`."""
     size = DOF * len(keyframes)
     system = System(np.zeros((size, size)), np.zeros(size))
+    between = _Between(keyframes)
     for host in range(len(keyframes)) if hosts is None else hosts:
         patches = keyframes[host].patches
         n, difference = len(patches), patches.rho - patches.measured
@@ -148,7 +164,7 @@ def linearize(
         system.cost += 0.5 * float(pull @ difference)
         for target in range(len(keyframes)):
             if target != host:
-                _add_pair(system, of_host, keyframes, host, target, camera, sigma, 1.0 / spread, with_jacobians)
+                _add_pair(system, of_host, keyframes, between, host, target, camera, sigma, 1.0 / spread, with_jacobians)
         system.hosts[host] = of_host
     return system
 
@@ -157,6 +173,7 @@ def _add_pair(
     system: System,
     of_host: OfHost,
     keyframes: Sequence[WindowKeyframe],
+    between: _Between,
     host: int,
     target: int,
     camera: Pinhole,
@@ -166,8 +183,7 @@ def _add_pair(
 ) -> None:
     """Patches of one keyframe in another: ξ = Ad(T_th) ξ_h − ξ_t, and a_t − a_h."""
     h, t, n = keyframes[host], keyframes[target], len(of_host.H_rho)
-    T_th = se3.compose(se3.inverse(t.T_world_camera), h.T_world_camera)
-    T_first = se3.compose(se3.inverse(t.first_pose), h.first_pose)
+    T_th, T_first = between.now[target, host], between.first[target, host]
     H, g, cross, pulls = np.empty((DOF, DOF)), np.empty(DOF), np.empty((n, DOF)), np.empty((n, DOF))
     h_rho, g_rho, errors, state = np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8)
     p = h.patches
@@ -185,7 +201,7 @@ def _add_pair(
         return
     of_h, of_t = h.block(host), t.block(target)
     M_h, M_t = np.zeros((DOF, DOF)), np.diag([-1.0] * 6 + [1.0])
-    M_h[:6, :6], M_h[6, 6] = se3.adjoint(T_first), -1.0
+    M_h[:6, :6], M_h[6, 6] = between.adjoints[target, host], -1.0
     HM_h, HM_t = scale * H @ M_h, scale * H @ M_t
     system.H[of_h, of_h] += M_h.T @ HM_h
     system.H[of_h, of_t] += M_h.T @ HM_t
