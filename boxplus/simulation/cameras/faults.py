@@ -246,7 +246,7 @@ def bare_walls(contrast: float = 0.004) -> CameraFault:
         world = World([box((0.0, 0.0, 1.6), (9.0, 7.5, 3.2), reflectivity=0.8)], cell_m=2.0)
         return replace(scenario, world=world, contrast=contrast)
 
-    words = ("texture", "few corners", "few features", "shows nothing")
+    words = ("texture", "few features", "shows nothing")
     return CameraFault("bare_walls", "walls without texture", words, "inspect", scenario=bare)
 
 
@@ -361,8 +361,8 @@ CAMERA_FAULTS: dict[str, Callable[[], CameraFault]] = {
     "moving_object": moving_object,
     "drop_imu": lambda: of_imu(imu_faults.drop_imu(start_s=5.0), ("missing", "gap")),
     "imu_in_g": lambda: of_imu(imu_faults.imu_in_g(), ("reports in g", "unit", "as g")),
-    "gyro_in_deg": lambda: of_imu(imu_faults.gyro_in_deg(), ("unit", "deg/s")),
-    "flip_gyro": lambda: of_imu(imu_faults.flip_gyro(), ("does not fit", "different platforms", "sign")),
+    "gyro_in_deg": lambda: of_imu(imu_faults.gyro_in_deg(), ("another unit", "deg/s")),
+    "flip_gyro": lambda: of_imu(imu_faults.flip_gyro(), ("opposite sign",)),
 }
 """Name → maker."""
 

@@ -27,7 +27,14 @@ _LIVELY_RAD_S = 0.05  # spread of the second axis that turns most
 _OUTLIERS = 3.0
 _OFFSET_S = 0.005
 _ANGLE_DEG = 1.5
-_UNLIKE, _ANOTHER_UNIT = 0.5, 3.0
+_UNLIKE, _FAR_OFF = 0.5, 3.0
+_COARSE = 5  # of the offsets looked at for another reading of the gyroscope
+_READINGS = {
+    "the gyroscope's rates have the opposite sign, or it counts in a left-handed frame": -1.0,
+    "the gyroscope reports another unit: deg/s, not rad/s": float(np.pi / 180.0),
+    "the gyroscope reports another unit: rad/s that was taken for deg/s": float(180.0 / np.pi),
+}
+"""Factors on the gyroscope's readings that would explain the camera's rotation where the readings do not, and what they say."""
 _OVERLAP = 3  # rotations share images with so many others
 _NO_CORNERS = np.zeros((0, 2))
 
@@ -81,6 +88,7 @@ class Alignment:
         offset_std_s: standard deviation, infinite at the end of the search [s].
         unlike: share of the camera's rotation that the gyroscope does not explain.
         rotation_std: standard deviation of the rotation, largest axis [rad].
+        instead: where much is unlike, another reading of the gyroscope that explains the camera's rotation; empty: none does.
     """
 
     R_imu_camera: NDArray[np.float64]
@@ -89,6 +97,7 @@ class Alignment:
     offset_std_s: float
     unlike: float
     rotation_std: float
+    instead: str = ""
 
 
 def align(turns: Turns, imu: ImuSamples) -> Alignment | str:
@@ -133,14 +142,28 @@ def align(turns: Turns, imu: ImuSamples) -> Alignment | str:
     centred = camera[kept] - camera[kept].mean(axis=0)
     spread = float((centred**2).sum())
     information = spread * np.eye(3) - centred.T @ centred
+    unlike, instead = float(np.sqrt(at / spread)), ""
+    if unlike > _UNLIKE:
+        coarse = [gyro_over(offset) for offset in offsets[::_COARSE]]
+        shares = {text: min(_typical_misfit(factor * gyro, camera) for gyro in coarse) for text, factor in _READINGS.items()}
+        best_reading = min(shares, key=lambda text: shares[text])
+        instead = best_reading if shares[best_reading] < _UNLIKE else ""
     return Alignment(
         R_imu_camera=R,
         bias=bias,
         offset_s=float(offset),
         offset_std_s=float(np.sqrt(2.0 * variance / curvature) * _STEP_S) if curvature > 0.0 else float("inf"),
-        unlike=float(np.sqrt(at / spread)),
+        unlike=unlike,
         rotation_std=float(np.sqrt(variance / np.linalg.eigvalsh(information)[0])),
+        instead=instead,
     )
+
+
+def _typical_misfit(gyro: NDArray[np.float64], camera: NDArray[np.float64]) -> float:
+    """The median error of the best mounting over the median rate of the camera."""
+    _, _, errors = _fit(gyro, camera, np.ones(len(camera), dtype=bool))
+    rates = np.linalg.norm(camera - np.median(camera, axis=0), axis=1)
+    return float(np.median(errors) / max(float(np.median(rates)), 1e-9))
 
 
 def _misfit(gyro: NDArray[np.float64], camera: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -172,9 +195,12 @@ def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidenc
         text = (
             f"what the gyroscope does not explain is {100 * found.unlike:.0f} % of the camera's rotation, whatever the mounting"
         )
-        if found.unlike > _ANOTHER_UNIT:
-            return [Evidence(rotation_key, "unlike", "error", f"{text}: the gyroscope has another unit, or another platform")]
-        text += ": few corners, wrong intrinsics, a wrong unit of the gyroscope, or sensors of different platforms"
+        if found.instead:
+            return [Evidence(rotation_key, "unlike", "error", f"{text}: {found.instead}")]
+        if found.unlike > _FAR_OFF:
+            text += ": the gyroscope has another unit, or another platform, or too few corners were followed"
+            return [Evidence(rotation_key, "unlike", "error", text)]
+        text += ": sensors of different platforms (a mounting that is not rigid), wrong intrinsics, or too few corners"
         return [Evidence(rotation_key, "unlike", "warning", text)]
     if not np.isfinite(found.offset_std_s):
         text = f"no offset up to {_SEARCH_S * 1e3:.0f} ms fits: the clocks are further apart; synchronise them"

@@ -15,7 +15,7 @@ _DARK, _BRIGHT = 15.0, 240.0
 _BLOCK = 8
 _EMPTY, _EMPTY_SHARE = 1.0, 0.25  # grey values between neighbouring blocks, and of the recording's median
 _COVERED_AT_LEAST_S = 0.2
-_FEW_CORNERS, _FEW_A_PIXEL = 80.0, 0.0008
+_FEW_CORNERS, _FEW_A_PIXEL = 40.0, 0.0004
 _LITTLE_STRUCTURE = 3.0
 _BLURRED = 0.35
 _MANY_BLURRED = 0.1
@@ -140,7 +140,8 @@ def check_blur(name: str, views: Views) -> list[Evidence]:
     """A finding about blur: images whose finest differences are small for their coarser ones, beside the recording's sharpest."""
     sharpness = np.array(views.sharpness)
     shown = np.array(views.structure) > _EMPTY
-    if shown.sum() < 20:
+    # Where there is little but noise, the noise is what is sharp.
+    if shown.sum() < 20 or float(np.median(views.structure)) < _LITTLE_STRUCTURE:
         return []
     sharpest = float(np.quantile(sharpness[shown], 0.9))
     share = float((sharpness[shown] < _BLURRED * sharpest).mean())
@@ -154,15 +155,15 @@ def check_blur(name: str, views: Views) -> list[Evidence]:
 def check_corners(name: str, followed: list[int], views: Views) -> list[Evidence]:
     """A finding about how many corners can be followed from image to image; small images have fewer.
 
-    Surroundings without structure leave corners of noise: there, twice as many are few.
+    Surroundings without structure leave corners of noise: there, three times as many are few.
     """
     if not followed:
         return []
     median = float(np.median(followed))
     text = f"corners of the first image found again in the second, median of {len(followed)} pairs, at most 300 are looked for"
     few = min(_FEW_CORNERS, _FEW_A_PIXEL * views.size[0] * views.size[1])
-    if float(np.median(views.structure)) > _LITTLE_STRUCTURE:
-        few *= 0.5
+    if float(np.median(views.structure)) < _LITTLE_STRUCTURE:
+        few *= 3.0
     if median < few:
         text += ": few corners, surroundings with little texture, blur or darkness"
         return [Evidence(f"{name}_corners", f"{median:.0f}", "warning", text)]

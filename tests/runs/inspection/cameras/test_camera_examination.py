@@ -93,9 +93,13 @@ def test_findings_of_a_right_and_of_wrong_calibrations() -> None:
     late = said(stream(R), *turning(2, 0.03, R))["cam0_imu_time_offset"]
     assert late.verdict == "warning" and late.value.startswith(("+29", "+30")) and "timeshift_cam_imu" in late.text
     degrees = said(stream(R), *turning(3, 0.0, R, scale=57.3))["R_imu_cam0"]
-    assert (degrees.verdict, degrees.value) == ("error", "unlike")
+    assert (degrees.verdict, degrees.value) == ("error", "unlike") and "deg/s, not rad/s" in degrees.text
+    radians = said(stream(R), *turning(3, 0.0, R, scale=1.0 / 57.3))["R_imu_cam0"]
+    assert radians.verdict == "error" and "taken for deg/s" in radians.text
+    opposite = said(stream(R), *turning(5, 0.02, R, scale=-1.0))["R_imu_cam0"]
+    assert opposite.verdict == "error" and "opposite sign" in opposite.text
     other = said(stream(R), turns, turning(4, 0.0, R)[1])["R_imu_cam0"]
-    assert (other.verdict, other.value) == ("warning", "unlike")
+    assert (other.verdict, other.value) == ("warning", "unlike") and "different platforms" in other.text
     far = said(stream(R), *turning(2, 0.2, R))
     assert {evidence.value for evidence in far.values()} <= {"beyond the search", "unlike"}
     assert all(evidence.verdict != "ok" for evidence in far.values())
