@@ -13,6 +13,7 @@ import typer
 class _Alignment(StrEnum):
     se3 = "se3"
     sim3 = "sim3"
+    yaw = "yaw"
     none = "none"
 
 

@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
 
-AlignmentKind = Literal["none", "se3", "sim3"]
+AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
 _COINCIDENT_M = 1e-6
 _COLLINEAR = 1e-3  # second against first principal standard deviation
@@ -23,7 +23,7 @@ class Alignment:
     """x_world = scale · R_world_estimate · x_estimate + p_world_estimate.
 
     Attributes:
-        kind: `none`, `se3` or `sim3`.
+        kind: `none`, `yaw`, `se3` or `sim3`.
         R_world_estimate: (3, 3) rotation.
         p_world_estimate: (3,) [m].
         scale: 1 unless `sim3`.
@@ -50,11 +50,12 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: AlignmentKind 
 
     Args:
         p_estimate, p_ground_truth: (M, 3) matched positions [m].
-        kind: `se3` (rotation and translation), `sim3` (and scale) or `none` (identity).
+        kind: `se3` (rotation and translation), `sim3` (and scale), `yaw` (rotation about z and translation, which is what an
+            estimator with gravity does not know: Zhang and Scaramuzza, IROS 2018) or `none` (identity).
 
     Raises:
         InputError: fewer than three positions, or positions that do not determine the rotation: all in one place or on
-            one line.
+            one line; for `yaw` one above the other.
     """
     x, y = np.asarray(p_estimate, dtype=np.float64), np.asarray(p_ground_truth, dtype=np.float64)
     if x.ndim != 2 or x.shape[1:] != (3,) or x.shape != y.shape:
@@ -68,6 +69,8 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: AlignmentKind 
         raise InputError(
             "at least three matched positions to align", f"{len(x)}", "compare with --align none, or match more poses"
         )
+    if kind == "yaw":
+        return _align_heading(x, y, spread)
     for name, values in (("ground truth", spread), ("estimate", principal_spread(x))):
         if values[0] < _COINCIDENT_M:
             raise InputError(
@@ -89,6 +92,23 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: AlignmentKind 
     scale = float((d * sign).sum() / ((x - mean_x) ** 2).sum(axis=1).mean()) if kind == "sim3" else 1.0
     mirrored = bool(sign[2] < 0 and d[2] > 0.1 * d[1])
     return Alignment(kind, R, mean_y - scale * R @ mean_x, scale, spread, mirrored)
+
+
+def _align_heading(x: NDArray[np.float64], y: NDArray[np.float64], spread: NDArray[np.float64]) -> Alignment:
+    """The rotation about z and the translation, closed: the angle of Σ x̄* ȳ, horizontal positions as complex numbers."""
+    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
+    flat_x, flat_y = ((p - mean)[:, 0] + 1j * (p - mean)[:, 1] for p, mean in ((x, mean_x), (y, mean_y)))
+    for name, flat in (("ground truth", flat_y), ("estimate", flat_x)):
+        size = float(np.sqrt(np.mean(np.abs(flat) ** 2)))
+        if size < _COINCIDENT_M:
+            raise InputError(
+                f"{name} positions that differ horizontally, to align the heading by them",
+                f"{len(x)} positions within {size:.1e} m of one vertical",
+                "compare with --align none",
+            )
+    angle = float(np.angle(np.vdot(flat_x, flat_y)))
+    R = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    return Alignment("yaw", R, mean_y - R @ mean_x, 1.0, spread, False)
 
 
 def principal_spread(p: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,12 @@ from boxplus.evaluation.statistics import Statistics
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
-_KINDS = {"none": "no alignment", "se3": "SE(3) alignment (rotation and translation)", "sim3": "Sim(3) alignment (and scale)"}
+_KINDS = {
+    "none": "no alignment",
+    "yaw": "yaw alignment (rotation about z and translation)",
+    "se3": "SE(3) alignment (rotation and translation)",
+    "sim3": "Sim(3) alignment (and scale)",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +141,7 @@ def evaluate(
 
     Args:
         estimate, ground_truth: the trajectories.
-        alignment: `se3`, `sim3` or `none`, from the matched positions (`align`).
+        alignment: `se3`, `sim3`, `yaw` or `none`, from the matched positions (`align`).
         method, max_difference_s, offset_s, max_gap_s, min_matches: see `associate`.
         rpe_distance_m, rpe_time_s: deltas of the relative errors, or None to leave them out; where the trajectory is too
             short for one (or has no time), a warning says so.
@@ -221,7 +226,7 @@ def _association_doubts(association: Association, estimate: Trajectory, ground_t
 def _alignment_doubts(alignment: Alignment, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> list[str]:
     doubts = []
     rmse = float(np.sqrt(np.mean(translation**2)))
-    if alignment.kind != "none" and alignment.spread_m[1] < rmse:
+    if alignment.kind in ("se3", "sim3") and alignment.spread_m[1] < rmse:
         doubts.append(
             f"the path strays {alignment.spread_m[1]:.3g} m from a straight line, less than the error of {rmse:.3g} m: the "
             "rotation of the alignment about that line is mostly noise"

@@ -77,3 +77,37 @@ def test_apply_moves_poses_as_points(seed: int) -> None:
     back = align(other.p, path.p, "sim3").apply(other)
     np.testing.assert_allclose(back.p, path.p, atol=1e-9)
     np.testing.assert_allclose(np.abs(np.sum(back.q_wxyz * path.q_wxyz, axis=1)), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_other_heading_and_shift_fit_better(seed: int) -> None:
+    """Brute force over the heading; the best shift for each is the difference of the means."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(15, 3)) * [3.0, 2.0, 1.0], rng.normal(size=(15, 3)) + 4.0
+    found = align(x, y, "yaw")
+    ours = float(np.sum((y - x @ found.R_world_estimate.T - found.p_world_estimate) ** 2))
+    turned = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, 3600)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    centred = np.einsum("kij,nj->kni", turned, x - x.mean(axis=0))
+    assert ours <= ((y - y.mean(axis=0) - centred) ** 2).sum(axis=(1, 2)).min() + 1e-9
+    np.testing.assert_allclose(found.R_world_estimate[2], [0.0, 0.0, 1.0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(angle=st.floats(-3.1, 3.1), seed=st.integers(0, 1000))
+def test_a_known_heading_is_found_also_along_a_line(angle: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    line = np.linspace(0.0, 5.0, 20)[:, None] * np.array([0.6, 0.7, 0.1]) + rng.normal(size=3)
+    R = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+    found = align(line, line @ R.T + [1.0, 2.0, 3.0], "yaw")
+    np.testing.assert_allclose(found.R_world_estimate, R, atol=1e-9)
+    np.testing.assert_allclose(found.p_world_estimate, [1.0, 2.0, 3.0], atol=1e-8)
+
+
+def test_a_tilt_is_no_heading_and_a_vertical_has_none() -> None:
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(20, 3))
+    tilted = x @ Rotation.from_euler("x", 5.0, degrees=True).as_matrix().T
+    found = align(x, tilted, "yaw")
+    assert np.sqrt(np.mean(np.sum((tilted - x @ found.R_world_estimate.T - found.p_world_estimate) ** 2, axis=1))) > 0.05
+    with pytest.raises(InputError, match="differ horizontally, to align the heading"):
+        align(np.outer(np.arange(5.0), [0.0, 0.0, 1.0]), x[:5], "yaw")
