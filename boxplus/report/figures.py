@@ -11,6 +11,7 @@ from plotly.subplots import make_subplots
 
 from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
 from boxplus.report.run_data import RunData
+from boxplus.runs.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
@@ -101,7 +102,7 @@ def status_and_axes(data: RunData) -> go.Figure:
     figure.add_heatmap(
         x=data.seconds[rows],
         y=AXES,
-        z=data.scans.lidar_share[rows].T,
+        z=data.log.matrix(SHARES)[rows].T,
         zmin=0.0,
         zmax=1.0,
         colorscale="Cividis",
@@ -117,9 +118,9 @@ def status_and_axes(data: RunData) -> go.Figure:
 def timing(data: RunData) -> go.Figure:
     """Milliseconds per scan, stacked by stage."""
     figure, rows = go.Figure(), shown_rows(data)
-    for color, (stage, milliseconds) in zip(cycle(SERIES), data.scans.pairs("timing_ms").items(), strict=False):
+    for color, (stage, milliseconds) in zip(cycle(SERIES), data.log.pairs("timing_ms").items(), strict=False):
         _add_area(figure, data, rows, milliseconds, stage, color, "%{y:.2f} ms")
-    total = data.scans.column("total_ms")
+    total = data.log.column("total_ms")
     top = 1.15 * float(np.percentile(total, 99.5)) if len(total) else 1.0
     figure.update_yaxes(title_text="ms per scan", range=[0.0, max(top, 1e-3)])
     return _over_time(figure, data, 280)
@@ -128,7 +129,7 @@ def timing(data: RunData) -> go.Figure:
 def velocity(data: RunData) -> go.Figure:
     """Velocity of the IMU in the world."""
     figure, rows = go.Figure(), shown_rows(data)
-    values = data.scans.column("velocity")[rows]
+    values = data.log.column("velocity")[rows]
     _add_xyz(figure, data.seconds[rows], values)
     _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "speed", INK)
     figure.update_yaxes(title_text="m/s")
@@ -140,7 +141,7 @@ def biases(data: RunData) -> go.Figure:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
     for row, (name, factor) in enumerate((("bias_gyro", 180.0 / np.pi), ("bias_accel", 1.0)), 1):
-        values, sigma = factor * data.scans.column(name)[rows], factor * data.scans.column(f"sigma_{name}")[rows]
+        values, sigma = factor * data.log.column(name)[rows], factor * data.log.column(f"sigma_{name}")[rows]
         _add_xyz(figure, data.seconds[rows], values, sigma, row=row, legend=row == 1)
         figure.update_yaxes(range=_range_of(values), row=row, col=1)
     figure.update_yaxes(title_text="gyroscope [deg/s]", row=1, col=1)
@@ -152,7 +153,7 @@ def gravity(data: RunData) -> go.Figure:
     """Magnitude of gravity, and how far its direction moved from the first estimate."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
-    values = data.scans.column("gravity")[rows]
+    values = data.log.column("gravity")[rows]
     _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "magnitude", SERIES[0], row=1)
     _add_line(figure, data.seconds[rows], gravity_tilt_deg(values), "direction, from the first", SERIES[3], row=2)
     figure.update_yaxes(title_text="m/s²", row=1, col=1, tickformat=".3f")
@@ -175,10 +176,10 @@ def points(data: RunData) -> go.Figure:
     """Points after the voxel filter: used, and rejected by reason; and the residuals of the used ones."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
     rows = shown_rows(data)
-    _add_area(figure, data, rows, data.scans.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
-    for color, (reason, count) in zip(cycle(REJECTED), data.scans.pairs("rejected").items(), strict=False):
+    _add_area(figure, data, rows, data.log.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
+    for color, (reason, count) in zip(cycle(REJECTED), data.log.pairs("rejected").items(), strict=False):
         _add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} points", row=1)
-    residual_cm = 100.0 * data.scans.column("residual_rms")[rows]
+    residual_cm = 100.0 * data.log.column("residual_rms")[rows]
     _add_line(figure, data.seconds[rows], residual_cm, "residual (rms)", FAINT, row=2)
     figure.update_yaxes(title_text="points", row=1, col=1)
     figure.update_yaxes(title_text="cm", row=2, col=1, rangemode="tozero")
@@ -189,10 +190,10 @@ def extrinsic(data: RunData) -> go.Figure:
     """How the refined extrinsic moved from where it began."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
-    q = np.stack([data.scans.column(f"imu_lidar_q{part}") for part in "wxyz"], axis=1)[rows]
+    q = np.stack([data.log.column(f"imu_lidar_q{part}") for part in "wxyz"], axis=1)[rows]
     angle = 2.0 * np.degrees(np.arccos(np.clip(np.abs(q @ q[0]), 0.0, 1.0)))
     _add_line(figure, data.seconds[rows], angle, "rotation, from the first", SERIES[3], row=1)
-    _add_xyz(figure, data.seconds[rows], 100.0 * data.scans.column("imu_lidar_p")[rows], row=2)
+    _add_xyz(figure, data.seconds[rows], 100.0 * data.log.column("imu_lidar_p")[rows], row=2)
     figure.update_yaxes(title_text="deg", row=1, col=1, rangemode="tozero")
     figure.update_yaxes(title_text="position [cm]", row=2, col=1)
     return _over_time(figure, data, 340, bottom_row=2)

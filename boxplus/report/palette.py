@@ -27,7 +27,7 @@ def shown_rows(data: RunData) -> NDArray[np.intp]:
     even = np.linspace(0, count - 1, _MOST_ROWS).astype(np.intp)
     troubled = np.flatnonzero(data.status != "ok")
     troubled = troubled[:: max(1, len(troubled) // 1000)]
-    slowest = np.argsort(data.scans.column("total_ms"))[-200:]
+    slowest = np.argsort(data.log.column("total_ms"))[-200:]
     return np.unique(np.concatenate([even, troubled, slowest]))
 
 

@@ -11,6 +11,7 @@ from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
 from boxplus.report.run_data import RunData
 from boxplus.runs.run_folder import PLOTS
+from boxplus.runs.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _DPI = 130
@@ -72,7 +73,7 @@ def _status(data: RunData) -> Figure:
     for name, color in STATUS.items():
         strip.plot([], [], "s", color=color, label=f"{name} ({int((data.status == name).sum())})")
     strip.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, fontsize=9, borderaxespad=0.2)
-    mesh = shares.pcolormesh(edges, np.arange(7), data.scans.lidar_share[rows].T, cmap="cividis", vmin=0.0, vmax=1.0)
+    mesh = shares.pcolormesh(edges, np.arange(7), data.log.matrix(SHARES)[rows].T, cmap="cividis", vmin=0.0, vmax=1.0)
     shares.set_yticks(np.arange(6) + 0.5, AXES)
     shares.invert_yaxis()
     shares.set_xlabel("time since the first scan [s]")
@@ -85,13 +86,13 @@ def _timing(data: RunData) -> Figure:
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     axes = figure.subplots()
     rows = shown_rows(data)
-    stages = data.scans.pairs("timing_ms")
+    stages = data.log.pairs("timing_ms")
     if stages:
         colors = [SERIES[index % len(SERIES)] for index in range(len(stages))]
         axes.stackplot(
             data.seconds[rows], [values[rows] for values in stages.values()], labels=list(stages), colors=colors, linewidth=0
         )
-        axes.set_ylim(0.0, 1.15 * max(float(np.percentile(data.scans.column("total_ms"), 99.5)), 1e-3))
+        axes.set_ylim(0.0, 1.15 * max(float(np.percentile(data.log.column("total_ms"), 99.5)), 1e-3))
         axes.legend(ncols=3, loc="upper left", fontsize=9, frameon=False)
     scan = data.summary.timing.scan_ms
     if scan is not None:
@@ -110,7 +111,7 @@ def _biases(data: RunData) -> Figure:
     rows = shown_rows(data)
     kinds = (("bias_gyro", 180.0 / np.pi, "gyroscope [deg/s]"), ("bias_accel", 1.0, "accelerometer [m/s²]"))
     for axes, (name, factor, label) in zip(figure.subplots(2, 1, sharex=True), kinds, strict=True):
-        values, sigma = factor * data.scans.column(name)[rows], factor * data.scans.column(f"sigma_{name}")[rows]
+        values, sigma = factor * data.log.column(name)[rows], factor * data.log.column(f"sigma_{name}")[rows]
         for axis, color in enumerate(XYZ):
             low, high = values[:, axis] - sigma[:, axis], values[:, axis] + sigma[:, axis]
             axes.fill_between(data.seconds[rows], low, high, color=color, alpha=0.13, linewidth=0)

@@ -12,9 +12,10 @@ from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+from boxplus.runs.row_log import RowLog
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_summary import RunSummary, read_summary
-from boxplus.runs.scan_log import ScanLog, read_scan_log
+from boxplus.runs.scan_log import read_scan_log
 
 _MOST_POINTS = 150_000
 _THIN_FROM = 10 * _MOST_POINTS
@@ -31,7 +32,7 @@ class RunData:
         seconds: (N,) float64, time of every scan since the first one [s].
         position: (N, 3) float64, of the IMU in the world [m].
         sigma: (N, 6) float64, standard deviations of the pose: rotation [rad], position [m].
-        scans: everything else per scan.
+        log: everything else per scan.
         map_points: (M, 3) float32, a thinned map, world frame [m].
         map_remarks: sentences on what of the map is incomplete.
     """
@@ -41,14 +42,14 @@ class RunData:
     seconds: NDArray[np.float64]
     position: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    scans: ScanLog
+    log: RowLog
     map_points: NDArray[np.float32]
     map_remarks: tuple[str, ...]
 
     @property
     def status(self) -> NDArray[np.str_]:
         """(N,) ok, weak or lost."""
-        return self.scans.status
+        return self.log.status
 
 
 def load_run(folder: str | Path) -> RunData:
@@ -73,13 +74,13 @@ def load_run(folder: str | Path) -> RunData:
         seconds=(scans.time_ns - scans.time_ns[0]) * 1e-9,
         position=trajectory.p[:count],
         sigma=_sigmas(trajectory, count),
-        scans=scans,
+        log=scans,
         map_points=points,
         map_remarks=remarks,
     )
 
 
-def _counted(summary: RunSummary, scans: ScanLog, position: NDArray[np.float64]) -> RunSummary:
+def _counted(summary: RunSummary, scans: RowLog, position: NDArray[np.float64]) -> RunSummary:
     """The summary of a run that did not end, brought up to its last row; it is written every few seconds only."""
     if summary.state != "running":
         return summary

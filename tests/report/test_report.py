@@ -160,12 +160,12 @@ def test_map_is_thinned_evenly(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_long_runs_show_their_worst_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(palette, "_MOST_ROWS", 5)
     data = load_run(folder)
-    status = np.full(len(data.scans), "ok", dtype="<U4")
+    status = np.full(len(data.log), "ok", dtype="<U4")
     status[7] = "lost"
-    total = np.zeros(len(data.scans))
+    total = np.zeros(len(data.log))
     total[11] = 99.0
     scans = types.SimpleNamespace(column=lambda name: total)
-    fake = types.SimpleNamespace(seconds=data.seconds, status=status, scans=scans)
+    fake = types.SimpleNamespace(seconds=data.seconds, status=status, log=scans)
     rows = palette.shown_rows(fake)  # type: ignore[arg-type]
     assert {0, 7, 11, len(status) - 1} <= set(rows.tolist())
     assert (np.diff(rows) > 0).all()

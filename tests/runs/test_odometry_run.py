@@ -29,7 +29,7 @@ from boxplus.runs.extrinsic import choose_extrinsic
 from boxplus.runs.odometry_run import Progress, run_odometry
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_summary import RunSummary, read_summary
-from boxplus.runs.scan_log import read_scan_log
+from boxplus.runs.scan_log import SHARES, read_scan_log
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, SpinningLidar, simulate
@@ -73,8 +73,8 @@ def test_folder_holds_everything_and_agrees_with_itself(finished: tuple[RunFolde
 def test_scan_log_gives_back_the_estimates(finished: tuple[RunFolder, RunSummary]) -> None:
     folder, summary = finished
     scans = read_scan_log(folder.scans)
-    assert scans.lidar_share.shape == (len(scans), 6)
-    assert ((scans.lidar_share >= 0) & (scans.lidar_share <= 1)).all()
+    shares = scans.matrix(SHARES)
+    assert shares.shape == (len(scans), 6) and ((shares >= 0) & (shares <= 1)).all()
     used, rejected = scans.column("points_used"), sum(scans.pairs("rejected").values())
     np.testing.assert_array_equal((used + rejected)[1:], scans.column("points_filtered")[1:])
     np.testing.assert_allclose(np.linalg.norm(scans.column("gravity"), axis=1), 9.81, atol=0.1)
