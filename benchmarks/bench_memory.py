@@ -18,7 +18,8 @@ import numpy as np
 from metrics import Metric, run_as_script
 
 from boxplus.runs.config import MapConfig, RunConfig
-from boxplus.runs.odometry_run import Progress, run_odometry
+from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.run_loop import Progress
 from boxplus.simulation import as_recording, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
@@ -46,11 +47,11 @@ def measure(options: argparse.Namespace) -> list[Metric]:
     began = time.perf_counter()
 
     def note(progress: Progress) -> None:
-        if progress.stage == "odometry" and progress.scans and (not samples or progress.scans > samples[-1][0]):
-            samples.append((progress.scans, resident_mb()))
-            if progress.scans % 600 == 0:
+        if progress.stage == "odometry" and progress.count and (not samples or progress.count > samples[-1][0]):
+            samples.append((progress.count, resident_mb()))
+            if progress.count % 600 == 0:
                 print(
-                    f"{progress.scans / 600:3.0f} min  {samples[-1][1]:7.1f} MB  {time.perf_counter() - began:6.0f} s", flush=True
+                    f"{progress.count / 600:3.0f} min  {samples[-1][1]:7.1f} MB  {time.perf_counter() - began:6.0f} s", flush=True
                 )
 
     with tempfile.TemporaryDirectory() as folder:

@@ -96,6 +96,7 @@ def run(
     """
     from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
     from boxplus.recordings import open_recording
+    from boxplus.recordings.info import Evidence
     from boxplus.runs.extrinsic import choose_extrinsic
     from boxplus.runs.odometry_run import run_odometry
     from boxplus.runs.run_folder import claim_run_folder
@@ -113,7 +114,15 @@ def run(
     ):
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
             extrinsic = choose_extrinsic(opened, config.odometry)
-        terminal.print_evidence(opened.info, extrinsic)
+        info = opened.info
+        mounting = Evidence(
+            "T_imu_lidar", extrinsic.source, "warning" if extrinsic.warning else "ok", extrinsic.warning or extrinsic.text
+        )
+        terminal.print_evidence(
+            info.path,
+            f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages",
+            [*(entry for entry in info.evidence if entry.key != "T_imu_lidar"), mounting],
+        )
         with terminal.progress() as progress:
             summary = run_odometry(
                 opened,
@@ -130,5 +139,18 @@ def run(
 
             with terminal.status("drawing the report"):
                 write_report(folder)
-    terminal.print_results(summary, folder)
+    files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json")
+    terminal.print_results(summary, _rows(summary), folder, files)
     return summary
+
+
+def _rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """What the terminal shows of a run of LiDAR and IMU."""
+    from boxplus.cli.run_terminal import speed_text
+
+    timing, rows = summary.timing, []
+    if timing.scan_ms is not None:
+        rows.append(("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms"))
+    rows.append(("speed", speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)))
+    rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))
+    return rows

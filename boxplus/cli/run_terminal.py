@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -18,10 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 from boxplus.errors import printable
-from boxplus.recordings.info import RecordingInfo
-from boxplus.runs.extrinsic import Extrinsic
-from boxplus.runs.odometry_run import Progress
-from boxplus.runs.run_summary import RunSummary
+from boxplus.recordings.info import Evidence
+from boxplus.runs.run_facts import RunFacts
+from boxplus.runs.run_loop import Progress
 
 _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red", "weak": "yellow", "lost": "bold red"}
 _SHOWN_WARNINGS = 8
@@ -41,23 +40,19 @@ class RunTerminal:
         """Say that Ctrl-C was heard."""
         self._console.print("interrupted: finishing the files; Ctrl-C again stops at once")
 
-    def print_evidence(self, info: RecordingInfo, extrinsic: Extrinsic) -> None:
+    def print_evidence(self, path: Path, facts: str, evidence: Iterable[Evidence]) -> None:
         """How the recording is read, and why."""
-        facts = f": {info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
-        self._console.print(Text.assemble((printable(info.path.name), "bold"), facts))
+        self._console.print(Text.assemble((printable(path.name), "bold"), f": {facts}"))
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in ("reading", "found", "", "evidence"):
             table.add_column(heading, overflow="fold")
-        for entry in info.evidence:
-            if entry.key != "T_imu_lidar":
-                table.add_row(entry.key, Text(entry.value), Text(entry.verdict, _STYLE[entry.verdict]), Text(entry.text))
-        verdict = "warning" if extrinsic.warning else "ok"
-        table.add_row("T_imu_lidar", extrinsic.source, Text(verdict, _STYLE[verdict]), Text(extrinsic.warning or extrinsic.text))
+        for entry in evidence:
+            table.add_row(entry.key, Text(entry.value), Text(entry.verdict, _STYLE[entry.verdict]), Text(entry.text))
         self._console.print(table)
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[Progress], None]]:
-        """A bar with the scan rate; yields what `run_odometry` calls."""
+        """A bar with the rate of estimates; yields what a run calls."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -79,44 +74,46 @@ class RunTerminal:
                         self._console.print("compiling kernels (first use only) …")
                     bar.update(task, text=f"compiling {progress.compiling}")
                 elif rate.due():
-                    text = f"{progress.scans} scans, {rate(progress.scans):.0f}/s, {progress.status}"
+                    text = f"{progress.count} {progress.unit}, {rate(progress.count):.0f}/s, {progress.status}"
                     bar.update(task, completed=progress.share, description=progress.stage, text=text)
 
             yield show
             bar.update(task, completed=bar.tasks[0].total if bar.tasks[0].completed > 0.999 else bar.tasks[0].completed)
 
-    def print_results(self, summary: RunSummary, folder: Path) -> None:
-        """The facts of the run, its warnings and its files."""
-        console, timing = self._console, summary.timing
+    def print_results(self, summary: RunFacts, rows: Sequence[tuple[str, str]], folder: Path, files: Sequence[str]) -> None:
+        """The facts of the run, its warnings and its files.
+
+        Args:
+            rows: name and value, after the counts and the start.
+            files: names of those that may be there.
+        """
+        console = self._console
         style = "green" if summary.state == "finished" and summary.contradiction is None else "yellow"
         console.print(Text(printable(summary.describe_state()), style))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")
         table.add_column()
         counts = Text(", ").join(Text(f"{count} {name}", _STYLE[name]) for name, count in sorted(summary.status.items()))
-        table.add_row("scans", Text.assemble(f"{summary.scans} (", counts, ")"))
+        count, unit = summary.estimates
+        table.add_row(unit, Text.assemble(f"{count} (", counts, ")"))
         if summary.start is not None:
             table.add_row("start", Text(f"{summary.start.kind}: {summary.start.text}"))
         table.add_row("path length", f"{summary.path_length_m:.2f} m in {summary.duration_s:.1f} s")
-        if timing.scan_ms is not None:
-            table.add_row("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms")
-        compiled = " (with compilation)" if timing.compiled_kernels else ""
-        speed = f"{timing.real_time_factor:.1f} × real time{compiled}, reading included; {timing.total_s:.1f} s in all"
-        table.add_row("speed", speed)
-        table.add_row("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept")
+        for name, value in rows:
+            table.add_row(name, Text(value))
         console.print(table)
         for warning in summary.warnings[:_SHOWN_WARNINGS]:
             times = f" ({warning.count} times)" if warning.count > 1 else ""
             console.print(Text.assemble(("warning: ", "yellow"), printable(warning.text) + times))
         if len(summary.warnings) > _SHOWN_WARNINGS:
             console.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
-        for name in ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"):
+        for name in files:
             if (folder / name).exists():
                 console.print(f"  {folder / name}", soft_wrap=True, markup=False)
 
 
 class _Rate:
-    """Scans per second over the last few seconds, asked at most ten times a second."""
+    """Estimates per second over the last few seconds, asked at most ten times a second."""
 
     def __init__(self) -> None:
         self._last = 0.0
@@ -152,3 +149,9 @@ def stop_on_interrupt(announce: Callable[[], None]) -> Iterator[Callable[[], boo
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def speed_text(real_time_factor: float, total_s: float, compiled: int) -> str:
+    """How fast a run was."""
+    first = " (with compilation)" if compiled else ""
+    return f"{real_time_factor:.1f} × real time{first}, reading included; {total_s:.1f} s in all"

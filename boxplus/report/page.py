@@ -8,7 +8,8 @@ from pathlib import Path
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.runs.run_summary import Gap, Matrix
+from boxplus.runs.run_facts import Gap
+from boxplus.runs.run_summary import Matrix
 
 
 def write_page(data: RunData) -> Path:
@@ -95,7 +96,7 @@ def _weak_table(data: RunData) -> str:
     intervals = data.summary.weak_intervals
     if not intervals:
         return ""
-    rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.scans}", i.text) for i in intervals[:200]]
+    rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.count}", i.text) for i in intervals[:200]]
     table = html_table(rows, ("time", "status", "scans", "at its beginning"))
     return f"<details><summary>Intervals that were not ok: {len(intervals)}</summary>{table}</details>"
 

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import os
-import platform
-import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Protocol
 
-import boxplus
-from boxplus._jit import on_compilation
-from boxplus.errors import BoxplusError, InputError, OutputError, printable
-from boxplus.formats.output import atomic_file
+from boxplus.errors import InputError, printable
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.store import TileStore, merge
 from boxplus.maps.tiles.writer import TileWriter
@@ -26,44 +18,16 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.checkpoint import Checkpoint, CheckpointWriter, cut_to_whole_rows, read_checkpoint, run_identity
 from boxplus.runs.config import RunConfig, dump_run_config
 from boxplus.runs.extrinsic import Extrinsic, choose_extrinsic
+from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_folder import RunFolder, claim_run_folder
-from boxplus.runs.run_summary import (
-    ExtrinsicFacts,
-    MapFacts,
-    RecordingFacts,
-    RunSummary,
-    StartFacts,
-    State,
-    TimingFacts,
-    WarningFacts,
-)
+from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.run_summary import ExtrinsicFacts, MapFacts, RecordingFacts, RunSummary, TimingFacts
 from boxplus.runs.scan_log import ScanLogWriter
 from boxplus.runs.statistics import RunStatistics
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
-
-_SUMMARY_EVERY_S = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a run is.
-
-    Attributes:
-        share: of the recording, 0 to 1.
-        scans: estimates so far.
-        status: of the last scan, or "starting".
-        compiling: name of the kernel that is being compiled, or None.
-        stage: "odometry" or "merging the map".
-    """
-
-    share: float
-    scans: int
-    status: str
-    compiling: str | None = None
-    stage: str = "odometry"
 
 
 class View(Protocol):
@@ -124,8 +88,8 @@ def run_odometry(
         return run.execute(should_stop or (lambda: False))
 
 
-class _Run:
-    """One run: its writers, its clock and its counts."""
+class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
+    """One run of LiDAR-inertial odometry: its writers, its map and its checkpoints."""
 
     def __init__(
         self,
@@ -136,30 +100,23 @@ class _Run:
         progress: Callable[[Progress], None],
         view: View | None,
     ) -> None:
+        self._identity = run_identity(recording.info, dump_run_config(config, recording.info))
+        self._statistics = RunStatistics()
+        super().__init__(recording, folder.summary, folder.config, self._identity["config"], self._statistics, progress)
         self._recording = recording
         self._folder = folder
         self._config = config
         self._extrinsic = extrinsic
-        self._progress = progress
         self._view = view
         self._odometry = LidarInertialOdometry(config.odometry)
         self._tiles: TileWriter | None = None
-        self._statistics = RunStatistics()
         if extrinsic.warning:
             self._statistics.warnings.add(extrinsic.warning)
-        self._started = datetime.now(UTC)
-        self._began = time.perf_counter()
-        self._identity = run_identity(recording.info, dump_run_config(config, recording.info))
-        self._events, self._resumed = 0, 0
+        self._resumed = 0
         self._written_until_ns: int | None = None
-        self._odometry_ended: float | None = None
-        self._seconds = dict.fromkeys(("reading", "odometry", "writing", "merging"), 0.0)
-        self._summary_due = 0.0
-        self._compiled = 0
+        self.seconds["merging"] = 0.0
         self._registered = 0
         self._merged: int | None = None
-        self._stage = "odometry"
-        self._status = "starting"
 
     def resume(self) -> None:
         """Go on from the checkpoint in the folder.
@@ -167,115 +124,81 @@ class _Run:
         Scans that came after it are estimated again, and written where their rows are not there yet.
         """
         checkpoint = read_checkpoint(self._folder, self._identity)
-        self._written_until_ns = cut_to_whole_rows(self._folder, checkpoint.statistics.scans)
+        self._written_until_ns = cut_to_whole_rows(self._folder, checkpoint.statistics.count)
         self._odometry.restore(checkpoint.odometry)
-        self._statistics, self._registered = checkpoint.statistics, checkpoint.registered
-        self._events, self._resumed = checkpoint.events, checkpoint.resumed + 1
+        self._statistics = self.counts = checkpoint.statistics
+        self._registered = checkpoint.registered
+        self.events, self._resumed = checkpoint.events, checkpoint.resumed + 1
 
-    def execute(self, should_stop: Callable[[], bool]) -> RunSummary:
-        """Everything; see `run_odometry`."""
-        with atomic_file(self._folder.config) as file:
-            file.write(self._identity["config"].encode())
-        self._write_summary("running")
-        try:
-            state = self._process(should_stop)
-            self._odometry_ended = time.perf_counter()
-            if state == "finished" and not self._statistics.scans:
-                raise self._nothing_found()
-            self._merge_map()
-        except BaseException as problem:
-            named = str(problem) if isinstance(problem, BoxplusError) else f"{type(problem).__name__}: {problem}"
-            with suppress(OutputError):  # the disk may be full; then the facts of a moment ago stay
-                if isinstance(problem, KeyboardInterrupt):
-                    self._write_summary("interrupted")
-                else:
-                    self._write_summary("failed", named)
-            raise
-        return self._write_summary(state)
+    def open(self, stack: ExitStack) -> None:
+        """See `RunLoop.open`."""
+        map_config, after_ns = self._config.map, self._written_until_ns
+        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path, after_ns=after_ns))
+        self._scan_log = stack.enter_context(ScanLogWriter(self._folder.scans, go_on=after_ns is not None))
+        self._checkpoints = CheckpointWriter(self._folder.checkpoint)
+        if map_config.save:
+            tiles = TileWriter(self._folder.tiles, tile_size=map_config.tile_size, voxel=map_config.voxel)
+            self._tiles = stack.enter_context(tiles)
+            tiles.stored = TileStore.open(self._folder.tiles).point_count if self._resumed else 0
 
-    def _process(self, should_stop: Callable[[], bool]) -> State:
-        """Every event through the odometry, every estimate to disk."""
-        map_config = self._config.map
-        with ExitStack() as stack:
-            stack.enter_context(on_compilation(self._on_compilation))
-            after_ns = self._written_until_ns
-            trajectory = stack.enter_context(TrajectoryWriter(self._folder.path, after_ns=after_ns))
-            scan_log = stack.enter_context(ScanLogWriter(self._folder.scans, go_on=after_ns is not None))
-            checkpoints = CheckpointWriter(self._folder.checkpoint)
-            if map_config.save:
-                tiles = TileWriter(self._folder.tiles, tile_size=map_config.tile_size, voxel=map_config.voxel)
-                self._tiles = stack.enter_context(tiles)
-                tiles.stored = TileStore.open(self._folder.tiles).point_count if self._resumed else 0
-            events = iter(self._recording)
-            for _ in range(self._events):
-                next(events, None)
-            while not should_stop():
-                began = time.perf_counter()
-                event = next(events, None)
-                read = time.perf_counter()
-                self._seconds["reading"] += read - began
-                estimates = self._odometry.flush() if event is None else self._push(event)
-                self._seconds["odometry"] += time.perf_counter() - read
-                for estimate in estimates:
-                    self._keep(estimate, trajectory, scan_log)
-                self._show_progress()
-                if event is None:
-                    self._folder.checkpoint.unlink(missing_ok=True)
-                    return "finished"
-                self._events += 1
-                if checkpoints.is_due:
-                    checkpoints.write(self._checkpoint())
-                if time.perf_counter() > self._summary_due:
-                    self._write_summary("running")
-            checkpoints.write(self._checkpoint())
-        return "interrupted"
+    def between_events(self) -> None:
+        """See `RunLoop.between_events`."""
+        if self._checkpoints.is_due:
+            self._checkpoints.write(self._checkpoint())
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        if state == "finished":
+            self._folder.checkpoint.unlink(missing_ok=True)
+        else:
+            self._checkpoints.write(self._checkpoint())
 
     def _checkpoint(self) -> Checkpoint:
         odometry = self._odometry.snapshot()
-        return Checkpoint(self._identity, self._events, self._resumed, self._registered, self._statistics, odometry)
+        return Checkpoint(self._identity, self.events, self._resumed, self._registered, self._statistics, odometry)
 
-    def _push(self, event: Scan | ImuSamples) -> list[Estimate]:
+    def push(self, event: Scan | ImuSamples) -> list[Estimate]:
+        """See `RunLoop.push`."""
         self._statistics.add_event(event)
         return self._odometry.push_scan(event) if isinstance(event, Scan) else self._odometry.push_imu(event)
 
-    def _keep(self, estimate: Estimate, trajectory: TrajectoryWriter, scan_log: ScanLogWriter) -> None:
+    def flush(self) -> list[Estimate]:
+        """See `RunLoop.flush`."""
+        return self._odometry.flush()
+
+    def keep(self, estimate: Estimate) -> None:
         """Write one estimate. Points of a lost scan do not enter the map: nobody knows where they belong."""
         began = time.perf_counter()
         state = estimate.state
         is_new = self._written_until_ns is None or estimate.time_ns > self._written_until_ns
         if is_new:
-            trajectory.append(estimate.time_ns, state.R_world_imu, state.p_world_imu, estimate.pose_covariance, estimate.status)
-            scan_log.append(estimate)
+            pose = state.R_world_imu, state.p_world_imu
+            self._trajectory.append(estimate.time_ns, *pose, estimate.pose_covariance, estimate.status)
+            self._scan_log.append(estimate)
         if self._tiles is not None and estimate.status != "lost":
             if is_new:
                 self._tiles.append(estimate.points_world(), estimate.intensity)
             self._registered += len(estimate.p_lidar)
         self._statistics.add(estimate)
-        self._status = estimate.status
-        self._seconds["writing"] += time.perf_counter() - began
+        self.status = estimate.status
+        self.seconds["writing"] += time.perf_counter() - began
         if self._view is not None:
             self._view.show(estimate)
 
-    def _merge_map(self) -> None:
+    def finish(self) -> None:
+        """Merge the map."""
         settings = self._config.map
-        if self._tiles is None or not (settings.ply or settings.pcd) or not self._statistics.scans:
+        if self._tiles is None or not (settings.ply or settings.pcd) or not self._statistics.count:
             return
-        self._stage = "merging the map"
-        self._show_progress()
+        self.stage = "merging the map"
+        self.show_progress()
         began = time.perf_counter()
         ply, pcd = self._folder.map_ply if settings.ply else None, self._folder.map_pcd if settings.pcd else None
         self._merged = merge(self._folder.tiles, ply, pcd)
-        self._seconds["merging"] = time.perf_counter() - began
+        self.seconds["merging"] = time.perf_counter() - began
 
-    def _on_compilation(self, kernel: str) -> None:
-        self._compiled += 1
-        self._show_progress(kernel)
-
-    def _show_progress(self, compiling: str | None = None) -> None:
-        share, scans = self._recording.progress, self._statistics.scans
-        self._progress(Progress(share, scans, self._status, compiling, self._stage))
-
-    def _nothing_found(self) -> InputError:
+    def nothing_found(self) -> InputError:
+        """See `RunLoop.nothing_found`."""
         statistics = self._statistics
         reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
         reasons += self._odometry.time_steps
@@ -288,22 +211,17 @@ class _Run:
             "see 'boxplus inspect' for what is wrong with the recording",
         )
 
-    def _write_summary(self, state: State, error: str | None = None) -> RunSummary:
-        summary = self._summarize(state, error)
-        summary.write(self._folder.summary)
-        self._summary_due = time.perf_counter() + _SUMMARY_EVERY_S
-        return summary
-
-    def _summarize(self, state: State, error: str | None) -> RunSummary:
+    def summarize(self, state: State, error: str | None) -> RunSummary:
+        """See `RunLoop.summarize`."""
         statistics, start, info = self._statistics, self._odometry.start, self._recording.info
         origin = statistics.first_time_ns
         return RunSummary(
-            versions=_versions(),
+            versions=versions("rosbags"),
             state=state,
             error=error,
             process=os.getpid(),
             resumed=self._resumed,
-            started=self._started,
+            started=self.started,
             updated=datetime.now(UTC),
             recording=RecordingFacts(
                 path=printable(str(info.path.resolve())),
@@ -320,10 +238,10 @@ class _Run:
                 text=self._extrinsic.text,
                 estimation=self._config.odometry.extrinsic_estimation,
                 T_imu_lidar_start=self._extrinsic.T_imu_lidar.tolist(),
-                T_imu_lidar_end=statistics.T_imu_lidar.tolist() if statistics.scans else None,
+                T_imu_lidar_end=statistics.T_imu_lidar.tolist() if statistics.count else None,
             ),
             start=None if start is None else StartFacts(kind=start.kind, text=start.text, duration_s=start.duration_s),
-            scans=statistics.scans,
+            scans=statistics.count,
             status=dict(statistics.status),
             first_time_ns=origin,
             last_time_ns=statistics.last_time_ns,
@@ -348,7 +266,7 @@ class _Run:
                 rejected_points=self._tiles.rejected if self._tiles is not None else 0,
                 voxel_m=self._config.map.voxel,
             ),
-            peak_memory_mb=_peak_memory_mb(),
+            peak_memory_mb=peak_memory_mb(),
             warnings=[
                 *(WarningFacts(text=text, count=1) for text in self._odometry.time_steps),
                 *statistics.status_warnings(),
@@ -362,32 +280,14 @@ class _Run:
         )
 
     def _timing(self) -> TimingFacts:
-        now = time.perf_counter()
-        elapsed = (self._odometry_ended or now) - self._began
         return TimingFacts(
-            scan_ms=self._statistics.scan_ms(),
+            scan_ms=self._statistics.estimate_ms(),
             stages_ms=self._statistics.stages_ms(),
-            reading_s=self._seconds["reading"],
-            odometry_s=self._seconds["odometry"],
-            writing_s=self._seconds["writing"],
-            merging_s=self._seconds["merging"],
-            total_s=now - self._began,
-            real_time_factor=self._statistics.duration_s / elapsed,
-            compiled_kernels=self._compiled,
+            reading_s=self.seconds["reading"],
+            odometry_s=self.seconds["odometry"],
+            writing_s=self.seconds["writing"],
+            merging_s=self.seconds["merging"],
+            total_s=time.perf_counter() - self.began,
+            real_time_factor=self.real_time_factor(),
+            compiled_kernels=self.compiled,
         )
-
-
-@functools.cache
-def _versions() -> dict[str, str]:
-    versions = {"boxplus": boxplus.__version__, "python": platform.python_version(), "platform": platform.platform()}
-    return versions | {name: metadata.version(name) for name in ("numpy", "numba", "scipy", "rosbags")}
-
-
-def _peak_memory_mb() -> float | None:
-    """Of this process, where the system tells."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    unit = 1.0 if sys.platform == "darwin" else 1024.0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

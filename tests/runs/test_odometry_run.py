@@ -26,8 +26,9 @@ from boxplus.recordings.recording import Event, Recording
 from boxplus.runs import odometry_run
 from boxplus.runs.config import load_run_config
 from boxplus.runs.extrinsic import choose_extrinsic
-from boxplus.runs.odometry_run import Progress, run_odometry
+from boxplus.runs.odometry_run import run_odometry
 from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.run_loop import Progress
 from boxplus.runs.run_summary import RunSummary, read_summary
 from boxplus.runs.scan_log import SHARES, read_scan_log
 from boxplus.sensors.imu import ImuSamples
@@ -119,7 +120,7 @@ def test_without_map(tmp_path: Path) -> None:
 def test_asked_to_stop_the_results_are_complete(tmp_path: Path) -> None:
     seen: list[Progress] = []
     summary = run_odometry(
-        walk(), tmp_path / "out", progress=seen.append, should_stop=lambda: bool(seen) and seen[-1].scans >= 15
+        walk(), tmp_path / "out", progress=seen.append, should_stop=lambda: bool(seen) and seen[-1].count >= 15
     )
     assert summary.state == "interrupted"
     assert 15 <= summary.scans < 29
@@ -131,7 +132,7 @@ def test_asked_to_stop_the_results_are_complete(tmp_path: Path) -> None:
 
 def test_keyboard_interrupt_leaves_a_readable_folder(tmp_path: Path) -> None:
     def interrupt(progress: Progress) -> None:
-        if progress.scans >= 15:
+        if progress.count >= 15:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -183,7 +184,7 @@ def test_full_disk_is_told_and_what_was_written_stays(tmp_path: Path, monkeypatc
     write, full = os.write, [False]
 
     def fill(progress: Progress) -> None:
-        full[0] = full[0] or progress.scans >= 15
+        full[0] = full[0] or progress.count >= 15
 
     def limited(file: int, data: bytes) -> int:
         if full[0]:
