@@ -11,11 +11,15 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
+from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.config import MapConfig
 from boxplus.simulation import simulate, write_recording
+from boxplus.simulation.cameras import make_rig, simulate_cameras, write_camera_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from tests.small_problems import write_small_files
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,10 +40,12 @@ COMMANDS = [line for block in blocks(ROOT / "README.md", "sh") for line in block
 
 @pytest.fixture(scope="session")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files that the README speaks of: flight.bag, flight.gt.tum, scene.txt.bz2 and loops.g2o."""
+    """A folder with the files that the README speaks of: flight.bag, flight.gt.tum, room, scene.txt.bz2 and loops.g2o."""
     folder = tmp_path_factory.mktemp("flight")
     write_small_files(folder)
     write_recording(simulate("walk", duration_s=6.0), folder / "flight", "ros1")
+    cameras = simulate_cameras("room", 1, duration_s=3.2, rig=make_rig("stereo", None, 0.5, 15.0))
+    write_camera_recording(cameras, folder / "room", "euroc")
     return folder
 
 
@@ -99,12 +105,15 @@ def test_python_of_the_pages_runs(page: Path, workspace: Path) -> None:
 
 def test_commands_of_the_readme_run(workspace: Path) -> None:
     commands = [shlex.split(command) for command in COMMANDS if not command.startswith("make ")]
-    assert {command[1] for command in commands} == {"inspect", "lio", "eval", "ba", "pgo"}
+    assert {command[1] for command in commands} == {"inspect", "lio", "vio", "eval", "ba", "pgo"}
     for program, *arguments in commands:
         assert program == ".venv/bin/boxplus"
         run([sys.executable, "-c", "from boxplus.cli import main; main()", *arguments], workspace)
     assert {"report.html", "trajectory.tum", "map.ply", "config.yaml", "run.json"} <= {
         path.name for path in (workspace / "flight").iterdir()
+    }
+    assert {"report.html", "trajectory.tum", "landmarks.ply", "evaluation.json"} <= {
+        p.name for p in (workspace / "room_run").iterdir()
     }
     for folder, result in (("scene_boxplus", "adjusted.txt.bz2"), ("loops_boxplus", "optimized.g2o")):
         assert {"report.html", "run.json", result} <= {path.name for path in (workspace / folder).iterdir()}
@@ -123,11 +132,18 @@ def test_every_page_is_in_the_index() -> None:
     assert not [page.name for page in pages if page.name != "index.md" and f"({page.name})" not in index]
 
 
-@pytest.mark.parametrize("model", [LioConfig, RecordingOptions, MapConfig])
-def test_configuration_page_names_every_setting_and_its_default(
-    model: type[LioConfig] | type[RecordingOptions] | type[MapConfig],
-) -> None:
-    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("name_of_page", "model"),
+    [
+        ("configuration", LioConfig),
+        ("configuration", RecordingOptions),
+        ("configuration", MapConfig),
+        ("vio_configuration", VioConfig),
+        ("vio_configuration", CameraRecordingOptions),
+    ],
+)
+def test_configuration_page_names_every_setting_and_its_default(name_of_page: str, model: type[BaseModel]) -> None:
+    page = (ROOT / "docs" / f"{name_of_page}.md").read_text(encoding="utf-8")
     rows = {cells[0].strip(" `"): cells[1].strip() for cells in re.findall(r"^\| (`\w+`) \| ([^|]+) \|", page, re.MULTILINE)}
     for name, field in model.model_fields.items():
         value = field.default

@@ -15,6 +15,7 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_UNTRUSTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
+    "vio": ("boxplus.cli.vio:vio", "Turn a recording of cameras and an IMU into a trajectory, landmarks and a report."),
     "vo": ("boxplus.cli.vo:vo", "Turn a recording of an RGB-D or a stereo camera into a trajectory and a report."),
     "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),
     "pgo": ("boxplus.cli.pgo:pgo", "Optimise the poses of a g2o or TORO pose graph."),
@@ -74,7 +75,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # brackets in help texts are units and extras, not markup
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="boxplus: LiDAR-inertial odometry, bundle adjustment, pose graphs, and their tools.",
+    help="boxplus: LiDAR-inertial and visual-inertial odometry, bundle adjustment, pose graphs, and their tools.",
 )
 
 

@@ -8,12 +8,13 @@ from typing import Annotated
 import typer
 
 
-def report(folder: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio'.", metavar="FOLDER")]) -> None:
+def report(
+    folder: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio' or 'boxplus vio'.", metavar="FOLDER")],
+) -> None:
     """Draw the report of a run again, also of an interrupted one, and say how far the run came."""
     from boxplus.errors import printable
-    from boxplus.report import write_report
-    from boxplus.report.run_data import load_run
+    from boxplus.report import load_report, write_report
 
-    data = load_run(folder)
+    data = load_report(folder)
     typer.echo(printable(data.summary.describe_state()))
     typer.echo(str(write_report(data)))

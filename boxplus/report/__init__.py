@@ -2,30 +2,51 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from boxplus.report.run_data import RunData
+    from boxplus.report.visual_data import VisualData
 
 
-def write_report(run: str | Path | RunData) -> Path:
+def write_report(run: str | Path | RunData | VisualData) -> Path:
     """Draw `report.html` and the pictures in `plots/` from the output folder of a run, finished or not.
 
     Args:
-        run: the folder, or what `run_data.load_run` read from it.
+        run: the folder, or what `load_report` read from it.
 
     Returns:
         The path of the report.
 
     Raises:
-        InputError: no run's folder, or a run without a single scan.
+        InputError: no run's folder, or a run without a single estimate.
         OutputError: the files cannot be written.
     """
     from boxplus.report.page import write_page
     from boxplus.report.plots import write_plots
-    from boxplus.report.run_data import RunData, load_run
+    from boxplus.report.run_data import RunData
+    from boxplus.report.visual_page import write_visual_report
 
-    data = run if isinstance(run, RunData) else load_run(run)
+    data = load_report(run) if isinstance(run, (str, Path)) else run
+    if not isinstance(data, RunData):
+        return write_visual_report(data)
     write_plots(data)
     return write_page(data)
+
+
+def load_report(folder: str | Path) -> RunData | VisualData:
+    """What the report of a run shows, of any kind of odometry.
+
+    Raises:
+        InputError: no run's folder, or a run without a single estimate.
+    """
+    from boxplus.report.run_data import load_run
+    from boxplus.report.visual_data import load_visual_run
+    from boxplus.runs.output_folder import SUMMARY, program_of
+
+    with suppress(OSError):
+        if program_of(Path(folder) / SUMMARY) == "boxplus vio":
+            return load_visual_run(folder)
+    return load_run(folder)

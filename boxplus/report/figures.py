@@ -11,13 +11,14 @@ from plotly.subplots import make_subplots
 
 from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
 from boxplus.report.run_data import RunData
+from boxplus.report.timeline import Timeline
 from boxplus.runs.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 
 
-def map_and_trajectory(data: RunData) -> go.Figure:
+def map_and_trajectory(data: Timeline) -> go.Figure:
     """The map, coloured by height, and the trajectory, coloured by status."""
     figure = go.Figure()
     points = data.map_points
@@ -83,6 +84,25 @@ def status_and_axes(data: RunData) -> go.Figure:
     """The status, and how much of each axis came from the LiDAR."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, row_heights=[0.1, 0.9], vertical_spacing=0.03)
     rows = shown_rows(data)
+    add_status(figure, data, rows)
+    figure.add_heatmap(
+        x=data.seconds[rows],
+        y=AXES,
+        z=data.log.matrix(SHARES)[rows].T,
+        zmin=0.0,
+        zmax=1.0,
+        colorscale="Cividis",
+        colorbar={"title": {"text": "share from LiDAR", "side": "right"}, "thickness": 12, "tickformat": ".0%"},
+        hovertemplate="%{y}, %{x:.1f} s: %{z:.0%} measured<extra></extra>",
+        row=2,
+        col=1,
+    )
+    figure.update_yaxes(autorange="reversed", row=2, col=1)
+    return over_time(figure, data, 300, bottom_row=2)
+
+
+def add_status(figure: go.Figure, data: Timeline, rows: NDArray[np.intp]) -> None:
+    """A strip in the colours of the status, in the first row of the figure."""
     names = list(STATUS)
     codes = [[names.index(status) for status in data.status[rows]]]
     scale = [[(index + step) / 3, STATUS[name]] for index, name in enumerate(names) for step in (0, 1)]
@@ -99,44 +119,30 @@ def status_and_axes(data: RunData) -> go.Figure:
         row=1,
         col=1,
     )
-    figure.add_heatmap(
-        x=data.seconds[rows],
-        y=AXES,
-        z=data.log.matrix(SHARES)[rows].T,
-        zmin=0.0,
-        zmax=1.0,
-        colorscale="Cividis",
-        colorbar={"title": {"text": "share from LiDAR", "side": "right"}, "thickness": 12, "tickformat": ".0%"},
-        hovertemplate="%{y}, %{x:.1f} s: %{z:.0%} measured<extra></extra>",
-        row=2,
-        col=1,
-    )
-    figure.update_yaxes(autorange="reversed", row=2, col=1)
-    return _over_time(figure, data, 300, bottom_row=2)
 
 
-def timing(data: RunData) -> go.Figure:
-    """Milliseconds per scan, stacked by stage."""
+def timing(data: Timeline, unit: str = "scan") -> go.Figure:
+    """Milliseconds per estimate, stacked by stage."""
     figure, rows = go.Figure(), shown_rows(data)
     for color, (stage, milliseconds) in zip(cycle(SERIES), data.log.pairs("timing_ms").items(), strict=False):
-        _add_area(figure, data, rows, milliseconds, stage, color, "%{y:.2f} ms")
+        add_area(figure, data, rows, milliseconds, stage, color, "%{y:.2f} ms")
     total = data.log.column("total_ms")
     top = 1.15 * float(np.percentile(total, 99.5)) if len(total) else 1.0
-    figure.update_yaxes(title_text="ms per scan", range=[0.0, max(top, 1e-3)])
-    return _over_time(figure, data, 280)
+    figure.update_yaxes(title_text=f"ms per {unit}", range=[0.0, max(top, 1e-3)])
+    return over_time(figure, data, 280)
 
 
-def velocity(data: RunData) -> go.Figure:
+def velocity(data: Timeline) -> go.Figure:
     """Velocity of the IMU in the world."""
     figure, rows = go.Figure(), shown_rows(data)
     values = data.log.column("velocity")[rows]
     _add_xyz(figure, data.seconds[rows], values)
-    _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "speed", INK)
+    add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "speed", INK)
     figure.update_yaxes(title_text="m/s")
-    return _over_time(figure, data, 260)
+    return over_time(figure, data, 260)
 
 
-def biases(data: RunData) -> go.Figure:
+def biases(data: Timeline) -> go.Figure:
     """Biases of gyroscope and accelerometer with their standard deviations."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
@@ -146,7 +152,7 @@ def biases(data: RunData) -> go.Figure:
         figure.update_yaxes(range=_range_of(values), row=row, col=1)
     figure.update_yaxes(title_text="gyroscope [deg/s]", row=1, col=1)
     figure.update_yaxes(title_text="accelerometer [m/s²]", row=2, col=1)
-    return _over_time(figure, data, 400, bottom_row=2)
+    return over_time(figure, data, 400, bottom_row=2)
 
 
 def gravity(data: RunData) -> go.Figure:
@@ -154,14 +160,14 @@ def gravity(data: RunData) -> go.Figure:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
     values = data.log.column("gravity")[rows]
-    _add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "magnitude", SERIES[0], row=1)
-    _add_line(figure, data.seconds[rows], gravity_tilt_deg(values), "direction, from the first", SERIES[3], row=2)
+    add_line(figure, data.seconds[rows], np.linalg.norm(values, axis=1), "magnitude", SERIES[0], row=1)
+    add_line(figure, data.seconds[rows], gravity_tilt_deg(values), "direction, from the first", SERIES[3], row=2)
     figure.update_yaxes(title_text="m/s²", row=1, col=1, tickformat=".3f")
     figure.update_yaxes(title_text="deg", row=2, col=1, rangemode="tozero")
-    return _over_time(figure, data, 300, bottom_row=2)
+    return over_time(figure, data, 300, bottom_row=2)
 
 
-def sigmas(data: RunData) -> go.Figure:
+def sigmas(data: Timeline) -> go.Figure:
     """Standard deviations of the pose."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
@@ -169,21 +175,21 @@ def sigmas(data: RunData) -> go.Figure:
     _add_xyz(figure, data.seconds[rows], 100.0 * data.sigma[rows, 3:], row=2, legend=False)
     figure.update_yaxes(title_text="rotation [deg]", row=1, col=1, rangemode="tozero")
     figure.update_yaxes(title_text="position [cm]", row=2, col=1, rangemode="tozero")
-    return _over_time(figure, data, 380, bottom_row=2)
+    return over_time(figure, data, 380, bottom_row=2)
 
 
 def points(data: RunData) -> go.Figure:
     """Points after the voxel filter: used, and rejected by reason; and the residuals of the used ones."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
     rows = shown_rows(data)
-    _add_area(figure, data, rows, data.log.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
+    add_area(figure, data, rows, data.log.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
     for color, (reason, count) in zip(cycle(REJECTED), data.log.pairs("rejected").items(), strict=False):
-        _add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} points", row=1)
+        add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} points", row=1)
     residual_cm = 100.0 * data.log.column("residual_rms")[rows]
-    _add_line(figure, data.seconds[rows], residual_cm, "residual (rms)", FAINT, row=2)
+    add_line(figure, data.seconds[rows], residual_cm, "residual (rms)", FAINT, row=2)
     figure.update_yaxes(title_text="points", row=1, col=1)
     figure.update_yaxes(title_text="cm", row=2, col=1, rangemode="tozero")
-    return _over_time(figure, data, 380, bottom_row=2)
+    return over_time(figure, data, 380, bottom_row=2)
 
 
 def extrinsic(data: RunData) -> go.Figure:
@@ -192,11 +198,11 @@ def extrinsic(data: RunData) -> go.Figure:
     rows = shown_rows(data)
     q = np.stack([data.log.column(f"imu_lidar_q{part}") for part in "wxyz"], axis=1)[rows]
     angle = 2.0 * np.degrees(np.arccos(np.clip(np.abs(q @ q[0]), 0.0, 1.0)))
-    _add_line(figure, data.seconds[rows], angle, "rotation, from the first", SERIES[3], row=1)
+    add_line(figure, data.seconds[rows], angle, "rotation, from the first", SERIES[3], row=1)
     _add_xyz(figure, data.seconds[rows], 100.0 * data.log.column("imu_lidar_p")[rows], row=2)
     figure.update_yaxes(title_text="deg", row=1, col=1, rangemode="tozero")
     figure.update_yaxes(title_text="position [cm]", row=2, col=1)
-    return _over_time(figure, data, 340, bottom_row=2)
+    return over_time(figure, data, 340, bottom_row=2)
 
 
 def gaps(data: RunData) -> go.Figure:
@@ -216,10 +222,10 @@ def gaps(data: RunData) -> go.Figure:
         )
     figure.update_layout(barmode="overlay")
     figure.update_yaxes(title_text="gap [s]", rangemode="tozero")
-    return _over_time(figure, data, 220)
+    return over_time(figure, data, 220)
 
 
-def _add_line(
+def add_line(
     figure: go.Figure,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -228,6 +234,7 @@ def _add_line(
     row: int | None = None,
     legend: bool = True,
 ) -> None:
+    """One line."""
     place = {} if row is None else {"row": row, "col": 1}
     line = {"color": color, "width": 1.4}
     hover = f"{name}: %{{y:.4g}}<extra></extra>"
@@ -253,12 +260,12 @@ def _add_xyz(
             figure.add_scatter(
                 x=np.concatenate([x, x[::-1]]), y=around, legendgroup=name, showlegend=False, hoverinfo="skip", **band, **place
             )
-        _add_line(figure, x, values[:, axis], name, color, row, legend)
+        add_line(figure, x, values[:, axis], name, color, row, legend)
 
 
-def _add_area(
+def add_area(
     figure: go.Figure,
-    data: RunData,
+    data: Timeline,
     rows: NDArray[np.intp],
     values: NDArray[np.float64],
     name: str,
@@ -266,6 +273,7 @@ def _add_area(
     unit: str,
     row: int | None = None,
 ) -> None:
+    """A layer on those before."""
     place = {} if row is None else {"row": row, "col": 1}
     figure.add_scatter(
         x=data.seconds[rows],
@@ -286,7 +294,7 @@ def _range_of(values: NDArray[np.float64]) -> list[float]:
     return [low - margin, high + margin]
 
 
-def _over_time(figure: go.Figure, data: RunData, height: int, bottom_row: int | None = None) -> go.Figure:
+def over_time(figure: go.Figure, data: Timeline, height: int, bottom_row: int | None = None) -> go.Figure:
     """The look of all figures over time."""
     figure.update_layout(
         height=height,
@@ -300,5 +308,5 @@ def _over_time(figure: go.Figure, data: RunData, height: int, bottom_row: int | 
     figure.update_xaxes(showgrid=True, gridcolor=GRID, zeroline=False, range=[0.0, float(max(data.seconds[-1], 1e-3))])
     figure.update_yaxes(showgrid=True, gridcolor=GRID, zerolinecolor=GRID)
     place = {} if bottom_row is None else {"row": bottom_row, "col": 1}
-    figure.update_xaxes(title_text="time since the first scan [s]", **place)
+    figure.update_xaxes(title_text="time since the first estimate [s]", **place)
     return figure

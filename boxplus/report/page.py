@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from html import escape
 from pathlib import Path
 
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.runs.run_facts import Gap
+from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.runs.run_summary import Matrix
 
 
@@ -83,13 +84,17 @@ def _head(data: RunData) -> str:
 
 
 def _warnings(data: RunData) -> str:
+    return warnings_section([*warning_lines(data.summary.warnings), *(f"map: {escape(remark)}" for remark in data.map_remarks)])
+
+
+def warning_lines(warnings: Iterable[WarningFacts]) -> list[str]:
+    """Each with how often it came."""
     lines = []
-    for warning in data.summary.warnings:
+    for warning in warnings:
         when = "" if warning.first_s is None else f", first at {warning.first_s:.1f} s"
         times = f" <small>({warning.count} times{when})</small>" if warning.count > 1 else ""
         lines.append(f"{escape(warning.text)}{times}")
-    lines += [f"map: {escape(remark)}" for remark in data.map_remarks]
-    return warnings_section(lines)
+    return lines
 
 
 def _weak_table(data: RunData) -> str:
@@ -123,9 +128,9 @@ def _stage_table(data: RunData) -> str:
 def _extrinsic(data: RunData) -> str:
     facts = data.summary.extrinsic
     estimation = {"off": "kept as it was", "on": "refined throughout", "gated": "refined while the motion made it observable"}
-    matrices = f"<td><pre>{_matrix(facts.T_imu_lidar_start)}</pre></td>"
+    matrices = f"<td><pre>{matrix_text(facts.T_imu_lidar_start)}</pre></td>"
     if facts.T_imu_lidar_end is not None and facts.estimation != "off":
-        matrices += f"<td><pre>{_matrix(facts.T_imu_lidar_end)}</pre></td>"
+        matrices += f"<td><pre>{matrix_text(facts.T_imu_lidar_end)}</pre></td>"
     table = f"<table><tr><th>T_imu_lidar at the start</th><th>at the end</th></tr><tr>{matrices}</tr></table>"
     what = f"{facts.source}, {estimation.get(facts.estimation, '')}"
     text = f"Pose of the LiDAR in the IMU frame (p_imu = T_imu_lidar p_lidar): {what}. {facts.text}"
@@ -134,7 +139,8 @@ def _extrinsic(data: RunData) -> str:
     return figure_section("Extrinsic", text, figures.extrinsic(data), table)
 
 
-def _matrix(T: Matrix) -> str:
+def matrix_text(T: Matrix) -> str:
+    """A matrix in rows."""
     return "\n".join("  ".join(f"{value: .5f}" for value in row) for row in T)
 
 
@@ -167,15 +173,19 @@ def _facts(data: RunData) -> str:
         ("memory", f"{summary.peak_memory_mb:.0f} MB at most" if summary.peak_memory_mb is not None else "–"),
         ("versions", ", ".join(f"{name} {version}" for name, version in summary.versions.items())),
     ]
+    return f"<section><h2>Run</h2>{html_table(rows)}</section>{evidence_table(recording.evidence, data.folder.config)}"
+
+
+def evidence_table(found: Iterable[Mapping[str, str]], config: Path) -> str:
+    """How the recording was read, and the settings."""
     evidence = "".join(
         f'<tr><td class="key">{escape(e["key"])}</td><td>{escape(e["value"])}</td>'
         f'<td class="{escape(e["verdict"])}">{escape(e["verdict"])}</td><td>{escape(e["text"])}</td></tr>'
-        for e in recording.evidence
+        for e in found
     )
     head = "<tr><th>reading</th><th>found</th><th></th><th>evidence</th></tr>"
-    settings = escape(data.folder.config.read_text(encoding="utf-8", errors="replace")) if data.folder.config.is_file() else ""
+    settings = escape(config.read_text(encoding="utf-8", errors="replace")) if config.is_file() else ""
     return (
-        f"<section><h2>Run</h2>{html_table(rows)}</section>"
         f"<section><h2>How the recording was read</h2><table>{head}{evidence}</table>"
         f"<details><summary>config.yaml</summary><pre>{settings}</pre></details></section>"
     )

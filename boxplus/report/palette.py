@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.report.run_data import RunData
+from boxplus.report.timeline import Timeline
 
 STATUS = {"ok": "#2f7d5b", "weak": "#e09f3e", "lost": "#c1443c"}
 XYZ = ("#b5443c", "#3a8f4d", "#3568a8")
@@ -19,7 +19,7 @@ INK, FAINT, GRID = "#22303c", "#6b7a8f", "#e4e8ec"
 _MOST_ROWS = 4000
 
 
-def shown_rows(data: RunData) -> NDArray[np.intp]:
+def shown_rows(data: Timeline) -> NDArray[np.intp]:
     """The scans to draw over time: all, or of a long run an even selection with the slowest and the troubled ones kept."""
     count = len(data.seconds)
     if count <= _MOST_ROWS:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
 from boxplus.report.run_data import RunData
+from boxplus.report.timeline import Timeline
 from boxplus.runs.run_folder import PLOTS
 from boxplus.runs.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
@@ -25,13 +30,24 @@ def write_plots(data: RunData) -> None:
     Raises:
         OutputError: they cannot be written.
     """
-    make_folder(data.folder.plots)
-    for name, draw in zip(PLOTS, (_trajectory, _status, _timing, _biases), strict=True):
-        with atomic_file(data.folder.plots / name) as file:
-            draw(data).savefig(file, format="png", dpi=_DPI)
+    way = f"{data.summary.path_length_m:.1f} m in {data.summary.duration_s:.1f} s, from above"
+    pictures = (trajectory_picture(data, way), _status(data), _timing(data), biases_picture(data))
+    write_pictures(data.folder.plots, dict(zip(PLOTS, pictures, strict=True)))
 
 
-def _trajectory(data: RunData) -> Figure:
+def write_pictures(folder: Path, pictures: Mapping[str, Figure]) -> None:
+    """Write figures under their names.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    make_folder(folder)
+    for name, figure in pictures.items():
+        with atomic_file(folder / name) as file:
+            figure.savefig(file, format="png", dpi=_DPI)
+
+
+def trajectory_picture(data: Timeline, title: str) -> Figure:
     """From above, over the map."""
     figure = Figure(figsize=(8.0, 8.0), layout="constrained")
     axes = figure.subplots()
@@ -55,9 +71,9 @@ def _trajectory(data: RunData) -> Figure:
     axes.scatter(path[0, 0], path[0, 1], s=45, facecolors="white", edgecolors=INK, label="start", zorder=4)
     axes.scatter(path[-1, 0], path[-1, 1], s=45, color=INK, marker="X", label="end", zorder=4)
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.set_title(f"{data.summary.path_length_m:.1f} m in {data.summary.duration_s:.1f} s, from above", loc="left", fontsize=11)
+    axes.set_title(title, loc="left", fontsize=11)
     axes.legend(loc="upper right", framealpha=0.9, fontsize=9)
-    _plain(axes)
+    plain(axes)
     return figure
 
 
@@ -66,6 +82,17 @@ def _status(data: RunData) -> Figure:
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     strip, shares = figure.subplots(2, 1, sharex=True, height_ratios=[0.12, 1.0])
     rows = shown_rows(data)
+    edges = status_strip(strip, data, rows)
+    mesh = shares.pcolormesh(edges, np.arange(7), data.log.matrix(SHARES)[rows].T, cmap="cividis", vmin=0.0, vmax=1.0)
+    shares.set_yticks(np.arange(6) + 0.5, AXES)
+    shares.invert_yaxis()
+    shares.set_xlabel("time since the first estimate [s]")
+    figure.colorbar(mesh, ax=shares, label="share from LiDAR", aspect=18)
+    return figure
+
+
+def status_strip(strip: Axes, data: Timeline, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The status over time in its colours; returns the borders of the cells."""
     edges = _edges(data.seconds[rows])
     codes = np.array([[list(STATUS).index(status) for status in data.status[rows]]])
     strip.pcolormesh(edges, [0, 1], codes, cmap=ListedColormap(list(STATUS.values())), vmin=-0.5, vmax=2.5)
@@ -73,12 +100,7 @@ def _status(data: RunData) -> Figure:
     for name, color in STATUS.items():
         strip.plot([], [], "s", color=color, label=f"{name} ({int((data.status == name).sum())})")
     strip.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, fontsize=9, borderaxespad=0.2)
-    mesh = shares.pcolormesh(edges, np.arange(7), data.log.matrix(SHARES)[rows].T, cmap="cividis", vmin=0.0, vmax=1.0)
-    shares.set_yticks(np.arange(6) + 0.5, AXES)
-    shares.invert_yaxis()
-    shares.set_xlabel("time since the first scan [s]")
-    figure.colorbar(mesh, ax=shares, label="share from LiDAR", aspect=18)
-    return figure
+    return edges
 
 
 def _timing(data: RunData) -> Figure:
@@ -99,13 +121,13 @@ def _timing(data: RunData) -> Figure:
         axes.axhline(scan.median, color=INK, linewidth=0.9, linestyle="--")
         text = f"median {scan.median:.1f} ms, 99th percentile {scan.p99:.1f} ms, largest {scan.max:.1f} ms"
         axes.set_title(text, loc="left", fontsize=11)
-    axes.set(xlabel="time since the first scan [s]", ylabel="ms per scan")
+    axes.set(xlabel="time since the first estimate [s]", ylabel="ms per scan")
     axes.margins(x=0.0)
-    _plain(axes)
+    plain(axes)
     return figure
 
 
-def _biases(data: RunData) -> Figure:
+def biases_picture(data: Timeline) -> Figure:
     """Biases of gyroscope and accelerometer, with one standard deviation."""
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
     rows = shown_rows(data)
@@ -120,9 +142,9 @@ def _biases(data: RunData) -> Figure:
         axes.set_ylim(values.min() - margin, values.max() + margin)
         axes.set_ylabel(label)
         axes.margins(x=0.0)
-        _plain(axes)
+        plain(axes)
     figure.axes[0].legend(ncols=3, loc="upper right", fontsize=9, frameon=False)
-    figure.axes[1].set_xlabel("time since the first scan [s]")
+    figure.axes[1].set_xlabel("time since the first estimate [s]")
     return figure
 
 
@@ -134,7 +156,8 @@ def _edges(seconds: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
     return np.concatenate([[2 * seconds[0] - middle[0]], middle, [2 * seconds[-1] - middle[-1]]])
 
 
-def _plain(axes: Axes) -> None:
+def plain(axes: Axes) -> None:
+    """The look of all axes."""
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

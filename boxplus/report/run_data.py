@@ -73,7 +73,7 @@ def load_run(folder: str | Path) -> RunData:
         summary=_counted(summary, scans, trajectory.p[:count]),
         seconds=(scans.time_ns - scans.time_ns[0]) * 1e-9,
         position=trajectory.p[:count],
-        sigma=_sigmas(trajectory, count),
+        sigma=sigmas_of(trajectory, count),
         log=scans,
         map_points=points,
         map_remarks=remarks,
@@ -96,7 +96,8 @@ def _counted(summary: RunSummary, scans: RowLog, position: NDArray[np.float64]) 
     return summary.model_copy(update=facts)
 
 
-def _sigmas(trajectory: Trajectory, count: int) -> NDArray[np.float64]:
+def sigmas_of(trajectory: Trajectory, count: int) -> NDArray[np.float64]:
+    """(count, 6) standard deviations of the first poses: rotation [rad], position [m]."""
     if trajectory.covariance is None:
         return np.zeros((count, 6))
     return np.sqrt(np.maximum(np.diagonal(trajectory.covariance[:count], axis1=1, axis2=2), 0.0))

@@ -79,7 +79,7 @@ def _has_to_be_cleared(
             f"other files in {path}",
             "choose another folder with --output",
         )
-    earlier = _program(path / SUMMARY)
+    earlier = program_of(path / SUMMARY)
     if not overwrite and (earlier != program or holds_results()):
         raise InputError(
             "a new or empty output folder",
@@ -93,7 +93,7 @@ def _has_to_be_cleared(
     return True
 
 
-def _program(summary: Path) -> str | None:
+def program_of(summary: Path) -> str | None:
     """Who wrote a summary; None where it cannot be read."""
     try:
         found = json.loads(summary.read_bytes())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +18,8 @@ _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+
 
 
 @dataclass(frozen=True, slots=True)
-class RunFolder:
-    """The paths of a run's results.
+class OdometryFolder:
+    """The paths of the results that every odometry run has.
 
     Attributes:
         path: the folder.
@@ -38,6 +38,42 @@ class RunFolder:
         return self.path / "config.yaml"
 
     @property
+    def trajectory(self) -> Path:
+        """The trajectory with covariance and status; `.tum` and `.kitti.txt` lie beside it."""
+        return self.path / "trajectory.csv"
+
+    @property
+    def report(self) -> Path:
+        """The report."""
+        return self.path / "report.html"
+
+    @property
+    def plots(self) -> Path:
+        """Folder of the pictures."""
+        return self.path / "plots"
+
+    def existing(self, more: Iterable[Path], pictures: Iterable[str]) -> Iterator[Path]:
+        """Of the files that every run writes, `more` and `pictures`, those that are there, half-written ones too."""
+        top = [self.summary, self.config, self.report, *more]
+        top += [self.trajectory.with_name(f"trajectory.{ending}") for ending in ("tum", "kitti.txt", "csv")]
+        top += [self.plots / name for name in pictures]
+        for path in top:
+            yield from (candidate for candidate in (path, path.with_name(path.name + TEMPORARY_SUFFIX)) if candidate.is_file())
+
+    def holds_estimates(self) -> bool:
+        """Whether the trajectory has a single row; a killed run may have written rows that its `run.json` does not count."""
+        try:
+            with self.trajectory.open("rb") as file:
+                return sum(1 for _ in zip(file, range(2), strict=False)) > 1
+        except OSError:
+            return False
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder(OdometryFolder):
+    """The paths of the results of `boxplus lio`."""
+
+    @property
     def scans(self) -> Path:
         """One row a scan: velocity, biases, diagnosis, timing."""
         return self.path / "scans.csv"
@@ -46,11 +82,6 @@ class RunFolder:
     def checkpoint(self) -> Path:
         """From where a killed run can go on; gone when it has come to its end."""
         return self.path / "checkpoint.npz"
-
-    @property
-    def trajectory(self) -> Path:
-        """The trajectory with covariance and status; `.tum` and `.kitti.txt` lie beside it."""
-        return self.path / "trajectory.csv"
 
     @property
     def tiles(self) -> Path:
@@ -67,23 +98,9 @@ class RunFolder:
         """The merged map, in the other format."""
         return self.path / "map.pcd"
 
-    @property
-    def report(self) -> Path:
-        """The report."""
-        return self.path / "report.html"
-
-    @property
-    def plots(self) -> Path:
-        """Folder of the pictures."""
-        return self.path / "plots"
-
     def own_files(self) -> Iterator[Path]:
         """The files in the folder that a run writes."""
-        top = [self.summary, self.config, self.scans, self.map_ply, self.map_pcd, self.report, self.checkpoint]
-        top += [self.trajectory.with_name(f"trajectory.{ending}") for ending in ("tum", "kitti.txt", "csv")]
-        top += [self.plots / name for name in PLOTS]
-        for path in top:
-            yield from (candidate for candidate in (path, path.with_name(path.name + TEMPORARY_SUFFIX)) if candidate.is_file())
+        yield from self.existing([self.scans, self.map_ply, self.map_pcd, self.checkpoint], PLOTS)
         for path in self.tiles.rglob("*"):
             inside = path.relative_to(self.tiles).as_posix().removesuffix(TEMPORARY_SUFFIX)
             if path.is_file() and _MAP_FILE.fullmatch(inside):
@@ -93,14 +110,6 @@ class RunFolder:
         """The folders in it that a run creates, inner ones first."""
         yield from self.tiles.glob("tiles/*")
         yield from (self.tiles / "tiles", self.tiles, self.plots)
-
-    def holds_estimates(self) -> bool:
-        """Whether the trajectory has a single row; a killed run may have written rows that its `run.json` does not count."""
-        try:
-            with self.trajectory.open("rb") as file:
-                return sum(1 for _ in zip(file, range(2), strict=False)) > 1
-        except OSError:
-            return False
 
 
 @contextmanager

@@ -1,0 +1,90 @@
+"""Everything the report of a run with cameras shows, read back from its output folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import read_trajectory
+from boxplus.report.run_data import sigmas_of
+from boxplus.runs.row_log import RowLog
+from boxplus.runs.visual_inertial.frame_log import read_frame_log
+from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
+from boxplus.runs.visual_inertial.vio_folder import VioFolder
+
+_MOST_POINTS = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class VisualData:
+    """A run with cameras as its folder tells it.
+
+    Attributes:
+        folder: where it lies.
+        summary: the facts; how far the run came is counted in the rows that can be read.
+        seconds: (N,) time of every frame since the first one with a state [s].
+        position: (N, 3) of the IMU in the world [m].
+        sigma: (N, 6) standard deviations of the pose: rotation [rad], position [m].
+        log: everything else per frame.
+        map_points: (M, 3) the landmarks [m].
+        evaluation: the comparison with a ground truth, or None.
+    """
+
+    folder: VioFolder
+    summary: VioSummary
+    seconds: NDArray[np.float64]
+    position: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    log: RowLog
+    map_points: NDArray[np.float32]
+    evaluation: dict[str, Any] | None
+
+    @property
+    def status(self) -> NDArray[np.str_]:
+        """(N,) ok, weak or lost."""
+        return self.log.status
+
+
+def load_visual_run(folder: str | Path) -> VisualData:
+    """Read the output folder of a run, finished or not.
+
+    Raises:
+        InputError: no folder of 'boxplus vio', or a run without a single frame.
+    """
+    run = VioFolder(Path(folder))
+    summary = read_vio_summary(run.summary)
+    trajectory, log = read_trajectory(run.trajectory, "csv"), read_frame_log(run.frames)
+    count = min(len(trajectory), len(log))  # a killed run may have written one row more to one of them
+    if not count:
+        raise InputError(
+            "a run with at least one frame", f"none in {run.path} ({summary.describe_state()})", "see run.json for the reason"
+        )
+    log, position = log.first(count), trajectory.p[:count]
+    if summary.state == "running":  # it is written every few seconds only
+        names, counts = np.unique(log.status, return_counts=True)
+        counted: dict[str, object] = {
+            "frames": count,
+            "status": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+            "duration_s": float(log.time_ns[-1] - log.time_ns[0]) * 1e-9,
+            "path_length_m": float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum()),
+        }
+        summary = summary.model_copy(update=counted)
+    points = read_ply(run.landmarks).points if run.landmarks.is_file() else np.zeros((0, 3), np.float32)
+    evaluation = json.loads(run.evaluation.read_text(encoding="utf-8")) if run.evaluation.is_file() else None
+    return VisualData(
+        folder=run,
+        summary=summary,
+        seconds=(log.time_ns - log.time_ns[0]) * 1e-9,
+        position=position,
+        sigma=sigmas_of(trajectory, count),
+        log=log,
+        map_points=points[:: max(1, -(-len(points) // _MOST_POINTS))].astype(np.float32),
+        evaluation=evaluation,
+    )

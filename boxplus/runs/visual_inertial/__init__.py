@@ -1,0 +1,1 @@
+"""Visual-inertial odometry over files: settings, rig, output folder, facts."""

@@ -1,0 +1,263 @@
+"""Visual-inertial odometry over a whole recording, with every result on disk as soon as it is known."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError, printable
+from boxplus.formats.ply import write_ply
+from boxplus.formats.trajectory_writer import TrajectoryWriter
+from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
+from boxplus.runs.estimate_statistics import EstimateStatistics
+from boxplus.runs.run_facts import StartFacts, State, WarningFacts
+from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
+from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
+from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
+from boxplus.runs.visual_inertial.summary import CameraFacts, CameraRecordingFacts, FrameTiming, VioSummary
+from boxplus.runs.visual_inertial.vio_folder import VioFolder, claim_vio_folder
+from boxplus.sensors.camera_image import CameraImage
+from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
+from boxplus.systems.visual_inertial_odometry.odometry import VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.start.start import Start
+
+_LANDMARKS_EVERY_S = 10.0
+_TOLD = (
+    *("image motion [px]", "mean specific force [m/s²]", "duration [s]", "acceleration, variation [m/s²]"),
+    *("sightings, deviation [px]", "gravity, deviation [deg]", "scale, deviation [%]"),
+)  # of the tests of a start; `run.json` has all of them
+_VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
+
+
+def run_visual_odometry(
+    recording: CameraRecording,
+    folder: str | Path | VioFolder,
+    config: VioRunConfig | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> VioSummary:
+    """Run visual-inertial odometry over a recording and write trajectory, frames, landmarks and facts to a folder.
+
+    Every estimate goes to disk at once. A run that is killed leaves everything up to its last frame (of the landmarks what was
+    known some seconds before); `run.json` then says so. The report is drawn from the folder, by `boxplus.report.write_report`.
+
+    Args:
+        recording: opened.
+        folder: created; see docs/output_folder.md for what it holds. Or what `claim_vio_folder` yields.
+        config: settings; each has a default.
+        overwrite: replace the results of an earlier run in the folder.
+        progress: called after every event that was read.
+        should_stop: asked between events; True ends the run in good order, with the state "interrupted".
+
+    Returns:
+        The facts of the run, as in `run.json`.
+
+    Raises:
+        InputError: the calibration or the IMU's noise is not known; the folder holds something else, or another process is
+            writing there; no start was found in the whole recording.
+        OutputError: the folder cannot be written or the disk is full; what was written before is intact.
+        RecordingError: nothing could be read.
+
+    Example:
+        >>> with open_camera_recording("MH_01_easy") as recording:   # doctest: +SKIP
+        ...     run_visual_odometry(recording, "out").status
+        {'ok': 3638}
+    """
+    config = config or VioRunConfig()
+    claimed = nullcontext(folder) if isinstance(folder, VioFolder) else claim_vio_folder(folder, overwrite=overwrite)
+    with claimed as vio_folder:
+        return _Run(recording, vio_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
+
+
+class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
+    """One run of visual-inertial odometry: its writers and its landmarks."""
+
+    def __init__(
+        self, recording: CameraRecording, folder: VioFolder, config: VioRunConfig, progress: Callable[[Progress], None]
+    ) -> None:
+        text = dump_vio_config(config, recording.info)
+        super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
+        self._info, self._folder, self._config = recording.info, folder, config
+        self._rig = rig_of_recording(recording.info, config.odometry)
+        self._odometry = VisualInertialOdometry(config.odometry, self._rig)
+        self._images: Counter[int] = Counter()
+        self._rejected: Counter[str] = Counter()
+        self._keyframes = self._before_start = 0
+        self._push_s = 0.0  # since the frame before
+        self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
+        self._time_offset_s = 0.0
+        self._landmarks: dict[int, NDArray[np.float64]] = {}
+        self._landmarks_due = time.perf_counter() + _LANDMARKS_EVERY_S
+
+    def open(self, stack: ExitStack) -> None:
+        """See `RunLoop.open`."""
+        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
+        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
+
+    def push(self, event: CameraEvent) -> list[VioEstimate]:
+        """See `RunLoop.push`."""
+        began = time.perf_counter()
+        if isinstance(event, CameraImage):
+            self._images[event.camera] += 1
+            estimates = self._odometry.push_image(event) if event.camera < len(self._rig.cameras) else []
+        else:
+            self.counts.add_imu(event.time_ns)
+            estimates = self._odometry.push_imu(event)
+        self._push_s += time.perf_counter() - began
+        return estimates
+
+    def flush(self) -> list[VioEstimate]:
+        """See `RunLoop.flush`."""
+        return self._odometry.flush()
+
+    def keep(self, estimate: VioEstimate) -> None:
+        """Write one estimate; before the start there is none."""
+        stages = dict(estimate.timing_s)
+        stages["window"] = max(self._push_s - sum(stages.values()), 0.0)
+        self._push_s, self.status = 0.0, estimate.status
+        self._rejected.update(estimate.rejected)
+        if estimate.status == "starting":
+            self._before_start += 1
+            return
+        began = time.perf_counter()
+        T, covariance = estimate.T_world_imu, estimate.covariance[:6, :6]
+        self._trajectory.append(estimate.time_ns, T[:3, :3], T[:3, 3], covariance, estimate.status)
+        self._frames.append(estimate, stages)
+        trouble = f"began with: {'; '.join(estimate.reasons)}"
+        self.counts.add_estimate(estimate.time_ns, T[:3, 3], estimate.status, stages, trouble)
+        if estimate.is_keyframe:
+            self._keyframes += 1
+            good = estimate.landmark_sigmas < _VAGUE_M
+            self._landmarks.update(
+                zip(estimate.landmark_ids[good].tolist(), estimate.landmarks[good].astype(np.float64), strict=True)
+            )
+        self._mountings, self._time_offset_s = estimate.T_imu_camera, estimate.time_offset_s
+        self.seconds["writing"] += time.perf_counter() - began
+
+    def between_events(self) -> None:
+        """See `RunLoop.between_events`."""
+        if time.perf_counter() > self._landmarks_due:
+            self._write_landmarks()
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        self._write_landmarks()
+
+    def _write_landmarks(self) -> None:
+        began = time.perf_counter()
+        if self._landmarks:
+            write_ply(self._folder.landmarks, np.array(list(self._landmarks.values()), dtype=np.float32))
+        now = time.perf_counter()
+        self._landmarks_due = now + max(_LANDMARKS_EVERY_S, 20.0 * (now - began))
+        self.seconds["writing"] += now - began
+
+    def nothing_found(self) -> InputError:
+        """See `RunLoop.nothing_found`."""
+        reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
+        if self._odometry.start_problem:
+            reasons.append(self._odometry.start_problem)
+        images = ", ".join(str(count) for _, count in sorted(self._images.items())) or "no"
+        return InputError(
+            "frames that IMU samples cover, and a start that can be found",
+            f"{images} images and {self.counts.imu_samples_read} IMU samples, and no start "
+            f"({'; '.join(reasons) or 'no reason counted'})",
+            "see 'boxplus inspect' for what is wrong with the recording; one camera needs accelerations that change",
+        )
+
+    def summarize(self, state: State, error: str | None) -> VioSummary:
+        """See `RunLoop.summarize`."""
+        counts, info, start = self.counts, self._info, self._odometry.start
+        contradiction = self._odometry.contradiction
+        return VioSummary(
+            versions=versions("rosbags", "opencv-python-headless"),
+            state=state,
+            error=error,
+            process=os.getpid(),
+            started=self.started,
+            updated=datetime.now(UTC),
+            recording=CameraRecordingFacts(
+                path=printable(str(info.path.resolve())),
+                format=info.format,
+                imu=printable(info.imu.source if info.imu is not None else ""),
+                duration_s=info.duration_s,
+                messages=info.message_count,
+                progress=self.recording.progress,
+                evidence=[{"key": e.key, "value": e.value, "verdict": e.verdict, "text": e.text} for e in info.evidence],
+            ),
+            cameras=self._cameras(),
+            start=None if start is None else _start_facts(start),
+            start_facts={} if start is None else {name: float(value) for name, value in start.facts.items()},
+            start_problem=self._odometry.start_problem,
+            frames=counts.count,
+            keyframes=self._keyframes,
+            frames_before_start=self._before_start,
+            status=dict(counts.status),
+            first_time_ns=counts.first_time_ns,
+            last_time_ns=counts.last_time_ns,
+            duration_s=counts.duration_s,
+            path_length_m=counts.path_length_m,
+            contradiction=contradiction,
+            imu_samples_read=counts.imu_samples_read,
+            rejected={
+                "recording": self.recording.rejected,
+                "odometry": dict(self._odometry.counters),
+                "corners": dict(self._rejected),
+            },
+            weak_intervals=counts.weak_intervals(),
+            imu_gaps=counts.imu_gaps(),
+            time_offset_s=self._time_offset_s,
+            landmarks=len(self._landmarks),
+            timing=self._timing(),
+            peak_memory_mb=peak_memory_mb(),
+            warnings=[
+                *counts.status_warnings(),
+                *counts.warnings.facts(counts.first_time_ns),
+                *(WarningFacts(text=f"{e.key}: {e.text}", count=1) for e in info.evidence if e.verdict != "ok"),
+            ],
+        )
+
+    def _cameras(self) -> list[CameraFacts]:
+        facts = []
+        for number, mounted in enumerate(self._rig.cameras):
+            stream = self._info.cameras[number]
+            facts.append(
+                CameraFacts(
+                    name=printable(stream.name),
+                    model=type(mounted.model).__name__,
+                    width=mounted.width,
+                    height=mounted.height,
+                    images=self._images[number],
+                    T_imu_camera_start=mounted.T_imu_camera.tolist(),
+                    T_imu_camera_end=self._mountings[number].tolist() if self.counts.count else None,
+                    sources={name: printable(source) for name, source in stream.sources.items()},
+                )
+            )
+        return facts
+
+    def _timing(self) -> FrameTiming:
+        return FrameTiming(
+            frame_ms=self.counts.estimate_ms(),
+            stages_ms=self.counts.stages_ms(),
+            reading_s=self.seconds["reading"],
+            odometry_s=self.seconds["odometry"],
+            writing_s=self.seconds["writing"],
+            total_s=time.perf_counter() - self.began,
+            real_time_factor=self.real_time_factor(),
+            compiled_kernels=self.compiled,
+        )
+
+
+def _start_facts(start: Start) -> StartFacts:
+    text = ", ".join(f"{name} {value:.3g}" for name, value in start.facts.items() if name in _TOLD)
+    return StartFacts(kind=start.kind, text=text, duration_s=float((start.time_ns[-1] - start.time_ns[0]) * 1e-9))

@@ -1,0 +1,163 @@
+"""Visual-inertial odometry over a simulated recording: its files, its end and its refusals."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from boxplus.cli import app
+from boxplus.errors import InputError
+from boxplus.evaluation.evaluation import evaluate
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import read_trajectory
+from boxplus.recordings.cameras.open import open_camera_recording
+from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.report import write_report
+from boxplus.runs.settings_file import load_settings
+from boxplus.runs.visual_inertial.config import VioRunConfig
+from boxplus.runs.visual_inertial.frame_log import read_frame_log
+from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
+from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
+from boxplus.runs.visual_inertial.vio_folder import VioFolder
+from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras, write_camera_recording
+from boxplus.systems.visual_inertial_odometry import VioConfig
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
+SETTINGS = {"odometry": {"cell_size": 12, "features": 100}}
+CONFIG = VioRunConfig.model_validate(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A EuRoC folder, at rest for two seconds; beside it NAME.gt.tum."""
+    simulation = simulate_cameras("room", 1, duration_s=3.2, rig=make_rig("stereo", None, 0.3, 15.0))
+    return write_camera_recording(simulation, tmp_path_factory.mktemp("recorded") / "room", "euroc")
+
+
+@pytest.fixture(scope="module")
+def finished(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[VioFolder, VioSummary]:
+    folder = VioFolder(tmp_path_factory.mktemp("run") / "out")
+    with open_camera_recording(recorded) as recording:
+        return folder, run_visual_odometry(recording, folder.path, CONFIG)
+
+
+def test_every_frame_with_a_state_has_a_row_everywhere(finished: tuple[VioFolder, VioSummary]) -> None:
+    folder, summary = finished
+    trajectory, frames = read_trajectory(folder.trajectory), read_frame_log(folder.frames)
+    assert summary.state == "finished" and summary.contradiction is None
+    assert summary.frames == len(trajectory) == len(frames) == sum(summary.status.values()) > 20
+    assert summary.frames + summary.frames_before_start == summary.cameras[0].images
+    assert np.array_equal(trajectory.time_ns, frames.time_ns) and (np.diff(frames.time_ns) > 0).all()
+    assert trajectory.covariance is not None and np.linalg.eigvalsh(trajectory.covariance[-1])[0] > 0.0
+    assert (frames.column("tracked") > 10).all() and (frames.column("sigma_bias_gyro") > 0.0).all()
+    assert len(read_ply(folder.landmarks).points) == summary.landmarks > 30
+    assert len((folder.path / "trajectory.tum").read_text().splitlines()) == summary.frames
+    assert load_settings(VioRunConfig, folder.config).odometry == CONFIG.odometry
+    assert read_vio_summary(folder.summary) == summary
+    assert summary.start is not None and summary.start.kind == "at rest" and summary.start_facts
+
+
+def test_the_trajectory_is_that_of_the_simulation(finished: tuple[VioFolder, VioSummary], recorded: Path) -> None:
+    folder, summary = finished
+    truth = read_trajectory(recorded.with_name("room.gt.tum"))
+    evaluation = evaluate(read_trajectory(folder.trajectory), truth, alignment="yaw", method="interpolate")
+    assert summary.path_length_m > 0.2 and evaluation.ate.rmse < 0.01
+
+
+def test_the_report_says_what_the_run_was(finished: tuple[VioFolder, VioSummary]) -> None:
+    folder, summary = finished
+    page = write_report(folder.path).read_text(encoding="utf-8")
+    for text in ("Landmarks and trajectory", "Status and corners", "Biases", f"{summary.frames} frames", "cam1: Pinhole"):
+        assert text in page
+    assert {path.name for path in folder.plots.iterdir()} == {"trajectory.png", "tracked.png", "biases.png"}
+
+
+def test_a_second_run_replaces_the_first_only_when_asked(
+    finished: tuple[VioFolder, VioSummary], recorded: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(finished[0].path, folder)
+    (folder / "notes.txt").write_text("mine")
+    with open_camera_recording(recorded) as recording:
+        with pytest.raises(InputError, match="the results of an earlier run"):
+            run_visual_odometry(recording, folder, CONFIG)
+        stopped = run_visual_odometry(recording, folder, CONFIG, overwrite=True, should_stop=lambda: True)
+    assert stopped.state == "interrupted" and stopped.frames == 0
+    assert {path.name for path in folder.iterdir()} >= {"notes.txt", "run.json"} and not (folder / "landmarks.ply").exists()
+
+
+def test_a_killed_run_leaves_everything_up_to_its_last_frame(recorded: Path, tmp_path: Path) -> None:
+    folder = VioFolder(tmp_path / "killed")
+    command = [sys.executable, "-c", "from boxplus.cli import main; main()", "vio", str(recorded), "-o", str(folder.path)]
+    process = subprocess.Popen([*command, "--set", "cell_size=12"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        limit = time.monotonic() + 120.0
+        while time.monotonic() < limit and process.poll() is None:
+            if folder.trajectory.exists() and folder.trajectory.read_bytes().count(b"\n") > 4:
+                break
+            time.sleep(0.005)
+        assert process.poll() is None, "the run ended before it could be killed"
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    summary = read_vio_summary(folder.summary)
+    assert "ended without a word" in summary.describe_state()
+    rows = len(read_trajectory(folder.trajectory))
+    assert rows >= 4 and abs(len(read_frame_log(folder.frames)) - rows) <= 1
+    assert "ended without a word" in write_report(folder.path).read_text(encoding="utf-8")
+
+
+def test_what_is_not_calibrated_is_refused_with_the_way_out(recorded: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(recorded, bare)
+    for file in bare.rglob("*.yaml"):
+        file.unlink()
+    with (
+        open_camera_recording(bare) as recording,
+        pytest.raises(InputError, match=r"intrinsics and the mounting .* no cam0: model .* --calibration camchain\.yaml"),
+    ):
+        rig_of_recording(recording.info, VioConfig())
+    camchain = recorded.with_name("room.calib.yaml")
+    with open_camera_recording(bare, CameraRecordingOptions(calibration=camchain)) as recording:
+        if recording.info.imu is not None and recording.info.imu.noise is None:
+            with pytest.raises(InputError, match=r"noise densities of the IMU .* --set gyro_noise=…"):
+                rig_of_recording(recording.info, VioConfig())
+        given = VioConfig(gyro_noise=1e-3, accel_noise=1e-2, gyro_bias_walk=1e-5, accel_bias_walk=1e-4)
+        assert len(rig_of_recording(recording.info, given).cameras) == 2
+        assert len(rig_of_recording(recording.info, given.model_copy(update={"cameras": "first"})).cameras) == 1
+
+
+def test_no_start_in_the_whole_recording_is_an_error_with_its_number(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room", 1, duration_s=0.6, rig=make_rig("mono", None, 0.2, 15.0))
+    with pytest.raises(InputError, match=r"and no start \(.*s of frames were seen \(1 are needed\)"):
+        run_visual_odometry(as_camera_recording(simulation), tmp_path / "out", CONFIG)
+    summary = read_vio_summary(tmp_path / "out" / "run.json")
+    assert summary.state == "failed" and summary.start is None and summary.frames_before_start > 5
+
+
+def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    truth = recorded.with_name("room.gt.tum")
+    arguments = ["vio", str(recorded), "-o", str(out), "--gt", str(truth), "--set", "cell_size=12", "--mono"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "frames" in done.output and "at rest" in done.output and "yaw alignment" in " ".join(done.output.split())
+    assert json.loads((out / "evaluation.json").read_text())["alignment"]["kind"] == "yaw"
+    assert len(read_vio_summary(out / "run.json").cameras) == 1
+    assert "ATE" in (out / "report.html").read_text(encoding="utf-8")
+    assert CliRunner().invoke(app, ["report", str(out)]).exit_code == 0
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    unknown = CliRunner().invoke(app, [*arguments, "--overwrite", "--set", "featurs=3"])
+    assert unknown.exit_code == 2
