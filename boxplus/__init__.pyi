@@ -73,3 +73,7 @@ from .systems.lidar_inertial_odometry.estimate import Estimate as Estimate
 from .systems.lidar_inertial_odometry.odometry import LidarInertialOdometry as LidarInertialOdometry
 from .systems.pose_graph.pose_graph import PoseGraphConfig as PoseGraphConfig
 from .systems.pose_graph.pose_graph import optimize_pose_graph as optimize_pose_graph
+from .systems.visual_inertial_odometry.config import VioConfig as VioConfig
+from .systems.visual_inertial_odometry.estimate import VioEstimate as VioEstimate
+from .systems.visual_inertial_odometry.odometry import VisualInertialOdometry as VisualInertialOdometry
+from .systems.visual_inertial_odometry.rig import Rig as Rig

@@ -49,11 +49,14 @@ class Health:
         """A start was found."""
         self._seen_ns = self._agreed_ns = time_ns
 
-    def judge(self, tracks: Tracks, fit: Fit, rests: bool, position_sigma: float) -> tuple[Status, tuple[str, ...]]:
+    def judge(
+        self, tracks: Tracks, fit: Fit, rests: bool, imu_gap_s: float, position_sigma: float
+    ) -> tuple[Status, tuple[str, ...]]:
         """The status of a frame, and why it is not "ok".
 
         Args:
             rests: the images stand still, so that the pose is held without landmarks.
+            imu_gap_s: longest time between IMU samples before the frame [s].
             position_sigma: standard deviation of the position, all axes together [m].
         """
         time_ns, reasons = tracks.time_ns, []
@@ -69,6 +72,10 @@ class Health:
             reasons.append(
                 f"no landmark was seen for {blind_s:.1f} s; the IMU holds the pose for {self.config.max_blind:g} s, its standard "
                 f"deviation is {position_sigma:.2f} m by now"
+            )
+        if imu_gap_s > self.config.max_imu_gap:
+            reasons.append(
+                f"the IMU was silent for {imu_gap_s:.2f} s, of {self.config.max_imu_gap:g} s at most: only images tell the motion"
             )
         contradictions = self._contradictions(tracks, fit)
         if not contradictions:

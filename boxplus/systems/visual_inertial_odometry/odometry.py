@@ -33,6 +33,7 @@ from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
+_TRY_EVERY_NS = 150_000_000  # a start in motion takes longer to look for than a frame lasts
 _OUTLIER = 4.0  # standard deviations
 _LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
 
@@ -63,6 +64,7 @@ class VisualInertialOdometry:
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._waiting: deque[Tracks] = deque()
         self._time_ns = 0  # of the frame before
+        self._next_try_ns = 0
         self._health = Health(self.config)
         self._counters: Counter[str] = Counter()
 
@@ -132,9 +134,18 @@ class VisualInertialOdometry:
             if self._imu.time_ns[0] > time_ns:
                 self._counters["images before the first IMU sample"] += 1
                 continue
+            if self.start is not None and not self._has_imu_since_last_frame(time_ns):
+                self._counters["images between two IMU samples"] += 1
+                continue
             estimates.append(self._frame(time_ns, images))
             self._time_ns = time_ns
         return estimates
+
+    def _has_imu_since_last_frame(self, time_ns: int) -> bool:
+        """Whether a sample lies between the newest frame and this time: without one they cannot be told apart by the IMU."""
+        since, until = self.window.frames[-1].time_ns + self.window.cut_ns, time_ns + self.window.cut_ns
+        first, last = np.searchsorted(self._imu.time_ns, [since, until], side="right")
+        return bool(last > first) and bool(self._imu.time_ns[first] < until)
 
     def _frame(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         if self.start is None:
@@ -172,6 +183,9 @@ class VisualInertialOdometry:
         while time_ns - self._waiting[0].time_ns > _LONGEST_START * self.config.start_duration * 1e9:
             self._waiting.popleft()
         seen = list(self._waiting)
+        if time_ns < self._next_try_ns:
+            return self._nothing(tracks, self.start_problem or "the next frames are waited for")
+        self._next_try_ns = time_ns + _TRY_EVERY_NS
         start = find_start(seen, self._imu, self.rig, self.config) if len(seen) > 1 else "one frame so far"
         if isinstance(start, str):
             self.start_problem = start
@@ -213,7 +227,7 @@ class VisualInertialOdometry:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
         ids, landmarks, sigmas = self.window.landmarks()
         covariance = self.window.covariance
-        status, reasons = self._health.judge(tracks, fit, rests, position_sigma(covariance))
+        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, position_sigma(covariance))
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,

@@ -40,6 +40,7 @@ _COST_TOLERANCE = 1e-3
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
+_GAP_ACCEL, _GAP_RATE = 3.0, 0.5  # m/s², rad/s: of what may happen while the IMU is silent
 _LEAST_RHO = 0.1  # 1/m, for what is not known to be nearer
 _RECUT_NS = 1_000_000
 SPARE_NS = 20_000_000  # of IMU samples on both sides of the intervals, where these follow the clocks' offset
@@ -53,6 +54,7 @@ class Window:
         problem: poses `bodies`, velocities and biases `states` [v, b_a, b_g], camera mountings, `points` [x, y, ρ] in the first
             camera of their anchor.
         offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
+        gap_s: longest time between IMU samples before the newest frame [s].
         frames: in order of time.
         covariance: (15, 15) of the newest frame, [θ, p, v, b_ω, b_a].
         leak: what the last prior claims to know of position and yaw.
@@ -78,6 +80,7 @@ class Window:
         else:
             self.problem.fix(self.offset)
         self.cut_ns = 0
+        self.gap_s = 0.0
         self._gauge = world_gauge({self.bodies: "world_from_body", self.states: "velocity_first"}, rotation="yaw")
         self.leak: Leak | None = None
         self.covariance = np.zeros((15, 15))
@@ -114,7 +117,7 @@ class Window:
         spare = SPARE_NS if self._config.time_offset_estimation else 0
         first = max(int(np.searchsorted(imu.time_ns, since - spare, side="right")) - 1, 0)
         last = int(np.searchsorted(imu.time_ns, until + spare, side="left")) + 1
-        return Preintegration.integrate(
+        step = Preintegration.integrate(
             imu.time_ns[first:last],
             imu.gyro[first:last],
             imu.accel[first:last],
@@ -123,6 +126,12 @@ class Window:
             bias_accel=state[3:6],
             bias_gyro=state[6:],
         )
+        gap = float(step.longest_gap_s[0])
+        if gap > self._config.max_imu_gap:
+            # What happened meanwhile is not known; in the order [α, θ, β].
+            spread = np.repeat([0.5 * _GAP_ACCEL * gap**2, _GAP_RATE * gap, _GAP_ACCEL * gap], 3)
+            step.covariance[0][range(9), range(9)] += spread**2
+        return step
 
     def _follow_clock(self) -> None:
         """Cut the IMU's intervals anew where the clocks' offset moved away from that they were cut at."""
@@ -150,6 +159,9 @@ class Window:
         if self.frames:
             step = self._step(tracks.time_ns, imu)
             self._imu = step if self._imu is None else self._imu.append(step)
+            self.gap_s = float(step.longest_gap_s[0])
+            if self.gap_s > self._config.max_imu_gap:  # such an interval is never made one with another
+                self.frames[-1].is_keyframe = is_keyframe = True
         number = int(self.problem.extend(self.bodies, pose).ids[0])
         self.problem.extend(self.states, state)
         self.frames.append(Frame(number, tracks.time_ns, tracks, is_keyframe))

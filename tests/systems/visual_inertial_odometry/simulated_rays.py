@@ -174,14 +174,18 @@ class SimulatedTracker:
 
 
 def run(
-    flight: Flight, its: Rig, config: VioConfig, tracker: SimulatedTracker | None = None
+    flight: Flight,
+    its: Rig,
+    config: VioConfig,
+    tracker: SimulatedTracker | None = None,
+    silent: tuple[float, float] = (1e9, 1e9),
 ) -> tuple[VisualInertialOdometry, list[VioEstimate]]:
-    """All of a flight through the odometry."""
+    """All of a flight through the odometry, but for the IMU samples between the two times `silent` [s]."""
     vio = VisualInertialOdometry(config, its, tracker or SimulatedTracker(flight, its))
     blank = np.zeros((480, 752), np.uint8)
     estimates = []
     for k in range(0, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY):
-        samples = slice(k, k + IMAGE_EVERY)
+        samples = np.array([n for n in range(k, k + IMAGE_EVERY) if not silent[0] <= n / RATE < silent[1]], dtype=np.int64)
         for camera in range(len(its.cameras)):
             estimates += vio.push_image(CameraImage(camera, f"cam{camera}", int(flight.time_ns[k]), blank))
         estimates += vio.push_imu(flight.time_ns[samples], flight.gyro[samples], flight.accel[samples])

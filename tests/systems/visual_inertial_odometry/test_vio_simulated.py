@@ -153,6 +153,18 @@ def test_cameras_that_are_not_where_the_calibration_says_are_contradicted() -> N
     assert "weak" in statuses[60:] and vio.contradiction is not None
 
 
+def test_while_the_imu_is_silent_images_alone_tell_the_motion_and_it_is_said() -> None:
+    flight = Flight(5, 5.5)
+    vio, estimates = run(flight, rig(), CONFIG, silent=(3.0, 3.4))
+    known = [e for e in estimates if e.status != "starting"]
+    silent = [e for e in known if any("the IMU was silent for 0.4" in reason for reason in e.reasons)]
+    assert silent and all(e.status == "weak" for e in silent)
+    assert vio.counters == {"images between two IMU samples": 8}
+    assert known[-1].status == "ok"
+    error, covariance = position_and_yaw_error(flight, known[0], known[-1])
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all()
+
+
 def test_what_cannot_be_used_is_refused_or_counted() -> None:
     flight = Flight(1, 1.0)
     vio = VisualInertialOdometry(CONFIG, rig(), SimulatedTracker(flight, rig()))
