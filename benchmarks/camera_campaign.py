@@ -1,8 +1,9 @@
-"""Many random recordings of cameras through `boxplus inspect`: is what is wrong named, and is what is right left alone?
+"""Many random recordings of cameras through `boxplus inspect`, or through `boxplus vio`: right, or said what is wrong?
 
     python benchmarks/camera_campaign.py                               # 20 seeds
     python benchmarks/camera_campaign.py --seeds 1:101:2 --out odd.jsonl   # settings come from even seeds, odd ones report
     python benchmarks/camera_campaign.py --only fault=rolling_shutter --seeds 0:400
+    python benchmarks/camera_campaign.py --vio --seeds 0:40            # the odometry in place of the data doctor
     python benchmarks/camera_campaign.py --merge odd.jsonl
 
 A seed draws world, motion, light, cameras, IMU and, in three of five, one fault (vio_campaign/draws.py). Verdicts, of the
@@ -12,6 +13,8 @@ findings that are not ok:
 - `right cause`: a fault, and a finding with one of its words; `flagged`: other findings only.
 - `unchecked`: nothing, and the findings say that camera and IMU could not be compared.
 - `silent`: nothing. Faults that only an estimator can tell are counted apart, as `not for inspect`.
+
+With `--vio` the verdicts are those of vio_campaign/judge.py.
 """
 
 from __future__ import annotations
@@ -72,6 +75,21 @@ def run(seed: int) -> dict[str, Any]:
     }
 
 
+def run_vio(seed: int) -> dict[str, Any]:
+    """A line about a seed through the odometry."""
+    from vio_campaign.judge import judge_run, run_odometry
+
+    drawn = draw(seed)
+    began = time.perf_counter()
+    outcome, facts = run_odometry(drawn)
+    error = None if outcome.error_m is None else round(outcome.error_m, 4)
+    wrong = [["error_m", error, f"of {outcome.way_m:.1f} m"], ["not_ok", round(outcome.not_ok, 2), ""]]
+    wrong += [["flag", "", text] for text in outcome.flags]
+    verdict = judge_run(drawn, outcome)
+    elapsed = round(time.perf_counter() - began, 1)
+    return {"seed": seed, **asdict(drawn.kinds), "verdict": verdict, "wrong": wrong, **facts, "time_s": elapsed}
+
+
 def table(lines: list[dict[str, Any]]) -> str:
     """Verdicts by fault."""
     rows = []
@@ -87,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0:20", help="begin:end or begin:end:step")
     parser.add_argument("--only", action="append", default=[], help="KIND=VALUE, for example fault=darkness")
+    parser.add_argument("--vio", action="store_true", help="run the odometry")
     parser.add_argument("--out", type=Path, help="append a JSON line for each run")
     parser.add_argument("--merge", type=Path, nargs="+", help="tables of earlier runs; nothing is run")
     options = parser.parse_args(arguments)
@@ -99,9 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed in range(*map(int, options.seeds.split(":"))):
         if not draw_kinds(seed).matches(only):
             continue
-        lines.append(run(seed))
+        lines.append(run_vio(seed) if options.vio else run(seed))
         line = lines[-1]
-        said = "; ".join(f"{key} {value}" for key, value, _ in line["wrong"])
+        said = "; ".join(f"{key} {value or text[:70]}" for key, value, text in line["wrong"])
         print(
             f"{seed:5} {line['world']:10}{line['motion']:13}{line['rig']:7}{line['fault']:24}{line['verdict']:14}{said}",
             flush=True,

@@ -25,7 +25,8 @@ def campaign() -> Iterator[SimpleNamespace]:
     sys.path.insert(0, str(FOLDER))
     try:
         draws = importlib.import_module("vio_campaign.draws")
-        yield SimpleNamespace(draws=draws, script=importlib.import_module("camera_campaign"))
+        script, judge = (importlib.import_module(name) for name in ("camera_campaign", "vio_campaign.judge"))
+        yield SimpleNamespace(draws=draws, script=script, judge=judge)
     finally:
         sys.path.remove(str(FOLDER))
         for name in [name for name in sys.modules if name.partition(".")[0] in ("vio_campaign", "camera_campaign")]:
@@ -77,3 +78,16 @@ def test_tables_of_earlier_runs(campaign: SimpleNamespace, tmp_path: Path, capsy
     (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, rows)))
     campaign.script.main(["--merge", str(tmp_path / "a.jsonl"), "--only", "fault=darkness"])
     assert capsys.readouterr().out.split() == ["darkness", "2", "right", "cause", "all", "2", "right", "cause"]
+
+
+def test_the_judge_of_the_odometry(campaign: SimpleNamespace) -> None:
+    def said(made: Any, error_m: float | None, *flags: str, not_ok: float = 0.0) -> str:
+        return str(campaign.judge.judge_run(made, campaign.judge.Outcome(error_m, 10.0, not_ok, list(flags))))
+
+    sound, short = drawn(campaign, fault="none"), drawn(campaign, fault="wrong_baseline")
+    assert said(sound, 0.1) == "right" and said(sound, 0.1, "something") == "false alarm"
+    assert (
+        said(sound, 0.3) == "silent" and said(sound, 0.3, not_ok=0.5) == "flagged" and said(sound, None, "refused") == "flagged"
+    )
+    assert said(short, 0.01, "anything") == "right" and said(short, 0.4) == "silent"
+    assert said(short, 0.4, "the baseline of the rig does not fit the accelerations") == "right cause"
