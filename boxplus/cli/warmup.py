@@ -25,6 +25,7 @@ def warmup() -> None:
             _run_odometry()
             _optimize_pose_graphs()
             _adjust_bundle()
+            _follow_camera()
     what = f"{len(compiled)} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
     console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
 
@@ -87,3 +88,21 @@ def _adjust_bundle() -> None:
     adjust_bundle(BalProblem(cameras, points, camera_of, point_of, pixels))
     poses = se3.exp(cameras[:, :6])
     adjust_bundle(GbpProblem(np.array([500.0, 500.0, 0.0, 0.0]), poses, -points, camera_of, point_of, -pixels))
+
+
+def _follow_camera() -> None:
+    import numpy as np
+
+    from boxplus.cameras.pinhole import Pinhole
+    from boxplus.systems.direct_odometry import DirectOdometry, DirectOdometryConfig, StereoPair
+
+    camera = Pinhole(150.0, 150.0, 79.5, 59.5)
+    v, u = np.mgrid[:120, :160]
+    # A wall 2 m ahead that moves by three pixels a frame, seen twice with a baseline of as much.
+    greys = [100.0 + 40.0 * np.sin(0.25 * (u + 3.0 * k)) * np.cos(0.2 * v + 0.05 * (u + 3.0 * k)) for k in range(5)]
+    config = DirectOdometryConfig(window=2, keyframe_flow=0.005)
+    by_depth = DirectOdometry(camera, config)
+    by_stereo = DirectOdometry(camera, config, stereo=StereoPair(camera, (1.0, 0.0, 0.0, 0.0, -0.04, 0.0, 0.0)))
+    for k, grey in enumerate(greys[:4]):
+        by_depth.push_rgbd(k, grey, np.full(grey.shape, 2.0))
+        by_stereo.push_stereo(k, grey, greys[k + 1])

@@ -97,6 +97,7 @@ def track(
     T_21: ArrayLike = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     loss: Loss | None = None,
     brightness: bool = True,
+    light: tuple[float, float] | None = None,
     max_iterations: int = 50,
     tolerance: float = 1e-4,
     search_deg: float = 0.0,
@@ -110,6 +111,7 @@ def track(
         loss: of e/σ at the finest level; by default `Tukey(4.685)`. Levels above have `Huber(1.345)` where the loss given turns
             outliers off.
         brightness: whether image 2 may be brighter, affinely, than image 1.
+        light: (a, b) of image 2 to start from as well, as in `Alignment.brightness`, such as that of the image before.
         max_iterations: linearisations at each level.
         tolerance: the finest level ends with a step below this [rad; the translation in units of the median depth], others with
             one below what is the same in their pixels.
@@ -145,7 +147,7 @@ def track(
     descent = _Descent(keyframe, Tukey(4.685) if loss is None else loss, brightness, starts[0].copy())
     if len(keyframe.levels) > 1 or len(starts) > 1 or search_deg > 0.0:
         coarsest = keyframe.levels[0]
-        descent.search(coarsest, pyramid[coarsest.octave], starts, search_deg, min(max_iterations, _SEARCH_ITERATIONS))
+        descent.search(coarsest, pyramid[coarsest.octave], starts, light, search_deg, min(max_iterations, _SEARCH_ITERATIONS))
     iterations: list[int] = []
     for level in keyframe.levels:
         is_free = brightness and (level.octave < _BRIGHTNESS_BELOW or level is keyframe.levels[-1])
@@ -197,7 +199,15 @@ class _Descent:
         spread: Matrix = scores.T @ scores * (missing * (weights / max(slopes, _LEAST_SLOPE * weights)) ** 2)
         return spread
 
-    def search(self, level: Level, image: Image, starts: Matrix, search_deg: float, max_iterations: int) -> None:
+    def search(
+        self,
+        level: Level,
+        image: Image,
+        starts: Matrix,
+        light: tuple[float, float] | None,
+        search_deg: float,
+        max_iterations: int,
+    ) -> None:
         """Go on from that of several starts which leads to the smallest mean of |e|, where enough of the image is seen."""
         most = search_deg // _SEARCH_STEP_DEG
         steps = np.radians(_SEARCH_STEP_DEG * np.arange(-most, most + 1.0))
@@ -205,9 +215,12 @@ class _Descent:
         grid = grid[np.linalg.norm(grid, axis=1) <= np.radians(search_deg) + 1e-12]
         turns = se3.exp(np.concatenate([grid, np.zeros_like(grid)], axis=1))
         best, least = (self.T_21, self.light), np.inf
-        for light in _lights(level.grey, image.grey) if self.brightness else (self.light,):
+        lights = _lights(level.grey, image.grey) if self.brightness else [self.light]
+        if light is not None and self.brightness:
+            lights.append(np.array([np.exp(light[0]), light[1]]))
+        for gain_and_offset in lights:
             for start in (se3.compose(turn, start) for start in starts for turn in turns):
-                self.T_21, self.light = start, light.copy()
+                self.T_21, self.light = start, gain_and_offset.copy()
                 code = self.refine(level, image, max_iterations, _SEARCH_TOLERANCE, False)
                 count, total = self.figures[0], self.figures[2]
                 if code in (CONVERGED, ITERATION_LIMIT) and total < least * count:

@@ -94,6 +94,7 @@ class DirectOdometry:
         self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
         self._covariance: Matrix = _WORLD
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
+        self._log_gain, self._offset = 0.0, 0.0
         self._reference: WindowKeyframe | None = None
         self._time_ns: int | None = None
         self._seen_ns: int | None = None
@@ -152,7 +153,7 @@ class DirectOdometry:
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
-        is_keyframe = self._asks_for_keyframe(keyframe, alignment)
+        is_keyframe, added = self._asks_for_keyframe(keyframe, alignment), None
         if is_keyframe:
             if self.stereo is None:  # depths of a stereo pair change with its intrinsics
                 self._calibration.add(keyframe, image.grey, alignment)
@@ -170,6 +171,9 @@ class DirectOdometry:
         if elapsed_s > 0.0:
             self._velocity, self._velocity_s = se3.compose(se3.inverse(self._T), T), self._unseen_s(time_ns)
         self._T, self._covariance, self._seen_ns = T, covariance, time_ns
+        self._log_gain, self._offset = keyframe.log_gain - alignment.brightness[0], alignment.brightness[1]
+        if added is not None:
+            self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
 
     def _begin(self, time_ns: int, image: Image, depth_of: Callable[[], SensedDepth], watch: Stopwatch) -> Estimate:
@@ -183,7 +187,7 @@ class DirectOdometry:
         else:
             self.window.begin(keyframe, self._covariance)
             self._reference, self._seen_ns = keyframe, time_ns
-            self._velocity_s = 0.0
+            self._velocity_s = self._log_gain = self._offset = 0.0
         watch.lap("keyframe")
         number = -1 if keyframe is None else keyframe.number
         return self._estimate(time_ns, number, keyframe is not None, None, Verdict(status, tuple(reasons), np.nan), watch)
@@ -206,7 +210,9 @@ class DirectOdometry:
                 starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, False)[1:], _SEARCH_DEG
             else:
                 starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, is_hard), 0.0
-            alignment = track(keyframe.tracker, image, T_21=starts, search_deg=search_deg)
+            offset = self._offset if keyframe is self._reference else 0.0
+            light = keyframe.log_gain - self._log_gain, offset
+            alignment = track(keyframe.tracker, image, T_21=starts, light=light, search_deg=search_deg)
             verdict = self._watch.judge(alignment, keyframe.tracker.median_depth)
             tracked.append(Tracked(keyframe, alignment, verdict))
             if verdict.status != "lost":

@@ -176,3 +176,15 @@ def test_recorded_neighbours_agree_with_their_composition(shared_data: Path) -> 
     assert degrees < 0.1 and metres < 0.005
     degrees, metres = degrees_and_metres(se3.compose(found[12, 14].T_21, found[10, 12].T_21), found[10, 14].T_21)
     assert degrees < 0.1 and metres < 0.005
+
+
+def test_a_start_of_the_brightness_is_followed() -> None:
+    """An image much darker than the keyframe, a part of which is bright and without texture."""
+    first, depth, second = textured_plane(2, MOTION)
+    keyframe = Keyframe.prepare(first, depth, CAMERA, levels=3)
+    dark = 0.3 * second + 20.0
+    dark[:20] = 250.0
+    found = track(keyframe, dark, light=(float(-np.log(0.3)), -20.0 / 0.3))
+    assert found.status == "converged"
+    assert found.brightness[0] == pytest.approx(-np.log(0.3), abs=0.05)
+    assert degrees_and_metres(found.T_21, MOTION)[0] < 0.3
