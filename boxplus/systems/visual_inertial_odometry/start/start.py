@@ -45,6 +45,7 @@ _FEWEST_SIGHTINGS = 3  # of a track
 _MISTAKEN, _NOISE, _CHI2, _BEHIND = 40.0, 5.0, 3.0, 10.0
 _TILT_DEG, _TILT_MONO_DEG, _SCALE = 1.0, 0.45, 5.0  # deg, deg, %
 _JUMPS = 0.3, 5.0  # rad/s, m/s²: standard deviations
+_SCALE_SURE, _TILT_SURE_DEG = 2.0, 0.65  # %, of a scale in which no error of gravity hides, and what then is enough
 _EXCITATION = 0.3  # m/s²
 _NO_EXCITATION = "the acceleration varies by {:.2f} m/s² ({:g} are needed to see the scale)"
 _ANY = 10.0  # rad, m, m/s
@@ -278,7 +279,7 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
         ("accelerometer bias [m/s²]", 1.0, "the accelerometer's bias would be {:.2f} m/s² (at most {:g})"),
         (
             "gravity, deviation [deg]",
-            _TILT_MONO_DEG if is_mono else _TILT_DEG,
+            _tilt_deg(facts) if is_mono else _TILT_DEG,
             "gravity is known to {:.2f} deg ({:g} are needed)",
         ),
     ]
@@ -290,6 +291,11 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
     if is_mono and not facts["scale, deviation [%]"] < _SCALE:
         return f"the scale is known to {facts['scale, deviation [%]']:.1f} % ({_SCALE:g} are needed)"
     return ""
+
+
+def _tilt_deg(facts: Mapping[str, float]) -> float:
+    """How well one camera has to know gravity."""
+    return _TILT_SURE_DEG if facts["scale, deviation [%]"] < _SCALE_SURE else _TILT_MONO_DEG
 
 
 def _moving(
