@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._stopwatch import Stopwatch
 from boxplus.cameras.model import CameraModel, check_pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
@@ -36,7 +37,6 @@ from boxplus.systems.direct_odometry.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.verdict import Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
-from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 
 Matrix = NDArray[np.float64]
 

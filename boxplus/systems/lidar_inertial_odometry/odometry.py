@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.iterated_update import Posterior, iterated_update
 from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
@@ -32,7 +33,6 @@ from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, afte
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
-from boxplus.systems.lidar_inertial_odometry.stopwatch import Stopwatch
 from boxplus.systems.lidar_inertial_odometry.unknown_mounting import UnknownMounting
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
