@@ -20,7 +20,7 @@ demo: $(VENV)/.runtime
 	@$(BIN)/boxplus demo -o $(OUTPUT) $(DEMO_ARGS)
 
 test: $(VENV)/.dev
-	@$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
 
 lint: $(VENV)/.dev
 	@$(BIN)/ruff check .

@@ -31,10 +31,15 @@ from boxplus.systems.visual_inertial_odometry.odometry import VisualInertialOdom
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 
 _LANDMARKS_EVERY_S = 10.0
-_TOLD = (
-    *("image motion [px]", "mean specific force [m/s²]", "duration [s]", "acceleration, variation [m/s²]"),
-    *("sightings, deviation [px]", "gravity, deviation [deg]", "scale, deviation [%]"),
-)  # of the tests of a start; `run.json` has all of them
+_TOLD = {
+    "duration [s]": "over {:.2f} s",
+    "image motion [px]": "images move by {:.2f} px",
+    "mean specific force [m/s²]": "specific force {:.2f} m/s²",
+    "acceleration, variation [m/s²]": "acceleration varies by {:.2f} m/s²",
+    "sightings, deviation [px]": "corners deviate by {:.2f} px",
+    "gravity, deviation [deg]": "gravity is known to {:.2f} deg",
+    "scale, deviation [%]": "scale to {:.1f} %",
+}  # of the tests of a start; `run.json` has all of them
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -259,5 +264,5 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
 
 
 def _start_facts(start: Start) -> StartFacts:
-    text = ", ".join(f"{name} {value:.3g}" for name, value in start.facts.items() if name in _TOLD)
+    text = ", ".join(phrase.format(start.facts[name]) for name, phrase in _TOLD.items() if name in start.facts)
     return StartFacts(kind=start.kind, text=text, duration_s=float((start.time_ns[-1] - start.time_ns[0]) * 1e-9))
