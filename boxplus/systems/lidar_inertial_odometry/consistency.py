@@ -8,6 +8,8 @@ without the filter (`lidar_inertial_agreement.watch`); a contradiction that last
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,9 @@ _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio mean
 _SUSPICIOUS_SHARE = 0.01  # of the squared rotation, corrected
 _INNOVATION_KEEP = 0.8
 _SUSPICIOUS_INNOVATION, _CONTRADICTED_INNOVATION = 2.0, 25.0  # mean square of the innovation, in variances a direction
-_CONTRADICTED_STREAK_S = 1.0
+_DOUBTED_INNOVATION = 1.0  # 0.2 at most on sound runs, simulated and real, of an IMU with several samples a scan
+_CONTRADICTED_STREAK_S, _DOUBTED_STREAK_S = 1.0, 2.0
+_FEWEST_SAMPLES = 5  # of the IMU within a scan; between fewer ones the motion is anybody's guess
 _ONE_SCAN = 100.0  # no single scan counts for more: it takes several to contradict
 _LOST_STREAK = 3
 _LEAST_FITTING = 0.6  # of the points with a plane lie on it; 0.92 at least on sound runs
@@ -32,6 +36,21 @@ _SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
 _FASTEST_M_S = 120.0
 _LARGEST_BIAS = 0.1, 0.7  # rad/s, m/s²: more than an inertial sensor in order has, and as known as three deviations
 _MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
+
+
+@dataclass
+class _Streak:
+    """How long something has held, scan after scan."""
+
+    since_ns: int | None = None
+
+    def seconds(self, holds: bool, begin_ns: int, now_ns: int) -> float:
+        """0 where it does not hold; else the time since `begin_ns` of the first scan in which it did."""
+        if not holds:
+            self.since_ns = None
+            return 0.0
+        self.since_ns = begin_ns if self.since_ns is None else self.since_ns
+        return (now_ns - self.since_ns) * 1e-9
 
 
 class Consistency:
@@ -49,9 +68,8 @@ class Consistency:
         self._turned = 0.0
         self._corrected = 0.0
         self._innovation = 0.0
-        self._contradicted_since_ns: int | None = None
+        self._contradicted, self._doubted, self._misfit = _Streak(), _Streak(), _Streak()
         self._innovation_text: str | None = None
-        self._misfit_since_ns: int | None = None
         self._unmatched = 0
         self._previous_start_ns: int | None = None
         self._told: set[str] = set()
@@ -140,7 +158,7 @@ class Consistency:
             self._innovation_text = f"the estimate moves at {speed:.0f} m/s, which no platform with a LiDAR does"
             return [self._innovation_text] if self._once("speed") else []
         if not posterior.valid or directions.weak.all():
-            self._contradicted_since_ns = None
+            self._contradicted, self._doubted = _Streak(), _Streak()
             return []
         delta = np.zeros(TANGENT)
         boxminus_into(x, x_prior, delta)
@@ -150,29 +168,27 @@ class Consistency:
         variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
         now = float(np.max(off**2 / variance))
         self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, _ONE_SCAN)
-        if self._innovation < _CONTRADICTED_INNOVATION:
-            self._contradicted_since_ns = None
-            return []
-        if self._contradicted_since_ns is None:
-            self._contradicted_since_ns = frame.scan.end_ns
-        lasted = (frame.scan.end_ns - self._contradicted_since_ns) * 1e-9
+        end_ns = frame.scan.end_ns
+        doubted = self._innovation > _DOUBTED_INNOVATION and len(frame.imu) >= _FEWEST_SAMPLES
+        told = []
+        if self._doubted.seconds(doubted, end_ns, end_ns) > _DOUBTED_STREAK_S and self._once("doubt"):
+            told.append(
+                f"for {_DOUBTED_STREAK_S:g} s the LiDAR has corrected what the IMU predicts by more than noise explains: "
+                "T_imu_lidar, the clocks, a unit or a topic may be wrong (see 'boxplus inspect')"
+            )
+        lasted = self._contradicted.seconds(self._innovation >= _CONTRADICTED_INNOVATION, end_ns, end_ns)
         if lasted < _CONTRADICTED_STREAK_S or self._innovation_text is not None:
-            return []
+            return told
         self._innovation_text = (
             f"for {lasted:.1f} s the LiDAR has contradicted what the IMU predicts, scan after scan, by "
             f"{np.sqrt(self._innovation):.0f} standard deviations: units, mounting, clocks or topics of the two do not "
             "fit together (see 'boxplus inspect')"
         )
-        return [self._innovation_text]
+        return [*told, self._innovation_text]
 
     def _fit(self, frame: Frame, fitting_share: float) -> list[str]:
         """Whether the points near surfaces of the map lie on them: a pose that has gone astray fits some, and misses most."""
-        if fitting_share > _LEAST_FITTING:
-            self._misfit_since_ns = None
-            return []
-        if self._misfit_since_ns is None:
-            self._misfit_since_ns = frame.scan.start_ns
-        lasted = (frame.scan.end_ns - self._misfit_since_ns) * 1e-9
+        lasted = self._misfit.seconds(fitting_share <= _LEAST_FITTING, frame.scan.start_ns, frame.scan.end_ns)
         if lasted < _CONTRADICTED_STREAK_S or self._innovation_text is not None:
             return []
         self._innovation_text = (

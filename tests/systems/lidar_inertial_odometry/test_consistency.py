@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from boxplus.filtering.nav_state import BA, BW, TANGENT, NavState
+from boxplus.filtering.nav_state import BA, BW, TANGENT, NavState, P
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 
@@ -48,3 +48,18 @@ def test_biases_that_no_sensor_in_order_has_are_named_once(gyro: float, accel: f
     found = consistency._biases(x, sigma**2 * np.eye(TANGENT)) + consistency._biases(x, sigma**2 * np.eye(TANGENT))
     assert len(found) == told
     assert all("T_imu_lidar is wrong" in text for text in found)
+
+
+@pytest.mark.parametrize(("off_m", "samples", "told"), [(0.02, 10, 1), (0.005, 10, 0), (0.02, 1, 0)])
+def test_corrections_beyond_noise_are_named_once_after_two_seconds(off_m: float, samples: int, told: int) -> None:
+    """2 cm a scan, where the prediction and a registration are good for 1 cm; with one IMU sample a scan nobody knows."""
+    prior, x = NavState.identity().pack(), NavState.identity().pack()
+    x[P] += off_m
+    directions = SimpleNamespace(weak=np.zeros(6, bool), vectors=np.eye(6), lever_arm=1.0)
+    posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
+    consistency, found = Consistency(LioConfig(), None), []
+    for number in range(40):
+        frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
+        found.append(consistency._innovate(frame, prior, 1e-8 * np.eye(TANGENT), posterior))
+    assert sum(map(len, found)) == told and consistency.contradiction is None
+    assert not any(found[:20])
