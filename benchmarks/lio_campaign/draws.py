@@ -6,9 +6,10 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from imu_grades import IMU_GRADES, draw_imu
 from numpy.typing import NDArray
 
-from boxplus.simulation import Fault, ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting
+from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting
 from boxplus.simulation.lidar import LidarModel
 from lio_campaign.places import MOTIONS, PLACES, Place, make_motion
 from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Setting, deliver, draw_spoiling
@@ -21,12 +22,7 @@ _COLUMNS = {16: 900, 32: 512, 64: 512, 128: 512}
 _ROSETTE_POINTS_S = 200_000.0
 FAULTY_SHARE = 0.5
 _BAG_SHARE = 0.25
-# density of gyro [rad/s/√Hz] and accelerometer [m/s²/√Hz], walks of both biases, largest biases [rad/s], [m/s²]
-_IMU_GRADES: dict[str, tuple[float, ...]] = {
-    "tactical": (3e-5, 3e-4, 2e-6, 3e-5, 1e-3, 0.01),
-    "industrial": (1.7e-4, 2e-3, 1.9e-5, 1e-3, 0.01, 0.06),
-    "cheap": (4e-4, 4e-3, 5e-5, 2e-3, 0.03, 0.25),
-}
+_IMU_RATES_HZ = (100.0, 125.0, 200.0, 250.0, 400.0)
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ def draw_kinds(seed: int) -> Kinds:
     motion = str(random.choice(list(MOTIONS)))
     world = str(random.choice(MOTIONS[motion]))
     sensor = str(random.choice(SENSORS))
-    imu = str(random.choice(list(_IMU_GRADES)))
+    imu = str(random.choice(list(IMU_GRADES)))
     extrinsic = str(random.choice(EXTRINSICS, p=(0.4, 0.4, 0.2)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
     chance = random.uniform()
@@ -110,7 +106,7 @@ def draw(seed: int) -> Draw:
     lidar, duration_s = _lidar(kinds.sensor, random)
     trajectory = make_motion(kinds.motion, kinds.world, place, duration_s, random)
     duration_s = min(duration_s, trajectory.duration_s)
-    imu = _imu(kinds.imu, random)
+    imu = draw_imu(kinds.imu, _IMU_RATES_HZ, random)
     if kinds.motion == "vibration":
         strength, hz = random.uniform(0.7, 1.3), random.uniform(55.0, 90.0)
         imu = imu.model_copy(update={"accel_vibration": strength, "gyro_vibration": 0.02 * strength, "vibration_hz": hz})
@@ -165,19 +161,6 @@ def _lidar(sensor: str, random: np.random.Generator) -> tuple[LidarModel, float]
         rate_hz=rate, range_sigma_m=sigma, max_range=reach, channels=channels, azimuth_steps=steps, vertical_fov_deg=fov
     )
     return spinning, duration_s
-
-
-def _imu(grade: str, random: np.random.Generator) -> ImuModel:
-    gyro, accel, gyro_walk, accel_walk, gyro_bias, accel_bias = _IMU_GRADES[grade]
-    return ImuModel(
-        rate_hz=float(random.choice((100.0, 125.0, 200.0, 250.0, 400.0))),
-        gyro_noise_density=gyro,
-        accel_noise_density=accel,
-        gyro_bias_walk=gyro_walk,
-        accel_bias_walk=accel_walk,
-        gyro_bias=tuple(random.uniform(-gyro_bias, gyro_bias, 3)),
-        accel_bias=tuple(random.uniform(-accel_bias, accel_bias, 3)),
-    )
 
 
 def _mounting(near: bool, random: np.random.Generator) -> NDArray[np.float64]:

@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from imu_grades import IMU_GRADES, draw_imu
 
-from boxplus.simulation import ImuModel, manoeuvres
 from boxplus.simulation import faults as imu_faults
+from boxplus.simulation import manoeuvres
 from boxplus.simulation.cameras import (
     CameraFault,
     CameraRig,
@@ -41,16 +42,11 @@ FAULT_KINDS = (
     "covered_lens", "darkness", "drop_frames", *STEREO_FAULTS, "inverted_extrinsic", "imu_clock_offset", "other_imu",
     "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg", "flip_gyro",
 )  # fmt: skip
-# density of gyro [rad/s/√Hz] and accelerometer [m/s²/√Hz], walks of both biases, largest biases [rad/s], [m/s²]
-_IMU_GRADES: dict[str, tuple[float, ...]] = {
-    "tactical": (3e-5, 3e-4, 2e-6, 3e-5, 1e-3, 0.01),
-    "industrial": (1.7e-4, 2e-3, 1.9e-5, 1e-3, 0.01, 0.06),
-    "cheap": (4e-4, 4e-3, 5e-5, 2e-3, 0.03, 0.25),
-}
 _SPANS = {
     "room": (ROOM_LOW, ROOM_HIGH),
     "warehouse": (np.array([-12.0, -1.0, 1.2]), np.array([12.0, 1.0, 2.2])),
 }
+_IMU_RATES_HZ = (100.0, 200.0, 400.0)
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,7 @@ def draw_kinds(seed: int) -> Kinds:
     world = str(random.choice(MOTIONS[motion]))
     rig, lens = str(random.choice(RIGS, p=(0.65, 0.35))), str(random.choice(LENSES, p=(0.6, 0.25, 0.15)))
     light = str(random.choice(("steady", "swinging", "jumping"), p=(0.6, 0.25, 0.15)))
-    imu = str(random.choice(list(_IMU_GRADES)))
+    imu = str(random.choice(list(IMU_GRADES)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
     if fault in STEREO_FAULTS:
         rig = "stereo"
@@ -126,7 +122,7 @@ def draw(seed: int) -> Draw:
         scenario,
         name=f"campaign {seed}",
         trajectory=_motion(kinds, scenario, duration_s, seed, random),
-        imu=_imu(kinds.imu, random),
+        imu=draw_imu(kinds.imu, _IMU_RATES_HZ, random),
         light=light if kinds.light == "swinging" else Light(),
     )
     begin_s = float(random.uniform(3.0, 0.5 * duration_s))
@@ -154,19 +150,6 @@ def _motion(kinds: Kinds, scenario: CameraScenario, duration_s: float, seed: int
     rest = 0.0 if kinds.motion == "moving_start" else rest
     speed, rate = float(random.uniform(0.6, 1.5)), float(random.uniform(0.5, 1.2))
     return manoeuvres.handheld(length, low, high, speed=speed, rate=rate, standstill_s=rest, seed=seed)
-
-
-def _imu(grade: str, random: np.random.Generator) -> ImuModel:
-    gyro, accel, gyro_walk, accel_walk, gyro_bias, accel_bias = _IMU_GRADES[grade]
-    return ImuModel(
-        rate_hz=float(random.choice((100.0, 200.0, 400.0))),
-        gyro_noise_density=gyro,
-        accel_noise_density=accel,
-        gyro_bias_walk=gyro_walk,
-        accel_bias_walk=accel_walk,
-        gyro_bias=tuple(random.uniform(-gyro_bias, gyro_bias, 3)),
-        accel_bias=tuple(random.uniform(-accel_bias, accel_bias, 3)),
-    )
 
 
 Maker = Callable[[float, np.random.Generator, Kinds], CameraFault]

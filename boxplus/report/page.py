@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.runs.run_facts import Gap, WarningFacts
+from boxplus.runs.run_facts import Gap, WarningFacts, WeakInterval
 from boxplus.runs.run_summary import Matrix
 
 
@@ -43,7 +43,7 @@ def _body(data: RunData) -> str:
             "axis of the pose (rotation about the IMU's axes, position along the world's), the share of its information that "
             "came from the LiDAR.",
             figures.status_and_axes(data),
-            _weak_table(data),
+            weak_table(data.summary.weak_intervals, "scans"),
         )
     )
     parts.append(figure_section("Timing", _timing_text(data), figures.timing(data), _stage_table(data)))
@@ -97,12 +97,12 @@ def warning_lines(warnings: Iterable[WarningFacts]) -> list[str]:
     return lines
 
 
-def _weak_table(data: RunData) -> str:
-    intervals = data.summary.weak_intervals
+def weak_table(intervals: Sequence[WeakInterval], unit: str) -> str:
+    """The intervals that were not ok, folded away; `unit` is what they count."""
     if not intervals:
         return ""
     rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.count}", i.text) for i in intervals[:200]]
-    table = html_table(rows, ("time", "status", "scans", "at its beginning"))
+    table = html_table(rows, ("time", "status", unit, "at its beginning"))
     return f"<details><summary>Intervals that were not ok: {len(intervals)}</summary>{table}</details>"
 
 

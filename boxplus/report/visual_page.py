@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
 from boxplus.report import figures
-from boxplus.report.page import evidence_table, matrix_text, warning_lines
+from boxplus.report.page import evidence_table, matrix_text, warning_lines, weak_table
 from boxplus.report.palette import REJECTED, STATUS, shown_rows
 from boxplus.report.plots import biases_picture, plain, status_strip, trajectory_picture, write_pictures
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
@@ -50,7 +50,7 @@ def _body(data: VisualData) -> str:
             "Status and corners",
             f"{states} Below, the landmarks that each frame saw and that agree with it, and what was not used, by reason.",
             _tracked(data),
-            _weak_table(data),
+            weak_table(data.summary.weak_intervals, "frames"),
         ),
         figure_section("Biases", "With one standard deviation.", figures.biases(data)),
         figure_section("Velocity", "Of the IMU, along the world's axes.", figures.velocity(data)),
@@ -132,15 +132,6 @@ def _tracked_picture(data: VisualData) -> Figure:
     axes.margins(x=0.0)
     plain(axes)
     return figure
-
-
-def _weak_table(data: VisualData) -> str:
-    intervals = data.summary.weak_intervals
-    if not intervals:
-        return ""
-    rows = [(f"{i.begin_s:.1f} – {i.end_s:.1f} s", i.status, f"{i.count}", i.text) for i in intervals[:200]]
-    table = html_table(rows, ("time", "status", "frames", "at its beginning"))
-    return f"<details><summary>Intervals that were not ok: {len(intervals)}</summary>{table}</details>"
 
 
 def _timing_text(data: VisualData) -> str:

@@ -15,7 +15,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.simulation.imu import ImuModel, SimulatedImu
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.scenarios import Scenario, make_scenario
-from boxplus.simulation.spline import Motion
+from boxplus.simulation.spline import Motion, span_of
 from boxplus.simulation.world import World
 
 Event = Scan | ImuSamples
@@ -55,21 +55,13 @@ class Simulation:
 
     def __init__(self, scenario: Scenario, seed: int = 0, duration_s: float | None = None) -> None:
         trajectory = scenario.trajectory
-        duration = trajectory.duration_s if duration_s is None else float(duration_s)
-        if not 0 < duration <= trajectory.duration_s:
-            raise InputError(
-                f"a duration of at most {trajectory.duration_s:.1f} s, the length of the motion of {scenario.name!r}",
-                f"{duration:g} s",
-                "ask for less, or give a scenario with a longer trajectory",
-            )
+        self.start_ns, self.end_ns, duration = span_of(trajectory, scenario.name, duration_s)
         T_imu_lidar = np.array(scenario.T_imu_lidar, dtype=np.float64)
         if T_imu_lidar.shape != (4, 4) or not so3.is_rotation(T_imu_lidar[:3, :3]):
             raise InputError("T_imu_lidar (4, 4) with a rotation", f"shape {T_imu_lidar.shape}", "give a rigid transform")
         self.scenario = scenario
         self.world: World = scenario.world
         self.T_imu_lidar: NDArray[np.float64] = T_imu_lidar
-        self.start_ns = trajectory.start_ns
-        self.end_ns = min(self.start_ns + round(duration * 1e9), trajectory.end_ns)
         self.config = SimulationConfig(
             scenario=scenario.name,
             seed=seed,

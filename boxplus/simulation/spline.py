@@ -51,6 +51,22 @@ class Trajectory(Protocol):
         """Exact motion at `time_ns` (N,) integers [ns]."""
 
 
+def span_of(trajectory: Trajectory, name: str, duration_s: float | None) -> tuple[int, int, float]:
+    """First and last instant [ns] and length [s] of the beginning of a motion, all of it without `duration_s`.
+
+    Raises:
+        InputError: the motion, that of the scenario `name`, is not so long.
+    """
+    duration = trajectory.duration_s if duration_s is None else float(duration_s)
+    if not 0 < duration <= trajectory.duration_s:
+        raise InputError(
+            f"a duration of at most {trajectory.duration_s:.1f} s, the length of the motion of {name!r}",
+            f"{duration:g} s",
+            "ask for less, or give a scenario with a longer trajectory",
+        )
+    return trajectory.start_ns, min(trajectory.start_ns + round(duration * 1e9), trajectory.end_ns), duration
+
+
 @kernel(inline=True)
 def _multiply(A: Floats, B: Floats, C: Floats) -> None:
     """C = A B, all (3, 3); C is neither A nor B."""

@@ -17,7 +17,7 @@ from boxplus.simulation.cameras.renderer import Renderer, Surfaces
 from boxplus.simulation.cameras.scenarios import CameraScenario, Light, make_camera_scenario
 from boxplus.simulation.cameras.sensor import ELECTRONS_PER_GREY, GREY_PER_LIGHT_SECOND, CameraRig
 from boxplus.simulation.imu import ImuModel, SimulatedImu
-from boxplus.simulation.spline import Motion
+from boxplus.simulation.spline import Motion, span_of
 from boxplus.simulation.world import Solid
 
 Floats = NDArray[np.float64]
@@ -63,16 +63,8 @@ class CameraSimulation:
 
     def __init__(self, scenario: CameraScenario, seed: int = 0, duration_s: float | None = None) -> None:
         trajectory = scenario.trajectory
-        duration = trajectory.duration_s if duration_s is None else float(duration_s)
-        if not 0 < duration <= trajectory.duration_s:
-            raise InputError(
-                f"a duration of at most {trajectory.duration_s:.1f} s, the length of the motion of {scenario.name!r}",
-                f"{duration:g} s",
-                "ask for less, or give a scenario with a longer trajectory",
-            )
+        self.start_ns, self.end_ns, duration = span_of(trajectory, scenario.name, duration_s)
         self.scenario = scenario
-        self.start_ns = trajectory.start_ns
-        self.end_ns = min(self.start_ns + round(duration * 1e9), trajectory.end_ns)
         self.config = CameraSimulationConfig(
             scenario=scenario.name,
             seed=seed,
