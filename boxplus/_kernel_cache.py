@@ -2,8 +2,8 @@
 
 Numba's own cache looks at the modification time of the file that defines a function and not at the files its callees
 come from, so an edited helper leaves stale machine code behind. Here every kernel is cached under a hash of its own
-file, of every boxplus file that file imports (transitively), of Numba's version and of the processor. A stale kernel is
-impossible, and editing one file recompiles only what depends on it.
+file, of every boxplus file that file imports (transitively), of Numba's version and of the processor, and under the name
+of its module. A stale kernel is impossible, and editing one file recompiles only what depends on it.
 
 What is read back is unpickled, and so can run any code. It is therefore read only from folders and files that nobody but
 this user (or root) can write to, and only if it still has the checksum it was written with. Whatever fails is compiled
@@ -151,7 +151,10 @@ class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
         file = Path(py_file).resolve()
         self._line = py_func.__code__.co_firstlineno
-        self._folder = cache_root() / "kernels" / _source_key(file)
+        # Machine code imports, by name, the module its function was defined in: a file that was run as a script and is
+        # imported now, or imported under another name, is another one.
+        module = hashlib.sha256(py_func.__module__.encode()).hexdigest()[:8]
+        self._folder = cache_root() / "kernels" / f"{_source_key(file)}-{module}"
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -175,7 +178,7 @@ class _VerifiedFiles(IndexDataCacheFile):  # type: ignore[misc]
         content = self._read(self._index_path)
         if content is None:
             return {}
-        stamp, overloads = pickle.loads(content)
+        stamp, overloads = self._unpickle(self._index_path, content) or (None, {})
         return overloads if stamp == self._source_stamp else {}
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
@@ -183,10 +186,18 @@ class _VerifiedFiles(IndexDataCacheFile):  # type: ignore[misc]
 
     def _load_data(self, name: str) -> Any:
         content = self._read(self._data_path(name))  # type: ignore[no-untyped-call]
-        return None if content is None else pickle.loads(content)
+        return None if content is None else self._unpickle(self._data_path(name), content)  # type: ignore[no-untyped-call]
 
     def _save_data(self, name: str, data: Any) -> None:
         self._write(self._data_path(name), self._dump(data))  # type: ignore[no-untyped-call]
+
+    def _unpickle(self, path: str, content: bytes) -> Any:
+        """What was saved, or None where it cannot be restored here: it is compiled again."""
+        try:
+            return pickle.loads(content)
+        except Exception as error:  # noqa: BLE001 - whatever its imports raise: a cache must never stop a program
+            _warn_once("unrestorable", "%s cannot be restored (%r): its kernel is compiled again", path, error)
+            return None
 
     def _read(self, path: str) -> bytes | None:
         """What was written to `path`, if all of it is there and nobody else can have written it."""

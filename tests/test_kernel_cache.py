@@ -122,6 +122,27 @@ def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
     assert run(tmp_path / "file") == "8.0 ['twice']"
 
 
+@compiles
+def test_a_file_under_another_module_name_has_kernels_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(_PROGRAM)
+    as_a_module = "import importlib.util as u; s = u.spec_from_file_location({0!r}, {1!r}); m = u.module_from_spec(s); "
+    as_a_module += "import sys; sys.modules[{0!r}] = m; s.loader.exec_module(m)"
+
+    def run(*arguments: str) -> str:
+        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": ""}
+        done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
+        assert done.stderr == ""
+        return done.stdout.strip()
+
+    for arguments in (
+        [str(tmp_path / "program.py")],
+        ["-c", as_a_module.format("first", str(tmp_path / "program.py"))],
+        ["-c", as_a_module.format("second.name", str(tmp_path / "program.py"))],
+    ):
+        assert run(*arguments) == "8.0 ['twice']"
+        assert run(*arguments) == "8.0 []"
+
+
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache folder of this test's own, about which nothing was said yet."""
@@ -165,6 +186,33 @@ def test_a_damaged_file_is_discarded_said_once_and_written_again(
     assert [record.getMessage() for record in caplog.records] == [
         f"{file} is damaged (cut or changed): it is discarded and its kernel compiled again"
     ]
+
+
+def _gone() -> None:
+    raise ModuleNotFoundError("No module named 'gone'")
+
+
+class _Unrestorable:
+    """Unpickling it fails, as that of machine code does whose module has gone."""
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return _gone, ()
+
+
+@compiles
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_what_cannot_be_restored_is_said_once_and_compiled_again(
+    cache: Path, caplog: pytest.LogCaptureFixture, ending: str
+) -> None:
+    assert _compiled_names() == ["twice"] and _compiled_names() == []
+    (file,) = _files(cache, ending)
+    payload = pickle.dumps(_Unrestorable())
+    file.write_bytes(_kernel_cache.hashlib.sha256(payload).digest() + payload)
+    with caplog.at_level(logging.WARNING):
+        assert _compiled_names() == ["twice"]
+        assert _compiled_names() == []
+    (record,) = caplog.records
+    assert f"{file} cannot be restored" in record.getMessage() and "No module named 'gone'" in record.getMessage()
 
 
 class _Planted:
