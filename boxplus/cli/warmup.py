@@ -26,6 +26,7 @@ def warmup() -> None:
             _optimize_pose_graphs()
             _adjust_bundle()
             _follow_camera()
+            _follow_camera_and_imu()
     what = f"{len(compiled)} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
     console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
 
@@ -106,3 +107,21 @@ def _follow_camera() -> None:
     for k, grey in enumerate(greys[:4]):
         by_depth.push_rgbd(k, grey, np.full(grey.shape, 2.0))
         by_stereo.push_stereo(k, grey, greys[k + 1])
+
+
+def _follow_camera_and_imu() -> None:
+    import importlib.util
+    import tempfile
+    from pathlib import Path
+
+    from boxplus.runs.visual_inertial.config import VioRunConfig
+    from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+    from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+
+    if importlib.util.find_spec("cv2") is None:  # then there is no run either
+        return
+    # At rest for two seconds, then moving: a start, and a window from which keyframes leave.
+    simulation = simulate_cameras("room", 1, duration_s=4.0, rig=make_rig("stereo", None, 0.3, 15.0))
+    config = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})
+    with tempfile.TemporaryDirectory() as folder:
+        run_visual_odometry(as_camera_recording(simulation), Path(folder) / "run", config)

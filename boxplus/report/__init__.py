@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from boxplus.report.run_data import RunData
     from boxplus.report.visual_data import VisualData
+    from boxplus.runs.direct.summary import DirectSummary
+    from boxplus.runs.visual_inertial.summary import VioSummary
+
+    AnyRun = RunData | VisualData[VioSummary] | VisualData[DirectSummary]
 
 
-def write_report(run: str | Path | RunData | VisualData) -> Path:
+def write_report(run: str | Path | AnyRun) -> Path:
     """Draw `report.html` and the pictures in `plots/` from the output folder of a run, finished or not.
 
     Args:
@@ -24,29 +28,35 @@ def write_report(run: str | Path | RunData | VisualData) -> Path:
         InputError: no run's folder, or a run without a single estimate.
         OutputError: the files cannot be written.
     """
+    from boxplus.report.direct_page import write_direct_report
     from boxplus.report.page import write_page
     from boxplus.report.plots import write_plots
     from boxplus.report.run_data import RunData
     from boxplus.report.visual_page import write_visual_report
 
     data = load_report(run) if isinstance(run, (str, Path)) else run
-    if not isinstance(data, RunData):
-        return write_visual_report(data)
-    write_plots(data)
-    return write_page(data)
+    if isinstance(data, RunData):
+        write_plots(data)
+        return write_page(data)
+    if data.summary.program == "boxplus vo":
+        return write_direct_report(data)
+    return write_visual_report(data)
 
 
-def load_report(folder: str | Path) -> RunData | VisualData:
+def load_report(folder: str | Path) -> AnyRun:
     """What the report of a run shows, of any kind of odometry.
 
     Raises:
         InputError: no run's folder, or a run without a single estimate.
     """
     from boxplus.report.run_data import load_run
-    from boxplus.report.visual_data import load_visual_run
+    from boxplus.report.visual_data import load_direct_run, load_visual_run
     from boxplus.runs.output_folder import SUMMARY, program_of
 
     with suppress(OSError):
-        if program_of(Path(folder) / SUMMARY) == "boxplus vio":
+        program = program_of(Path(folder) / SUMMARY)
+        if program == "boxplus vio":
             return load_visual_run(folder)
+        if program == "boxplus vo":
+            return load_direct_run(folder)
     return load_run(folder)

@@ -9,7 +9,7 @@ from pathlib import Path
 from boxplus.report import figures
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.runs.run_facts import Gap, WarningFacts, WeakInterval
+from boxplus.runs.run_facts import Gap, RunFacts, WarningFacts, WeakInterval
 from boxplus.runs.run_summary import Matrix
 
 
@@ -72,12 +72,17 @@ def _head(data: RunData) -> str:
         (f"{summary.timing.real_time_factor:.1f} ×", "real time, reading included"),
         (f"{summary.map.stored_points:,}", "map points"),
     ]
+    return headline(summary, summary.recording.path, summary.recording.format, numbers)
+
+
+def headline(summary: RunFacts, recording: str, form: str, numbers: Sequence[tuple[str, str]]) -> str:
+    """What a report begins with: the recording, how far the run came, the main numbers."""
     color = summary.state if summary.contradiction is None else "failed"
     told = summary.describe_state().removeprefix(summary.state).lstrip(": ")
     return (
-        f"<h1>{escape(Path(summary.recording.path).name)}</h1>"
+        f"<h1>{escape(Path(recording).name)}</h1>"
         f'<p class="lead"><span class="state {color}">{summary.state}</span> {escape(told)} · '
-        f"{escape(summary.recording.format)} · boxplus {escape(summary.versions['boxplus'])} · "
+        f"{escape(form)} · boxplus {escape(summary.versions['boxplus'])} · "
         f"{summary.started:%Y-%m-%d %H:%M} UTC</p>"
         f"{tiles(numbers)}"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,31 +14,35 @@ from boxplus.errors import InputError
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.report.run_data import sigmas_of
+from boxplus.runs.cameras.folder import CameraRunFolder, DirectFolder, VioFolder
+from boxplus.runs.direct import frame_log as direct_log
+from boxplus.runs.direct.summary import DirectSummary, read_direct_summary
 from boxplus.runs.row_log import RowLog
-from boxplus.runs.visual_inertial.frame_log import read_frame_log
+from boxplus.runs.visual_inertial import frame_log as visual_log
 from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
-from boxplus.runs.visual_inertial.vio_folder import VioFolder
 
 _MOST_POINTS = 100_000
 
+SummaryT = TypeVar("SummaryT", VioSummary, DirectSummary)
+
 
 @dataclass(frozen=True, slots=True)
-class VisualData:
+class VisualData(Generic[SummaryT]):
     """A run with cameras as its folder tells it.
 
     Attributes:
         folder: where it lies.
         summary: the facts; how far the run came is counted in the rows that can be read.
         seconds: (N,) time of every frame since the first one with a state [s].
-        position: (N, 3) of the IMU in the world [m].
+        position: (N, 3) of the IMU, or of a camera without one, in the world [m].
         sigma: (N, 6) standard deviations of the pose: rotation [rad], position [m].
         log: everything else per frame.
         map_points: (M, 3) the landmarks [m].
         evaluation: the comparison with a ground truth, or None.
     """
 
-    folder: VioFolder
-    summary: VioSummary
+    folder: CameraRunFolder
+    summary: SummaryT
     seconds: NDArray[np.float64]
     position: NDArray[np.float64]
     sigma: NDArray[np.float64]
@@ -52,15 +56,28 @@ class VisualData:
         return self.log.status
 
 
-def load_visual_run(folder: str | Path) -> VisualData:
-    """Read the output folder of a run, finished or not.
+def load_visual_run(folder: str | Path) -> VisualData[VioSummary]:
+    """Read the output folder of a run of 'boxplus vio', finished or not.
 
     Raises:
-        InputError: no folder of 'boxplus vio', or a run without a single frame.
+        InputError: no such folder, or a run without a single frame.
     """
     run = VioFolder(Path(folder))
-    summary = read_vio_summary(run.summary)
-    trajectory, log = read_trajectory(run.trajectory, "csv"), read_frame_log(run.frames)
+    return _load(run, read_vio_summary(run.summary), visual_log.read_frame_log(run.frames))
+
+
+def load_direct_run(folder: str | Path) -> VisualData[DirectSummary]:
+    """Read the output folder of a run of 'boxplus vo', finished or not.
+
+    Raises:
+        InputError: no such folder, or a run without a single frame.
+    """
+    run = DirectFolder(Path(folder))
+    return _load(run, read_direct_summary(run.summary), direct_log.read_frame_log(run.frames))
+
+
+def _load(run: CameraRunFolder, summary: SummaryT, log: RowLog) -> VisualData[SummaryT]:
+    trajectory = read_trajectory(run.trajectory, "csv")
     count = min(len(trajectory), len(log))  # a killed run may have written one row more to one of them
     if not count:
         raise InputError(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -12,27 +14,30 @@ from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
 from boxplus.report import figures
-from boxplus.report.page import evidence_table, matrix_text, warning_lines, weak_table
+from boxplus.report.page import evidence_table, headline, matrix_text, warning_lines, weak_table
 from boxplus.report.palette import REJECTED, STATUS, shown_rows
 from boxplus.report.plots import biases_picture, plain, status_strip, trajectory_picture, write_pictures
-from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
-from boxplus.report.visual_data import VisualData
-from boxplus.runs.visual_inertial.vio_folder import PLOTS
+from boxplus.report.skeleton import figure_section, html_table, warnings_section, write_html
+from boxplus.report.timeline import Timeline
+from boxplus.report.visual_data import SummaryT, VisualData
+from boxplus.runs.cameras.facts import FrameTiming
+from boxplus.runs.run_facts import Distribution
+from boxplus.runs.visual_inertial.summary import VioSummary
 
 
-def write_visual_report(data: VisualData) -> Path:
+def write_visual_report(data: VisualData[VioSummary]) -> Path:
     """Draw `report.html` and the pictures in `plots/`; returns the path of the report.
 
     Raises:
         OutputError: they cannot be written.
     """
     way = f"{data.summary.path_length_m:.1f} m in {data.summary.duration_s:.1f} s, from above"
-    pictures = (_trajectory_picture(data, way), _tracked_picture(data), biases_picture(data))
-    write_pictures(data.folder.plots, dict(zip(PLOTS, pictures, strict=True)))
+    pictures = (close_trajectory_picture(data, way), _tracked_picture(data), biases_picture(data))
+    write_pictures(data.folder.plots, dict(zip(data.folder.pictures, pictures, strict=True)))
     return write_html(data.folder.report, Path(data.summary.recording.path).name, _body(data))
 
 
-def _body(data: VisualData) -> str:
+def _body(data: VisualData[VioSummary]) -> str:
     summary = data.summary
     landmarks = f"{len(data.map_points):,} of {summary.landmarks:,} landmarks, by height; the trajectory by status."
     states = (
@@ -57,7 +62,7 @@ def _body(data: VisualData) -> str:
         figure_section(
             "Uncertainty", "Standard deviations of the pose, relative to position and yaw of the first.", figures.sigmas(data)
         ),
-        figure_section("Timing", _timing_text(data), figures.timing(data, "frame")),
+        figure_section("Timing", timing_text(data.summary.timing), figures.timing(data, "frame")),
         _start(data),
         _cameras(data),
         _facts(data),
@@ -65,34 +70,37 @@ def _body(data: VisualData) -> str:
     return "\n".join(parts)
 
 
-def _head(data: VisualData) -> str:
+def _head(data: VisualData[VioSummary]) -> str:
     summary = data.summary
     frame = summary.timing.frame_ms
     numbers = [
         (f"{summary.frames}", f"frames, {summary.keyframes} of them keyframes"),
         (f"{summary.path_length_m:.2f} m", f"path in {summary.duration_s:.1f} s"),
         (f"{summary.status.get('ok', 0) / max(summary.frames, 1):.1%}", "of the frames ok"),
-        (
-            f"{frame.median:.1f} ms" if frame else "–",
-            f"median per frame, 99th percentile {frame.p99:.1f} ms" if frame else "per frame",
-        ),
+        *timing_tiles(frame),
         (f"{summary.landmarks:,}", "landmarks"),
+        *accuracy_tiles(data.evaluation),
     ]
-    if data.evaluation is not None:
-        rmse = 100.0 * float(data.evaluation["ate_translation_m"]["rmse"])
-        numbers.append((f"{rmse:.2f} cm", "ATE (rmse), position and yaw aligned"))
-    color = summary.state if summary.contradiction is None else "failed"
-    told = summary.describe_state().removeprefix(summary.state).lstrip(": ")
-    return (
-        f"<h1>{escape(Path(summary.recording.path).name)}</h1>"
-        f'<p class="lead"><span class="state {color}">{summary.state}</span> {escape(told)} · '
-        f"{escape(summary.recording.format)} · boxplus {escape(summary.versions['boxplus'])} · "
-        f"{summary.started:%Y-%m-%d %H:%M} UTC</p>"
-        f"{tiles(numbers)}"
-    )
+    return headline(summary, summary.recording.path, summary.recording.format, numbers)
 
 
-def _tracked(data: VisualData) -> go.Figure:
+def timing_tiles(frame: Distribution | None) -> list[tuple[str, str]]:
+    """Milliseconds per frame."""
+    if frame is None:
+        return []
+    return [(f"{frame.median:.1f} ms", f"median per frame, mean {frame.mean:.1f} ms, 99th percentile {frame.p99:.1f} ms")]
+
+
+def accuracy_tiles(evaluation: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """The error, where there is a ground truth."""
+    if evaluation is None:
+        return []
+    aligned = {"yaw": "position and yaw", "se3": "position and rotation", "sim3": "position, rotation and scale"}
+    rmse = 100.0 * float(evaluation["ate_translation_m"]["rmse"])
+    return [(f"{rmse:.2f} cm", f"ATE (rmse), {aligned[evaluation['alignment']['kind']]} aligned")]
+
+
+def _tracked(data: VisualData[VioSummary]) -> go.Figure:
     """The status, and the corners of every frame: used, and rejected by reason."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, row_heights=[0.1, 0.9], vertical_spacing=0.03)
     rows = shown_rows(data)
@@ -104,7 +112,7 @@ def _tracked(data: VisualData) -> go.Figure:
     return figures.over_time(figure, data, 380, bottom_row=2)
 
 
-def _trajectory_picture(data: VisualData, title: str) -> Figure:
+def close_trajectory_picture(data: Timeline, title: str) -> Figure:
     """From above, as far around the path as it is long: landmarks may lie much farther."""
     figure = trajectory_picture(data, title)
     low, high = data.position[:, :2].min(axis=0), data.position[:, :2].max(axis=0)
@@ -113,7 +121,7 @@ def _trajectory_picture(data: VisualData, title: str) -> Figure:
     return figure
 
 
-def _tracked_picture(data: VisualData) -> Figure:
+def _tracked_picture(data: VisualData[VioSummary]) -> Figure:
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     strip, axes = figure.subplots(2, 1, sharex=True, height_ratios=[0.12, 1.0])
     rows = shown_rows(data)
@@ -134,8 +142,8 @@ def _tracked_picture(data: VisualData) -> Figure:
     return figure
 
 
-def _timing_text(data: VisualData) -> str:
-    timing = data.summary.timing
+def timing_text(timing: FrameTiming) -> str:
+    """Where the time went, in words."""
     text = (
         f"The odometry's time per frame by stage. In all {timing.total_s:.1f} s: {timing.odometry_s:.1f} s odometry, "
         f"{timing.reading_s:.1f} s waiting for the reader, {timing.writing_s:.1f} s writing."
@@ -145,7 +153,7 @@ def _timing_text(data: VisualData) -> str:
     return text
 
 
-def _start(data: VisualData) -> str:
+def _start(data: VisualData[VioSummary]) -> str:
     summary = data.summary
     if summary.start is None:
         return ""
@@ -157,7 +165,7 @@ def _start(data: VisualData) -> str:
     return f"<section><h2>Start</h2><p>{escape(text)}</p>{html_table(rows)}</section>"
 
 
-def _cameras(data: VisualData) -> str:
+def _cameras(data: VisualData[VioSummary]) -> str:
     parts = []
     for camera in data.summary.cameras:
         matrices = f"<td><pre>{matrix_text(camera.T_imu_camera_start)}</pre></td>"
@@ -171,18 +179,25 @@ def _cameras(data: VisualData) -> str:
     return f"<section><h2>Cameras</h2>{''.join(parts)}</section>"
 
 
-def _facts(data: VisualData) -> str:
+def _facts(data: VisualData[VioSummary]) -> str:
     summary = data.summary
     recording = summary.recording
-    rejected = [(place, reason, f"{count:,}") for place, counts in summary.rejected.items() for reason, count in counts.items()]
     rows: list[tuple[str, ...]] = [
         ("recording", recording.path),
         ("IMU", f"{recording.imu}, {summary.imu_samples_read} samples"),
-        ("memory", f"{summary.peak_memory_mb:.0f} MB at most" if summary.peak_memory_mb is not None else "–"),
-        ("versions", ", ".join(f"{name} {version}" for name, version in summary.versions.items())),
     ]
+    return run_section(data, rows)
+
+
+def run_section(data: VisualData[SummaryT], rows: list[tuple[str, ...]]) -> str:
+    """What was not used, the facts of the run, and how the recording was read."""
+    summary = data.summary
+    rejected = [(place, reason, f"{count:,}") for place, counts in summary.rejected.items() for reason, count in counts.items()]
     table = html_table(rejected, ("where", "rejected because", "count")) or "<p>Nothing was rejected.</p>"
+    memory = f"{summary.peak_memory_mb:.0f} MB at most" if summary.peak_memory_mb is not None else "–"
+    versions = ", ".join(f"{name} {version}" for name, version in summary.versions.items())
+    facts = html_table([*rows, ("memory", memory), ("versions", versions)])
     return (
-        f"<section><h2>Rejections</h2>{table}</section><section><h2>Run</h2>{html_table(rows)}</section>"
-        f"{evidence_table(recording.evidence, data.folder.config)}"
+        f"<section><h2>Rejections</h2>{table}</section><section><h2>Run</h2>{facts}</section>"
+        f"{evidence_table(summary.recording.evidence, data.folder.config)}"
     )

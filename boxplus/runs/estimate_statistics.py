@@ -182,4 +182,4 @@ def _distribution(values: array[float]) -> Distribution | None:
         return None
     data = np.frombuffer(values, dtype=np.float64).copy()  # a view would keep the array from growing
     median, p99 = np.percentile(data, [50, 99])
-    return Distribution(median=float(median), p99=float(p99), max=float(data.max()))
+    return Distribution(median=float(median), mean=float(data.mean()), p99=float(p99), max=float(data.max()))

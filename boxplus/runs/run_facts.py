@@ -34,6 +34,7 @@ class Distribution(Part):
     """Milliseconds per estimate."""
 
     median: float
+    mean: float
     p99: float
     max: float
 

@@ -7,7 +7,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from boxplus.runs.run_facts import Distribution, Part, RunFacts, read_facts
+from boxplus.runs.cameras.facts import CameraRecordingFacts, FrameTiming
+from boxplus.runs.run_facts import Part, RunFacts, read_facts
 
 Matrix = list[list[float]]
 
@@ -23,31 +24,6 @@ class CameraFacts(Part):
     T_imu_camera_start: Matrix
     T_imu_camera_end: Matrix | None = None
     sources: dict[str, str] = Field(default={}, description="where intrinsics, mounting and time offset come from")
-
-
-class CameraRecordingFacts(Part):
-    """The recording as it was read."""
-
-    path: str
-    format: str
-    imu: str = Field(description="topic or file of the IMU")
-    duration_s: float = Field(description="between its first and last message [s]")
-    messages: int = Field(description="images and IMU samples to read")
-    progress: float = Field(0.0, description="share of the recording that was read, 0 to 1")
-    evidence: list[dict[str, str]] = Field(default=[], description="every reading found from the data: key, value, verdict, text")
-
-
-class FrameTiming(Part):
-    """Where the time went."""
-
-    frame_ms: Distribution | None = Field(None, description="the odometry's time per frame, all stages")
-    stages_ms: dict[str, Distribution] = Field(default={})
-    reading_s: float = Field(0.0, description="waiting for the reader, decoding of images included, all in all")
-    odometry_s: float = 0.0
-    writing_s: float = Field(0.0, description="trajectory, frames and landmarks")
-    total_s: float = Field(0.0, description="from the start of the run to this writing")
-    real_time_factor: float = Field(0.0, description="sensor time by the time of the run until its last frame, reading included")
-    compiled_kernels: int = Field(0, description="kernels compiled during the run: more than zero on first use only")
 
 
 class VioSummary(RunFacts):

@@ -14,23 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, printable
-from boxplus.formats.ply import write_ply
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
+from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recording_facts
+from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
+from boxplus.runs.cameras.landmark_file import LandmarkFile
 from boxplus.runs.estimate_statistics import EstimateStatistics
-from boxplus.runs.run_facts import StartFacts, State, WarningFacts
+from boxplus.runs.run_facts import StartFacts, State
 from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
-from boxplus.runs.visual_inertial.summary import CameraFacts, CameraRecordingFacts, FrameTiming, VioSummary
-from boxplus.runs.visual_inertial.vio_folder import VioFolder, claim_vio_folder
+from boxplus.runs.visual_inertial.summary import CameraFacts, VioSummary
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.odometry import VisualInertialOdometry
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 
-_LANDMARKS_EVERY_S = 10.0
 _TOLD = {
     "duration [s]": "over {:.2f} s",
     "image motion [px]": "images move by {:.2f} px",
@@ -59,7 +59,7 @@ def run_visual_odometry(
 
     Args:
         recording: opened.
-        folder: created; see docs/output_folder.md for what it holds. Or what `claim_vio_folder` yields.
+        folder: created; see docs/output_folder.md for what it holds. Or what `claim_camera_folder` yields.
         config: settings; each has a default.
         overwrite: replace the results of an earlier run in the folder.
         progress: called after every event that was read.
@@ -80,7 +80,8 @@ def run_visual_odometry(
         {'ok': 3638}
     """
     config = config or VioRunConfig()
-    claimed = nullcontext(folder) if isinstance(folder, VioFolder) else claim_vio_folder(folder, overwrite=overwrite)
+    run = folder if isinstance(folder, VioFolder) else VioFolder(Path(folder))
+    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite)
     with claimed as vio_folder:
         return _Run(recording, vio_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
 
@@ -103,7 +104,9 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
         self._time_offset_s = 0.0
         self._landmarks: dict[int, NDArray[np.float64]] = {}
-        self._landmarks_due = time.perf_counter() + _LANDMARKS_EVERY_S
+        self._landmark_file = LandmarkFile(
+            folder.landmarks, lambda: np.array(list(self._landmarks.values()), dtype=np.float32).reshape(-1, 3)
+        )
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -152,20 +155,11 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
 
     def between_events(self) -> None:
         """See `RunLoop.between_events`."""
-        if time.perf_counter() > self._landmarks_due:
-            self._write_landmarks()
+        self.seconds["writing"] += self._landmark_file.write_if_due()
 
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
-        self._write_landmarks()
-
-    def _write_landmarks(self) -> None:
-        began = time.perf_counter()
-        if self._landmarks:
-            write_ply(self._folder.landmarks, np.array(list(self._landmarks.values()), dtype=np.float32))
-        now = time.perf_counter()
-        self._landmarks_due = now + max(_LANDMARKS_EVERY_S, 20.0 * (now - began))
-        self.seconds["writing"] += now - began
+        self.seconds["writing"] += self._landmark_file.write()
 
     def nothing_found(self) -> InputError:
         """See `RunLoop.nothing_found`."""
@@ -191,15 +185,7 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
             process=os.getpid(),
             started=self.started,
             updated=datetime.now(UTC),
-            recording=CameraRecordingFacts(
-                path=printable(str(info.path.resolve())),
-                format=info.format,
-                imu=printable(info.imu.source if info.imu is not None else ""),
-                duration_s=info.duration_s,
-                messages=info.message_count,
-                progress=self.recording.progress,
-                evidence=[{"key": e.key, "value": e.value, "verdict": e.verdict, "text": e.text} for e in info.evidence],
-            ),
+            recording=recording_facts(info, self.recording.progress, with_imu=True),
             cameras=self._cameras(),
             start=None if start is None else _start_facts(start),
             start_facts={} if start is None else {name: float(value) for name, value in start.facts.items()},
@@ -223,12 +209,12 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
             imu_gaps=counts.imu_gaps(),
             time_offset_s=self._time_offset_s,
             landmarks=len(self._landmarks),
-            timing=self._timing(),
+            timing=frame_timing(self),
             peak_memory_mb=peak_memory_mb(),
             warnings=[
                 *counts.status_warnings(),
                 *counts.warnings.facts(counts.first_time_ns),
-                *(WarningFacts(text=f"{e.key}: {e.text}", count=1) for e in info.evidence if e.verdict != "ok"),
+                *evidence_warnings(info),
             ],
         )
 
@@ -249,18 +235,6 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
                 )
             )
         return facts
-
-    def _timing(self) -> FrameTiming:
-        return FrameTiming(
-            frame_ms=self.counts.estimate_ms(),
-            stages_ms=self.counts.stages_ms(),
-            reading_s=self.seconds["reading"],
-            odometry_s=self.seconds["odometry"],
-            writing_s=self.seconds["writing"],
-            total_s=time.perf_counter() - self.began,
-            real_time_factor=self.real_time_factor(),
-            compiled_kernels=self.compiled,
-        )
 
 
 def _start_facts(start: Start) -> StartFacts:

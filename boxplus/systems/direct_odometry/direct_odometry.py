@@ -105,6 +105,10 @@ class DirectOdometry:
         """Why no pose is to be trusted, whatever the status: the intrinsics that the grey values contradict; empty where none."""
         return self._watch.contradiction
 
+    def window_points(self) -> NDArray[np.float32]:
+        """(n, 3) the points of the keyframes that are still adjusted, in the world [m]; see `Estimate.finished_points`."""
+        return self.window.points()
+
     def push_rgbd(self, time_ns: int, image: Image | ArrayLike, depth: ArrayLike) -> Estimate:
         """A frame of an RGB-D camera.
 
@@ -304,6 +308,7 @@ class DirectOdometry:
             sigma=0.0 if alignment is None else alignment.sigma,
             residual_ratio=verdict.residual_ratio,
             brightness=(0.0, 0.0) if alignment is None else alignment.brightness,
+            finished_points=self.window.take_finished(),
             timing_s=watch.laps,
         )
 

@@ -31,7 +31,9 @@ class Estimate:
         sigma: robust standard deviation of the residuals [grey values of the keyframe]; residual_ratio: it by the median of
             frames before; NaN where there is none.
         brightness: (a, b) against the keyframe, I_keyframe = eᵃ I + b.
-        timing_s: seconds of processor time, by stage.
+        finished_points: (n, 3) float32, of the map, in the world [m]: those of a keyframe that left the window with this frame,
+            and that will not be adjusted any more.
+        timing_s: seconds, by stage.
     """
 
     time_ns: int
@@ -46,6 +48,7 @@ class Estimate:
     sigma: float
     residual_ratio: float
     brightness: tuple[float, float]
+    finished_points: NDArray[np.float32]
     timing_s: Mapping[str, float]
 
     @property

@@ -13,6 +13,8 @@ from boxplus.systems.direct_alignment.keyframe_kernel import select_pixels
 
 Matrix = NDArray[np.float64]
 _OFFSETS = np.array(DSO_PATTERN)
+_CENTRE = int(np.flatnonzero(~_OFFSETS.any(axis=1))[0])
+_KNOWN = 0.1  # standard deviation of a depth, by the depth, up to which a point enters the map
 _REACH = 2  # pixels of the pattern, and one more for gradients
 _SAME_SURFACE = 0.1  # share of the depth by which pixels of a patch may differ
 _STEEP = 50.0 / 255.0  # of the range of grey values and pixel: from there on a gradient says less of geometry than of its errors
@@ -41,6 +43,12 @@ class Patches:
 
     def __len__(self) -> int:
         return len(self.rho)
+
+    def points(self) -> Matrix:
+        """(k, 3) centres of those whose depth is known to a tenth, in the camera's frame [m]."""
+        known = self.rho * self.rho * self.information > _KNOWN**-2.0
+        rays = self.rays[known, _CENTRE]
+        return np.column_stack([rays, np.ones(len(rays))]) / self.rho[known, None]
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
         """Forget the others."""

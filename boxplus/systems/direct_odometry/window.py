@@ -26,6 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
@@ -79,15 +80,26 @@ class Window:
         self.g_prior: Matrix = np.zeros(0)
         self._covariance: Matrix = np.zeros((0, 0))
         self._visible: dict[int, float] = {}
+        self._finished: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)]  # the first one stays
 
     def covariance(self, keyframe: WindowKeyframe) -> Matrix:
         """(6, 6) of ξ in T_world_camera Exp(ξ), as of the last adjustment."""
         first = DOF * self.keyframes.index(keyframe)
         return self._covariance[first : first + 6, first : first + 6]
 
+    def points(self) -> NDArray[np.float32]:
+        """(k, 3) of all keyframes' patches, in the world [m]."""
+        return np.concatenate([self._finished[0], *(keyframe.points() for keyframe in self.keyframes)])
+
+    def take_finished(self) -> NDArray[np.float32]:
+        """(k, 3) those of keyframes that left since this was asked."""
+        finished, self._finished = np.concatenate(self._finished), self._finished[:1]
+        return finished
+
     def begin(self, keyframe: WindowKeyframe, covariance: Matrix) -> None:
         """Forget all others: this one's pose is known with a covariance (6, 6), as that of ξ in T_world_camera Exp(ξ)."""
         keyframe.freeze()
+        self._finished += [each.points() for each in self.keyframes]
         self.keyframes = [keyframe]
         self._covariance = np.zeros((DOF, DOF))
         self._covariance[:6, :6], self._covariance[6, 6] = covariance, _SIGMA_GAIN**2
@@ -210,4 +222,4 @@ class Window:
         self.g_prior = self.g_prior[stay] - across @ self.g_prior[gone]
         H = self.H_prior[np.ix_(stay, stay)] - across @ self.H_prior[np.ix_(gone, stay)]
         self.H_prior, self._covariance = 0.5 * (H + H.T), self._covariance[np.ix_(stay, stay)]
-        del self.keyframes[index]
+        self._finished.append(self.keyframes.pop(index).points())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
-from boxplus.manifolds import se3
+from boxplus.manifolds import quaternion, se3
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.patches import Patches
 from boxplus.systems.direct_odometry.window_kernel import GOOD, OUTLIER, OUTSIDE, eliminate, patch_pair
@@ -58,6 +58,11 @@ class WindowKeyframe:
             return np.zeros(DOF)
         T, log_gain = self.first
         return np.append(se3.log(se3.compose(se3.inverse(T), self.T_world_camera)), self.log_gain - log_gain)
+
+    def points(self) -> NDArray[np.float32]:
+        """(k, 3) of its patches, in the world [m]."""
+        R, p = quaternion.to_matrix(self.T_world_camera[:4]), self.T_world_camera[4:]
+        return (self.patches.points() @ R.T + p).astype(np.float32)
 
     def block(self, index: int) -> slice:
         """Its place in the window's state, where it is the `index`-th."""

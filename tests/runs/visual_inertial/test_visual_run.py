@@ -23,12 +23,12 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.report import write_report
+from boxplus.runs.cameras.folder import VioFolder
 from boxplus.runs.settings_file import load_settings
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.frame_log import read_frame_log
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
-from boxplus.runs.visual_inertial.vio_folder import VioFolder
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras, write_camera_recording
 from boxplus.systems.visual_inertial_odometry import VioConfig

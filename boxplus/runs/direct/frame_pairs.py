@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +12,6 @@ import numpy as np
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import RecordingError
 from boxplus.manifolds import quaternion
-from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.direct_odometry.sensed_depth import StereoPair
@@ -99,35 +98,45 @@ def _check_registered(first: CameraStream, depth: CameraStream) -> None:
         )
 
 
-def frame_pairs(
-    events: Iterable[CameraEvent], cameras: ChosenCameras, rejected: Counter[str]
-) -> Iterator[tuple[CameraImage, CameraImage]]:
-    """Images of the two streams whose stamps are closest, in the order of time; what has no partner is counted."""
-    waiting: dict[int, deque[CameraImage]] = {cameras.first.index: deque(), cameras.second.index: deque()}
-    first, second = waiting[cameras.first.index], waiting[cameras.second.index]
-    for event in events:
-        if not isinstance(event, CameraImage) or event.camera not in waiting:
-            continue
-        waiting[event.camera].append(event)
-        yield from _matched(first, second, cameras, rejected, False)
-    yield from _matched(first, second, cameras, rejected, True)
+class FramePairs:
+    """Images of the two streams whose stamps are closest, in the order of time.
 
+    Args:
+        cameras: which streams.
 
-def _matched(
-    first: deque[CameraImage], second: deque[CameraImage], cameras: ChosenCameras, rejected: Counter[str], is_end: bool
-) -> Iterator[tuple[CameraImage, CameraImage]]:
-    while first:
-        time_ns = first[0].time_ns
-        # A closer partner may still come until one is there that is as late as the image.
-        if not is_end and (not second or second[-1].time_ns < time_ns) and len(first) < _MOST_WAITING:
-            return
-        closest = min(second, key=lambda image: abs(image.time_ns - time_ns), default=None)
-        if closest is None or abs(closest.time_ns - time_ns) > cameras.tolerance_ns:
-            rejected[f"images of {cameras.first.name} without one of {cameras.second.name}"] += 1
-            first.popleft()
-            continue
-        while second[0] is not closest:
-            rejected[f"images of {cameras.second.name} without one of {cameras.first.name}"] += 1
+    Attributes:
+        rejected: images without a partner, by stream.
+    """
+
+    def __init__(self, cameras: ChosenCameras) -> None:
+        self._cameras = cameras
+        self._first: deque[CameraImage] = deque()
+        self._second: deque[CameraImage] = deque()
+        self.rejected: Counter[str] = Counter()
+
+    def push(self, image: CameraImage) -> list[tuple[CameraImage, CameraImage]]:
+        """Take an image of one of the two; returns the frames that are complete."""
+        (self._first if image.camera == self._cameras.first.index else self._second).append(image)
+        return list(self._matched(False))
+
+    def flush(self) -> list[tuple[CameraImage, CameraImage]]:
+        """The frames that are left, when no image follows."""
+        return list(self._matched(True))
+
+    def _matched(self, is_end: bool) -> Iterator[tuple[CameraImage, CameraImage]]:
+        first, second, names = self._first, self._second, (self._cameras.first.name, self._cameras.second.name)
+        while first:
+            time_ns = first[0].time_ns
+            # A closer partner may still come until one is there that is as late as the image.
+            if not is_end and (not second or second[-1].time_ns < time_ns) and len(first) < _MOST_WAITING:
+                return
+            closest = min(second, key=lambda image: abs(image.time_ns - time_ns), default=None)
+            if closest is None or abs(closest.time_ns - time_ns) > self._cameras.tolerance_ns:
+                self.rejected[f"images of {names[0]} without one of {names[1]}"] += 1
+                first.popleft()
+                continue
+            while second[0] is not closest:
+                self.rejected[f"images of {names[1]} without one of {names[0]}"] += 1
+                second.popleft()
             second.popleft()
-        second.popleft()
-        yield first.popleft(), closest
+            yield first.popleft(), closest

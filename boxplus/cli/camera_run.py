@@ -1,0 +1,124 @@
+"""A run with cameras on a terminal: evidence, progress, comparison with a ground truth, report, results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from boxplus.evaluation.alignment import AlignmentKind
+    from boxplus.formats.trajectory import Trajectory
+    from boxplus.recordings.cameras.events import CameraRecording
+    from boxplus.recordings.cameras.options import CameraRecordingOptions
+    from boxplus.runs.cameras.facts import FrameTiming
+    from boxplus.runs.cameras.folder import CameraRunFolder
+    from boxplus.runs.run_facts import RunFacts
+    from boxplus.runs.run_loop import Progress
+
+    SummaryT = TypeVar("SummaryT", bound=RunFacts)
+    SummaryT_co = TypeVar("SummaryT_co", bound=RunFacts, covariant=True)
+
+    class Odometry(Protocol[SummaryT_co]):
+        """Runs over an opened recording."""
+
+        def __call__(
+            self, recording: CameraRecording, *, progress: Callable[[Progress], None], should_stop: Callable[[], bool]
+        ) -> SummaryT_co: ...
+
+
+FILES = ("report.html", "trajectory.tum", "trajectory.csv", "frames.csv", "landmarks.ply", "evaluation.json", "run.json")
+
+
+def run_cameras(
+    recording: Path,
+    options: CameraRecordingOptions,
+    folder: CameraRunFolder,
+    odometry: Odometry[SummaryT],
+    rows: Callable[[SummaryT], Sequence[tuple[str, str]]],
+    alignment: Callable[[SummaryT], AlignmentKind],
+    *,
+    overwrite: bool,
+    ground_truth: Path | None,
+    report: bool,
+) -> SummaryT:
+    """Run an odometry with everything a terminal shows.
+
+    Args:
+        odometry: writes into `folder`, which is claimed while it runs.
+        rows: name and value of what is shown of its results.
+        alignment: what the odometry leaves open, for the comparison with the ground truth.
+
+    Raises:
+        BoxplusError: bad input, or results that cannot be written.
+    """
+    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.formats.trajectory import read_trajectory
+    from boxplus.recordings.cameras.open import open_camera_recording
+    from boxplus.runs.cameras.folder import claim_camera_folder
+
+    terminal = RunTerminal()
+    truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+    with (
+        stop_on_interrupt(terminal.announce_stop) as should_stop,
+        open_camera_recording(recording, options) as opened,
+        claim_camera_folder(folder, overwrite=overwrite),
+    ):
+        info = opened.info
+        facts = f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
+        terminal.print_evidence(info.path, facts, info.evidence)
+        with terminal.progress() as progress:
+            summary = odometry(opened, progress=progress, should_stop=should_stop)
+        shown, frames = list(rows(summary)), summary.estimates[0]
+        if truth is not None and frames:
+            shown.append(("against --gt", _compare(folder, truth, alignment(summary))))
+        if report and frames:
+            from boxplus.report import write_report
+
+            with terminal.status("drawing the report"):
+                write_report(folder.path)
+    terminal.print_results(summary, shown, folder.path, FILES)
+    return summary
+
+
+def _compare(folder: CameraRunFolder, truth: Trajectory, alignment: AlignmentKind) -> str:
+    """Write `evaluation.json`; returns its main line."""
+    import json
+
+    from boxplus.evaluation.evaluation import evaluate
+    from boxplus.formats.output import atomic_file
+    from boxplus.formats.trajectory import read_trajectory
+
+    evaluation = evaluate(read_trajectory(folder.trajectory), truth, alignment=alignment, method="interpolate")
+    with atomic_file(folder.evaluation) as file:
+        file.write(f"{json.dumps(evaluation.to_dict(), indent=2)}\n".encode())
+    return f"{evaluation.title}: {evaluation.ate.line('m')}"
+
+
+def timing_rows(timing: FrameTiming) -> list[tuple[str, str]]:
+    """How long it took."""
+    from boxplus.cli.run_terminal import speed_text
+
+    rows = []
+    if timing.frame_ms is not None:
+        ms = timing.frame_ms
+        text = f"median {ms.median:.1f} ms, mean {ms.mean:.1f} ms, 99th percentile {ms.p99:.1f} ms"
+        rows.append(("per frame", text))
+    rows.append(("speed", speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)))
+    return rows
+
+
+def exit_for(summary: RunFacts) -> None:
+    """Leave with the code of an interrupted run, or of one that is not to be trusted.
+
+    Raises:
+        typer.Exit: with that code.
+    """
+    from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+
+    if summary.state == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if summary.contradiction is not None:
+        raise typer.Exit(EXIT_UNTRUSTED)

@@ -1,0 +1,1 @@
+"""What runs with cameras share: their folder, their facts, their sparse map."""

@@ -1,0 +1,94 @@
+"""The output folder of a run with cameras: what lies where, and who may write there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from boxplus.runs.output_folder import output_folder
+from boxplus.runs.run_folder import OdometryFolder
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRunFolder(OdometryFolder):
+    """The paths of the results of a run with cameras."""
+
+    @property
+    def program(self) -> str:
+        """Who writes here."""
+        raise NotImplementedError
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """Names of the pictures in `plots`."""
+        raise NotImplementedError
+
+    @property
+    def frames(self) -> Path:
+        """One row a frame: what an estimate says besides its pose, diagnosis, timing."""
+        return self.path / "frames.csv"
+
+    @property
+    def landmarks(self) -> Path:
+        """The sparse map."""
+        return self.path / "landmarks.ply"
+
+    @property
+    def evaluation(self) -> Path:
+        """The comparison with a ground truth, where one was given."""
+        return self.path / "evaluation.json"
+
+    def own_files(self) -> Iterator[Path]:
+        """The files in the folder that a run writes."""
+        yield from self.existing([self.frames, self.landmarks, self.evaluation], self.pictures)
+
+
+@dataclass(frozen=True, slots=True)
+class VioFolder(CameraRunFolder):
+    """The paths of the results of `boxplus vio`."""
+
+    @property
+    def program(self) -> str:
+        """See `CameraRunFolder.program`."""
+        return "boxplus vio"
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """See `CameraRunFolder.pictures`."""
+        return ("trajectory.png", "tracked.png", "biases.png")
+
+
+@dataclass(frozen=True, slots=True)
+class DirectFolder(CameraRunFolder):
+    """The paths of the results of `boxplus vo`."""
+
+    @property
+    def program(self) -> str:
+        """See `CameraRunFolder.program`."""
+        return "boxplus vo"
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """See `CameraRunFolder.pictures`."""
+        return ("trajectory.png", "residuals.png")
+
+
+FolderT = TypeVar("FolderT", bound=CameraRunFolder)
+
+
+@contextmanager
+def claim_camera_folder(run: FolderT, *, overwrite: bool = False) -> Iterator[FolderT]:
+    """A folder to write a run into, locked while the block runs; see `output_folder`.
+
+    Raises:
+        InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
+            set.
+        OutputError: it cannot be created or cleared.
+    """
+    with output_folder(
+        run.path, run.program, run.own_files, lambda: [run.plots], overwrite=overwrite, holds_results=run.holds_estimates
+    ):
+        yield run

@@ -1,0 +1,1 @@
+"""Direct odometry over a recording: settings, folder, frames, summary."""

@@ -1,0 +1,29 @@
+"""Everything that can be set for a run of `boxplus vo`."""
+
+from __future__ import annotations
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus.recordings.cameras.info import CameraRecordingInfo
+from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+
+
+class DirectRunConfig(BaseModel):
+    """Settings of a run of direct odometry; this is what `config.yaml` holds. None has to be given."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording: CameraRecordingOptions = Field(default_factory=lambda: CameraRecordingOptions())
+    odometry: DirectOdometryConfig = Field(default_factory=lambda: DirectOdometryConfig())
+
+
+def dump_direct_config(config: DirectRunConfig, info: CameraRecordingInfo) -> str:
+    """The text of `config.yaml`: everything as used, topics found from the data included."""
+    used = config.model_dump(mode="json")
+    if any(topic.name == camera.source for topic in info.topics for camera in info.cameras):
+        used["recording"]["image_topics"] = [camera.source for camera in info.cameras]
+    head = "# Settings of this run, those found from the data included: 'boxplus vo RECORDING --config FILE' repeats it.\n"
+    body: str = yaml.safe_dump(used, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return head + body

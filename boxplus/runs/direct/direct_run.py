@@ -1,0 +1,210 @@
+"""Direct odometry over a whole camera recording, with every result on disk as soon as it is known."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError, printable
+from boxplus.formats.trajectory_writer import TrajectoryWriter
+from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
+from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recording_facts
+from boxplus.runs.cameras.folder import DirectFolder, claim_camera_folder
+from boxplus.runs.cameras.landmark_file import LandmarkFile
+from boxplus.runs.direct.config import DirectRunConfig, dump_direct_config
+from boxplus.runs.direct.frame_log import FrameLogWriter
+from boxplus.runs.direct.frame_pairs import FramePairs, choose_cameras
+from boxplus.runs.direct.summary import DirectSummary, StreamFacts
+from boxplus.runs.estimate_statistics import EstimateStatistics
+from boxplus.runs.run_facts import State
+from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.sensors.camera_image import CameraImage
+from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
+from boxplus.systems.direct_odometry.estimate import Estimate
+
+_MOST_LOST, _MOST_DOUBTED = 0.1, 0.5  # shares of the frames from which on the whole run is not to be trusted
+
+
+def run_direct_odometry(
+    recording: CameraRecording,
+    folder: str | Path | DirectFolder,
+    config: DirectRunConfig | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> DirectSummary:
+    """Run direct odometry over a recording and write trajectory, frames, landmarks and facts to a folder.
+
+    Every estimate goes to disk at once. A run that is killed leaves everything up to its last frame (of the landmarks what was
+    known some seconds before); `run.json` then says so. The report is drawn from the folder, by `boxplus.report.write_report`.
+
+    Args:
+        recording: opened.
+        folder: created; see docs/output_folder.md for what it holds. Or what `claim_camera_folder` yields.
+        config: settings; each has a default.
+        overwrite: replace the results of an earlier run in the folder.
+        progress: called after every event that was read.
+        should_stop: asked between events; True ends the run in good order, with the state "interrupted".
+
+    Returns:
+        The facts of the run, as in `run.json`.
+
+    Raises:
+        RecordingError: no depth and no second camera, unknown calibration, depths that are not registered, nothing to read.
+        InputError: no frame could be used; the folder holds something else, or another process is writing there.
+        OutputError: the folder cannot be written; what was written before is intact.
+
+    Example:
+        >>> with open_camera_recording("rgbd_dataset_freiburg1_desk") as recording:   # doctest: +SKIP
+        ...     run_direct_odometry(recording, "out").status
+        {'ok': 595}
+    """
+    config = config or DirectRunConfig()
+    run = folder if isinstance(folder, DirectFolder) else DirectFolder(Path(folder))
+    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite)
+    with claimed as direct_folder:
+        return _Run(recording, direct_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
+
+
+class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
+    """One run of direct odometry: its writers and its landmarks."""
+
+    def __init__(
+        self, recording: CameraRecording, folder: DirectFolder, config: DirectRunConfig, progress: Callable[[Progress], None]
+    ) -> None:
+        text = dump_direct_config(config, recording.info)
+        super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
+        self._info, self._folder = recording.info, folder
+        self._cameras = choose_cameras(recording.info)
+        self._pairs = FramePairs(self._cameras)
+        self._odometry = DirectOdometry(self._cameras.camera, config.odometry, stereo=self._cameras.stereo)
+        self._images = dict.fromkeys((self._cameras.first.index, self._cameras.second.index), 0)
+        self._landmarks: list[NDArray[np.float32]] = []  # of keyframes that left the window
+        self._landmark_file = LandmarkFile(folder.landmarks, self._all_landmarks)
+
+    def _all_landmarks(self) -> NDArray[np.float32]:
+        return np.concatenate([*self._landmarks, self._odometry.window_points()])
+
+    def open(self, stack: ExitStack) -> None:
+        """See `RunLoop.open`."""
+        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
+        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
+
+    def push(self, event: CameraEvent) -> list[Estimate]:
+        """See `RunLoop.push`."""
+        if not isinstance(event, CameraImage) or event.camera not in self._images:
+            return []
+        self._images[event.camera] += 1
+        return self._estimates(self._pairs.push(event))
+
+    def flush(self) -> list[Estimate]:
+        """See `RunLoop.flush`."""
+        return self._estimates(self._pairs.flush())
+
+    def _estimates(self, pairs: list[tuple[CameraImage, CameraImage]]) -> list[Estimate]:
+        if self._cameras.kind == "rgbd":
+            return [self._odometry.push_rgbd(one.time_ns, one.grey(), two.depth()) for one, two in pairs]
+        return [self._odometry.push_stereo(one.time_ns, one.grey(), two.grey()) for one, two in pairs]
+
+    def keep(self, estimate: Estimate) -> None:
+        """Write one estimate."""
+        self.status = estimate.status
+        began = time.perf_counter()
+        T, p = estimate.R_world_camera, estimate.p_world_camera
+        self._trajectory.append(estimate.time_ns, T, p, estimate.pose_covariance, estimate.status)
+        self._frames.append(estimate)
+        trouble = f"began with: {'; '.join(estimate.reasons)}"
+        self.counts.add_estimate(estimate.time_ns, p, estimate.status, estimate.timing_s, trouble)
+        for reason in estimate.reasons:
+            self.counts.warnings.add(reason, estimate.time_ns)
+        if len(estimate.finished_points):
+            self._landmarks.append(estimate.finished_points)
+        self.seconds["writing"] += time.perf_counter() - began
+
+    def between_events(self) -> None:
+        """See `RunLoop.between_events`."""
+        self.seconds["writing"] += self._landmark_file.write_if_due()
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        self.seconds["writing"] += self._landmark_file.write()
+
+    def nothing_found(self) -> InputError:
+        """See `RunLoop.nothing_found`."""
+        rejected = "; ".join(f"{count} × {what}" for what, count in self._pairs.rejected.items())
+        return InputError(
+            "frames of an image and its depth, or of left and right",
+            f"none ({rejected or 'no images'})",
+            "see 'boxplus inspect' for what is wrong with the recording",
+        )
+
+    def summarize(self, state: State, error: str | None) -> DirectSummary:
+        """See `RunLoop.summarize`."""
+        counts, info = self.counts, self._info
+        return DirectSummary(
+            versions=versions("rosbags", "opencv-python-headless"),
+            state=state,
+            error=error,
+            process=os.getpid(),
+            started=self.started,
+            updated=datetime.now(UTC),
+            recording=recording_facts(info, self.recording.progress, with_imu=False),
+            kind=self._cameras.kind,
+            cameras=self._streams(),
+            frames=counts.count,
+            keyframes=self._odometry.keyframes,
+            landmarks=len(self._all_landmarks()),
+            status=dict(counts.status),
+            first_time_ns=counts.first_time_ns,
+            last_time_ns=counts.last_time_ns,
+            duration_s=counts.duration_s,
+            path_length_m=counts.path_length_m,
+            contradiction=self._contradiction() if counts.count else None,
+            rejected={"recording": self.recording.rejected, "frames": dict(self._pairs.rejected)},
+            weak_intervals=counts.weak_intervals(),
+            timing=frame_timing(self),
+            peak_memory_mb=peak_memory_mb(),
+            warnings=[
+                *counts.status_warnings(),
+                *counts.warnings.facts(counts.first_time_ns),
+                *evidence_warnings(info),
+            ],
+        )
+
+    def _contradiction(self) -> str | None:
+        status, frames = self.counts.status, self.counts.count
+        lost, doubted = status["lost"] / frames, (status["lost"] + status["weak"]) / frames
+        if self._odometry.contradiction:
+            return self._odometry.contradiction
+        if self._odometry.gaps:
+            return (
+                f"{self._odometry.gaps} times the view was lost for so long that poses after it are not related to those before"
+            )
+        if lost > _MOST_LOST:
+            return f"{lost:.0%} of the frames have no pose ({_MOST_LOST:.0%} at most)"
+        if doubted > _MOST_DOUBTED:
+            return f"{doubted:.0%} of the poses are doubted ({_MOST_DOUBTED:.0%} at most)"
+        return None
+
+    def _streams(self) -> list[StreamFacts]:
+        uses = ("image", "depth") if self._cameras.kind == "rgbd" else ("left", "right")
+        return [
+            StreamFacts(
+                name=printable(stream.name),
+                use=use,
+                model=type(stream.model).__name__,
+                width=stream.width,
+                height=stream.height,
+                images=self._images[stream.index],
+                sources={name: printable(source) for name, source in stream.sources.items()},
+            )
+            for use, stream in zip(uses, (self._cameras.first, self._cameras.second), strict=True)
+        ]
