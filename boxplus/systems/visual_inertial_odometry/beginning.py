@@ -30,7 +30,9 @@ def beginning(start: Start) -> MarginalPrior:
     J = np.linalg.inv(np.linalg.cholesky(P))
     state = np.concatenate([start.velocity_world[0], start.accel_bias, start.gyro_bias])
     manifolds, x0 = (BodyPose, Euclidean(9)), (start.T_world_imu[0], state)
+    off = np.zeros(15)  # of x0 from the middle of what was known
+    off[9:] = state[3:] - np.concatenate([start.bias_before[3:], start.bias_before[:3]])
     # First estimates are kept from the first marginalisation on; a start may be far from where the window finds it.
     return MarginalPrior(
-        manifolds, x0, J, np.zeros(15), roles=("first pose", "first state"), fixes_gauge=True, keeps_first_estimates=False
+        manifolds, x0, J, J @ off, roles=("first pose", "first state"), fixes_gauge=True, keeps_first_estimates=False
     )

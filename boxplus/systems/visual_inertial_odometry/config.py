@@ -45,6 +45,9 @@ class VioConfig(BaseModel):
     accel_bias_walk: float | None = Field(
         None, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]; None is what the rig states"
     )
+    accel_bias_sigma: float = Field(
+        0.2, gt=0, description="standard deviation of the accelerometer's bias beforehand, along each axis [m/s²]"
+    )
     gravity: float = Field(9.81, gt=9.7, lt=9.9, description="magnitude of gravity [m/s²]")
     max_imu_gap: float = Field(0.15, gt=0, description="longest interval between IMU samples that is integrated over [s]")
     max_blind: float = Field(1.0, gt=0, description="time without a view after which the IMU's pose counts as lost [s]")

@@ -37,6 +37,9 @@ from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax
 _HUBER = 1.5  # standard deviations
 _LEAVING = 2  # keyframes at most, for every one that is new
 _COST_TOLERANCE = 1e-3
+# A tilt of the whole window against the accelerometer's bias is 1e-8 of what the IMU knows from frame to frame, and decides
+# where it goes: more damping than that would hold it where it is, while the covariance says it is known.
+_DAMPING = 1e-10
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
@@ -251,7 +254,10 @@ class Window:
         """Minimise over the window, from where it is; with as many steps as the settings say, if left out."""
         self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
-        solution = self.problem.solve(max_iterations=self._config.max_iterations, cost_tolerance=_COST_TOLERANCE, examine=False)
+        most = self._config.max_iterations if max_iterations is None else max_iterations
+        solution = self.problem.solve(
+            max_iterations=most, cost_tolerance=_COST_TOLERANCE, initial_damping=_DAMPING, examine=False
+        )
         self.problem.set_values(solution)
         number = self.frames[-1].number
         P = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)

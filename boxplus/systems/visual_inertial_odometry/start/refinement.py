@@ -32,6 +32,7 @@ _WRONG_SHARE = 0.34
 _FEWEST_SIGHTINGS, _FEWEST_TRACKS = 3, 15
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
 _ANY_VELOCITY = 30.0  # m/s
+_IMU_UNKNOWNS = 12  # velocity of the last frame, biases, gravity and scale, beside a velocity for each interval
 _RAYS = Pinhole(1.0, 1.0, 0.0, 0.0)
 
 
@@ -47,6 +48,7 @@ class Refined:
         used: (N,) sightings that agree.
         pixel_sigma: estimated from the sightings, in the unit of the rays.
         chi2_images, chi2_imu: per degree of freedom.
+        imu_share: standard deviation of the IMU's errors, as a share of what it was taken for.
         converged: whether the last search was.
     """
 
@@ -59,6 +61,7 @@ class Refined:
     pixel_sigma: float
     chi2_images: float
     chi2_imu: float
+    imu_share: float
     converged: bool
 
 
@@ -139,6 +142,7 @@ def refine(
         pixel_sigma=sigma / pixel,
         chi2_images=float(np.minimum(squares[used], _MISTAKE**2).sum() / max(left, 1)),
         chi2_imu=float(imu_squares.sum() / (9 * len(imu_squares) - 5)),
+        imu_share=float(np.sqrt(imu_squares.sum() / (6 * len(imu_squares) - _IMU_UNKNOWNS))),
         converged=solution.status == "converged",
     )
 

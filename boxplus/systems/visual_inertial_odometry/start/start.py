@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.manifolds import quaternion, so3, sphere
 from boxplus.residuals.inertial.imu_noise import ImuNoise
@@ -36,16 +36,17 @@ from boxplus.systems.visual_inertial_odometry.start.refinement import Refined, r
 from boxplus.systems.visual_inertial_odometry.start.rest import judge_rest, shortest_turn
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
-_GYRO_BIAS, _ACCEL_BIAS = 0.2, 0.1  # rad/s, m/s²: standard deviations beforehand
+_GYRO_BIAS = 0.2  # rad/s, standard deviation beforehand
 _SPACING_S = 0.2  # between keyframes
 _FEWEST_FRAMES, _MOST_FRAMES = 10, 16
 _FEWEST_TRACKS = 20
 _FEWEST_SAMPLES = 10
 _FEWEST_SIGHTINGS = 3  # of a track
 _MISTAKEN, _NOISE, _CHI2, _BEHIND = 40.0, 5.0, 3.0, 10.0
-_TILT_DEG, _TILT_MONO_DEG, _SCALE = 1.0, 0.45, 5.0  # deg, deg, %
+_BIAS_SIGMAS = 2.5
+_CAUTION = 2.0  # how many times as noisy as it was seen to be the IMU is taken for
+_TILT_DEG, _SCALE = 0.45, 5.0  # deg beside what the accelerometer's bias does, %
 _JUMPS = 0.3, 5.0  # rad/s, m/s²: standard deviations
-_SCALE_SURE, _TILT_SURE_DEG = 2.0, 0.65  # %, of a scale in which no error of gravity hides, and what then is enough
 _EXCITATION = 0.3  # m/s²
 _NO_EXCITATION = "the acceleration varies by {:.2f} m/s² ({:g} are needed to see the scale)"
 _ANY = 10.0  # rad, m, m/s
@@ -67,6 +68,7 @@ class Start:
         gyro_bias: (3,) [rad/s]; accel_bias: (3,) [m/s²].
         covariance: (15, 15) of the first state before anything is measured from its time on, in the order
             `[θ, p, v, b_ω, b_a]`; position and yaw are made known by definition, whatever stands here.
+        bias_before: (6,) the biases `[b_ω, b_a]` that `covariance` is about: at rest what was found, in motion zero.
         last_covariance: (15, 15) of the last state after all that was measured, relative to position and yaw of the first.
         facts: the numbers of the tests it passed, by name and unit, for the report.
     """
@@ -79,6 +81,7 @@ class Start:
     gyro_bias: NDArray[np.float64]
     accel_bias: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    bias_before: NDArray[np.float64]
     last_covariance: NDArray[np.float64]
     facts: Mapping[str, float]
 
@@ -108,7 +111,7 @@ def find_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioCon
         if np.count_nonzero(within) < _FEWEST_SAMPLES:
             return f"{np.count_nonzero(within)} IMU samples in {duration:.2f} s ({_FEWEST_SAMPLES} are needed)"
         samples = ImuSamples(imu.time_ns[within], imu.gyro[within], imu.accel[within])
-        rest = judge_rest(seen[first:], samples, noise, config.gravity, _ACCEL_BIAS)
+        rest = judge_rest(seen[first:], samples, noise, config.gravity, config.accel_bias_sigma)
         if not rest.problem:
             break
     if not rest.problem:
@@ -123,6 +126,7 @@ def find_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioCon
             gyro_bias=rest.gyro_bias,
             accel_bias=rest.accel_bias,
             covariance=rest.covariance,
+            bias_before=np.concatenate([rest.gyro_bias, rest.accel_bias]),
             last_covariance=rest.covariance,
             facts=rest.facts,
         )
@@ -165,7 +169,8 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
         return f"{count} corners were followed through {_FEWEST_SIGHTINGS} keyframes ({_FEWEST_TRACKS} are needed)"
 
     pixel = 1.0 / float(rig.cameras[0].model.parameters[0])
-    noise = shaken(imu_noise(rig, config), imu)
+    stated = imu_noise(rig, config)
+    noise = shaken(stated, imu)
     rate_hz = 1e9 / float(np.median(np.diff(imu.time_ns)))
     jumps = noise.gyro * np.sqrt(rate_hz), noise.accel * np.sqrt(rate_hz)
     if jumps[0] > _JUMPS[0] or jumps[1] > _JUMPS[1]:
@@ -198,8 +203,15 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
     motion = solve_motion(tracks, since_first, config.gravity, pixel, points)
     if motion is None:
         return "the corners show no motion that fits the accelerometer"
-    between = between.reintegrated(motion.accel_bias, turn.bias, np.ones(len(between), dtype=np.bool_))
-    found = refine(tracks, motion, between, config.gravity, pixel, config.pixel_sigma, (_GYRO_BIAS, _ACCEL_BIAS))
+    between = _between(times, imu, noise, turn.bias, motion.accel_bias)
+    bias_sigma = _GYRO_BIAS, config.accel_bias_sigma
+    found = refine(tracks, motion, between, config.gravity, pixel, config.pixel_sigma, bias_sigma)
+    share = 1.0 if found is None else _CAUTION * found.imu_share
+    if share < 1.0:
+        # Motors shake an IMU from sample to sample, but hardly from keyframe to keyframe, which is what counts.
+        calm = replace(noise, gyro=max(stated.gyro, share * noise.gyro), accel=max(stated.accel, share * noise.accel))
+        between = _between(times, imu, calm, turn.bias, motion.accel_bias)
+        found = refine(tracks, motion, between, config.gravity, pixel, config.pixel_sigma, bias_sigma)
     if found is None:
         return "too few corners agree with any one motion"
     if not found.converged:
@@ -208,10 +220,16 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
     problem = _problem(facts, is_mono, config)
     if problem:
         return problem
-    return _moving(found, frames, times, is_mono, facts)
+    return _moving(found, frames, times, is_mono, facts, bias_sigma)
 
 
-def _between(time_ns: NDArray[np.int64], imu: ImuSamples, noise: ImuNoise, bias_gyro: Floats | None = None) -> Preintegration:
+def _between(
+    time_ns: NDArray[np.int64],
+    imu: ImuSamples,
+    noise: ImuNoise,
+    bias_gyro: ArrayLike = (0.0, 0.0, 0.0),
+    bias_accel: ArrayLike = (0.0, 0.0, 0.0),
+) -> Preintegration:
     """The intervals between neighbours in `time_ns` (K,), K − 1."""
     return Preintegration.integrate(
         imu.time_ns,
@@ -219,7 +237,8 @@ def _between(time_ns: NDArray[np.int64], imu: ImuSamples, noise: ImuNoise, bias_
         imu.accel,
         noise=noise,
         intervals_ns=np.stack([time_ns[:-1], time_ns[1:]], axis=1),
-        bias_gyro=np.zeros(3) if bias_gyro is None else bias_gyro,
+        bias_gyro=bias_gyro,
+        bias_accel=bias_accel,
     )
 
 
@@ -248,7 +267,7 @@ def _facts(found: Refined, between: Preintegration, is_mono: bool) -> dict[str, 
     for k in range(len(p)):
         by_scale[2 + 15 * k + 3 : 2 + 15 * k + 6] = arm[k] / max(size, 1e-12)
     scale = max(float(by_scale @ found.covariance @ by_scale), 0.0) ** 0.5
-    tilt = float(np.linalg.svd(found.covariance[:2, :2])[1][0]) ** 0.5
+    tilt, beside = _tilt(found.covariance)
     facts = {
         "duration [s]": float(between.duration_s.sum()),
         "acceleration, variation [m/s²]": variation,
@@ -258,13 +277,22 @@ def _facts(found: Refined, between: Preintegration, is_mono: bool) -> dict[str, 
         "sightings, deviation [px]": found.pixel_sigma,
         "χ² of the images per degree of freedom": found.chi2_images,
         "χ² of the IMU per degree of freedom": found.chi2_imu,
-        "gravity, deviation [deg]": float(np.rad2deg(tilt)),
+        "gravity, deviation [deg]": tilt,
+        "gravity, deviation beside the bias [deg]": beside,
         "travelled [m]": float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()),
         "points behind the cameras [%]": 100.0 * float(np.mean(found.inverse_depth < 0.0)),
     }
     if is_mono:
         facts["scale, deviation [%]"] = 100.0 * scale
     return facts
+
+
+def _tilt(covariance: Floats) -> tuple[float, float]:
+    """Largest standard deviation of gravity's direction [deg], in all and if the accelerometer's bias were known."""
+    tilt, bias = slice(0, 2), slice(2 + 9, 2 + 12)
+    by_bias = covariance[tilt, bias] @ np.linalg.solve(covariance[bias, bias], covariance[bias, tilt])
+    whole, beside = (float(np.linalg.eigvalsh(P)[-1]) for P in (covariance[tilt, tilt], covariance[tilt, tilt] - by_bias))
+    return float(np.rad2deg(np.sqrt(max(whole, 0.0)))), float(np.rad2deg(np.sqrt(max(beside, 0.0))))
 
 
 def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> str:
@@ -276,11 +304,15 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
         ("χ² of the IMU per degree of freedom", _CHI2, "χ² of the IMU is {:.1f} per degree of freedom (at most {:g})"),
         ("points behind the cameras [%]", _BEHIND, "{:.0f} % of the points lie behind the cameras (at most {:g})"),
         ("gyroscope bias [rad/s]", 0.5, "the gyroscope's bias would be {:.2f} rad/s (at most {:g})"),
-        ("accelerometer bias [m/s²]", 1.0, "the accelerometer's bias would be {:.2f} m/s² (at most {:g})"),
         (
-            "gravity, deviation [deg]",
-            _tilt_deg(facts) if is_mono else _TILT_DEG,
-            "gravity is known to {:.2f} deg ({:g} are needed)",
+            "accelerometer bias [m/s²]",
+            _BIAS_SIGMAS * config.accel_bias_sigma,
+            "the accelerometer's bias would be {:.2f} m/s² (at most {:g})",
+        ),
+        (
+            "gravity, deviation beside the bias [deg]",
+            _TILT_DEG,
+            "gravity is known to {:.2f} deg beside what the accelerometer's bias does ({:g} are needed)",
         ),
     ]
     for name, most, text in tests:
@@ -293,15 +325,15 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
     return ""
 
 
-def _tilt_deg(facts: Mapping[str, float]) -> float:
-    """How well one camera has to know gravity."""
-    return _TILT_SURE_DEG if facts["scale, deviation [%]"] < _SCALE_SURE else _TILT_MONO_DEG
-
-
 def _moving(
-    found: Refined, frames: NDArray[np.intp], time_ns: NDArray[np.int64], is_mono: bool, facts: Mapping[str, float]
+    found: Refined,
+    frames: NDArray[np.intp],
+    time_ns: NDArray[np.int64],
+    is_mono: bool,
+    facts: Mapping[str, float],
+    bias_sigma: tuple[float, float],
 ) -> Start:
-    """In a world whose z is up."""
+    """In a world whose z is up; `bias_sigma` of the biases beforehand, gyroscope and accelerometer."""
     u = found.gravity_direction
     Q = shortest_turn(u, np.array([0.0, 0.0, -1.0]))
     R = Q @ quaternion.to_matrix(found.poses[:, :4])
@@ -317,7 +349,7 @@ def _moving(
     J[6:9, :2], J[6:9, at + 6 : at + 9] = -so3.hat(v[k]) @ turn, Q
     J[9:12, at + 12 : at + 15] = np.eye(3)
     J[12:15, at + 9 : at + 12] = np.eye(3)
-    before = np.diag(np.repeat([_ANY, _ANY, _ANY, _GYRO_BIAS, _ACCEL_BIAS], 3) ** 2)
+    before = np.diag(np.repeat([_ANY, _ANY, _ANY, *bias_sigma], 3) ** 2)
     return Start(
         kind="moving mono" if is_mono else "moving stereo",
         frames=frames,
@@ -327,6 +359,7 @@ def _moving(
         gyro_bias=found.velocity_bias[-1, 6:],
         accel_bias=found.velocity_bias[-1, 3:6],
         covariance=before,
+        bias_before=np.zeros(6),
         last_covariance=J @ found.covariance @ J.T,
         facts=facts,
     )
