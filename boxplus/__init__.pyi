@@ -61,6 +61,11 @@ from .simulation.simulation import simulate as simulate
 from .sparse.cholesky import SparseCholesky as SparseCholesky
 from .systems.bundle_adjustment.bundle_adjustment import adjust_bundle as adjust_bundle
 from .systems.bundle_adjustment.config import BundleAdjustmentConfig as BundleAdjustmentConfig
+from .systems.camera_calibration.calibration import CameraCalibration as CameraCalibration
+from .systems.camera_calibration.calibration import calibrate_cameras as calibrate_cameras
+from .systems.camera_calibration.config import CameraCalibrationConfig as CameraCalibrationConfig
+from .systems.camera_calibration.corners import TargetCorners as TargetCorners
+from .systems.camera_calibration.target import AprilGrid as AprilGrid
 from .systems.direct_alignment.direct_alignment import align_rgbd as align_rgbd
 from .systems.direct_alignment.keyframe import Keyframe as Keyframe
 from .systems.direct_alignment.tracking import Alignment as Alignment

@@ -13,6 +13,7 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"
 # What the output must say for the example to have shown what it is about.
 SHOWS = {
     "bundle_adjustment": "before, 0.51 px after",
+    "camera_calibration": "findings: none",
     "direct_odometry": "14 ok",
     "dynamic_kdtree": "after delete_box: 24668 (332 removed)",
     "evaluate_trajectory": "ATE rmse: 1.7",

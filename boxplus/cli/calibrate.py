@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli.calibrate_cameras import cameras
 from boxplus.cli.options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 
@@ -20,6 +21,9 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=T
 @app.callback()
 def _calibrate() -> None:
     """Find out how sensors are mounted, timed and scaled, from a recording of them."""
+
+
+app.command("cameras")(cameras)
 
 
 @app.command("lidar-imu")

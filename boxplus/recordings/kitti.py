@@ -31,7 +31,7 @@ _CALIBRATION = "calib_imu_to_velo.txt"
 
 
 @dataclass(frozen=True, slots=True)
-class _Files:
+class SensorFiles:
     """File names and times of one sensor; a line of the time file without its data file is left out and counted."""
 
     paths: list[Path]
@@ -48,7 +48,7 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
         RecordingError: a sensor or its times are missing, or the times cannot be read.
     """
     scans = _scan_files(path / "velodyne_points", options)
-    imu = _sensor_files(path / "oxts", ".txt")
+    imu = sensor_files(path / "oxts", ".txt")
     first = int(min(scans.start_ns.min(), imu.time_ns.min()))
     last = int(max(scans.end_ns.max(), imu.time_ns.max()))
     check_start(options.start_s, (last - first) * 1e-9)
@@ -108,7 +108,12 @@ def read_times(file: Path) -> NDArray[np.int64]:
         ) from error
 
 
-def _sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") -> _Files:
+def sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") -> SensorFiles:
+    """The files of a sensor, `data/0000000000` and so on, with a time each.
+
+    Raises:
+        RecordingError: no times, or not one data file.
+    """
     time_ns = read_times(folder / time_file)
     paths = [folder / "data" / f"{index:010d}{suffix}" for index in range(len(time_ns))]
     present = np.array([path.is_file() for path in paths], dtype=bool)
@@ -116,30 +121,30 @@ def _sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") 
         raise RecordingError(f"data files like 0000000000{suffix}", f"none in {folder / 'data'}", "unpack the whole drive")
     kept = [path for path, there in zip(paths, present, strict=True) if there]
     time_ns = time_ns[present]
-    return _Files(kept, time_ns, time_ns, time_ns, int((~present).sum()))
+    return SensorFiles(kept, time_ns, time_ns, time_ns, int((~present).sum()))
 
 
-def _scan_files(folder: Path, options: RecordingOptions) -> _Files:
+def _scan_files(folder: Path, options: RecordingOptions) -> SensorFiles:
     if options.point_time_field == NO_POINT_TIME:
-        return _sensor_files(folder, ".bin")
+        return sensor_files(folder, ".bin")
     if not _has_turn_times(folder):
-        return _turns_around(_sensor_files(folder, ".bin"), folder)
-    starts = _sensor_files(folder, ".bin", "timestamps_start.txt")
-    ends = _sensor_files(folder, ".bin", "timestamps_end.txt")
+        return _turns_around(sensor_files(folder, ".bin"), folder)
+    starts = sensor_files(folder, ".bin", "timestamps_start.txt")
+    ends = sensor_files(folder, ".bin", "timestamps_end.txt")
     if len(starts.time_ns) != len(ends.time_ns):
         raise RecordingError(
             "as many start times as end times of the scans",
             f"{len(starts.time_ns)} and {len(ends.time_ns)} in {folder}",
             "unpack the drive again",
         )
-    return _Files(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing)
+    return SensorFiles(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing)
 
 
 def _has_turn_times(folder: Path) -> bool:
     return all((folder / f"timestamps_{end}.txt").is_file() for end in ("start", "end"))
 
 
-def _turns_around(forward: _Files, folder: Path) -> _Files:
+def _turns_around(forward: SensorFiles, folder: Path) -> SensorFiles:
     """Both ends of every turn, from the times at which the laser faced forward: halfway to its neighbours.
 
     Across a gap the turn takes as long as the median one.
@@ -156,10 +161,10 @@ def _turns_around(forward: _Files, folder: Path) -> _Files:
     ends = round(float(turn)) // 2
     start_ns = forward.time_ns - np.concatenate(([ends], half))
     end_ns = forward.time_ns + np.concatenate((half, [ends]))
-    return _Files(forward.paths, forward.time_ns, start_ns, end_ns, forward.missing)
+    return SensorFiles(forward.paths, forward.time_ns, start_ns, end_ns, forward.missing)
 
 
-def _point_time_evidence(scans: _Files, options: RecordingOptions, folder: Path) -> Evidence:
+def _point_time_evidence(scans: SensorFiles, options: RecordingOptions, folder: Path) -> Evidence:
     key = "point_time_field"
     if options.point_time_field == NO_POINT_TIME:
         text = "every point is taken at the time of its scan, as asked for: motion within a scan is not corrected"
@@ -178,32 +183,56 @@ def _point_time_evidence(scans: _Files, options: RecordingOptions, folder: Path)
 
 
 def _calibration(path: Path) -> tuple[NDArray[np.float64] | None, str]:
+    file = calibration_file(path, _CALIBRATION)
+    if file is None:
+        return None, ""
+    T_velo_imu = rigid_transform(calibration_lines(file), file)
+    T_imu_lidar = np.eye(4)
+    T_imu_lidar[:3, :3] = T_velo_imu[:3, :3].T
+    T_imu_lidar[:3, 3] = -T_velo_imu[:3, :3].T @ T_velo_imu[:3, 3]
+    return T_imu_lidar, file.name
+
+
+def calibration_file(path: Path, name: str) -> Path | None:
+    """A calibration of the date of a drive: inside of the drive, above it, or beside it with the drive's name before its own."""
     folders = (path, path.parent, path.parent.parent)
-    for file in [folder / _CALIBRATION for folder in folders] + [path.parent / f"{path.name}.{_CALIBRATION}"]:
-        if not file.is_file():
+    files = [folder / name for folder in folders] + [path.parent / f"{path.name}.{name}"]
+    return next((file for file in files if file.is_file()), None)
+
+
+def calibration_lines(file: Path) -> dict[str, NDArray[np.float64]]:
+    """The lines `name: numbers` of a calibration; those with something else are left out."""
+    values = {}
+    for line in file.read_text(errors="replace").splitlines():
+        name, _, numbers = line.partition(":")
+        try:
+            values[name.strip()] = np.array(numbers.split(), dtype=np.float64)
+        except ValueError:
             continue
-        values = {}
-        for line in file.read_text(errors="replace").splitlines():
-            name, _, numbers = line.partition(":")
-            if name in ("R", "T"):
-                try:
-                    values[name] = np.array(numbers.split(), dtype=np.float64)
-                except ValueError:
-                    continue
-        R, T = values.get("R", np.empty(0)), values.get("T", np.empty(0))
-        rotates = R.size == 9 and T.size == 3 and np.allclose(R.reshape(3, 3) @ R.reshape(3, 3).T, np.eye(3), atol=1e-3)
-        if not rotates or np.linalg.det(R.reshape(3, 3)) < 0:
-            raise RecordingError(
-                "R (9 numbers, a rotation) and T (3 numbers)", f"something else in {file}", "download the calibration again"
-            )
-        T_imu_lidar = np.eye(4)
-        T_imu_lidar[:3, :3] = R.reshape(3, 3).T
-        T_imu_lidar[:3, 3] = -R.reshape(3, 3).T @ T
-        return T_imu_lidar, file.name
-    return None, ""
+    return values
 
 
-def _events(scans: _Files, imu: _Files, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally) -> Iterator[Event]:
+def rigid_transform(values: dict[str, NDArray[np.float64]], file: Path, R: str = "R", T: str = "T") -> NDArray[np.float64]:
+    """(4, 4) of the lines R and T.
+
+    Raises:
+        RecordingError: one is missing, or R is no rotation.
+    """
+    rotation, translation = values.get(R, np.empty(0)), values.get(T, np.empty(0))
+    rotates = rotation.size == 9 and translation.size == 3
+    rotates = rotates and np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-3)
+    if not rotates or np.linalg.det(rotation.reshape(3, 3)) < 0:
+        raise RecordingError(
+            f"{R} (9 numbers, a rotation) and {T} (3 numbers)", f"something else in {file}", "download the calibration again"
+        )
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), translation
+    return transform
+
+
+def _events(
+    scans: SensorFiles, imu: SensorFiles, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally
+) -> Iterator[Event]:
     lidar_order = ((int(end), 1, index) for index, end in enumerate(scans.end_ns))
     imu_order = ((int(time), 0, index) for index, time in enumerate(imu.time_ns))
     for received_ns, is_scan, index in heapq.merge(imu_order, lidar_order):
@@ -215,7 +244,7 @@ def _events(scans: _Files, imu: _Files, options: RecordingOptions, start_ns: int
             yield event
 
 
-def _read_scan(scans: _Files, index: int, options: RecordingOptions, tally: Tally) -> Scan | None:
+def _read_scan(scans: SensorFiles, index: int, options: RecordingOptions, tally: Tally) -> Scan | None:
     try:
         raw = scans.paths[index].read_bytes()
     except OSError:
@@ -234,13 +263,20 @@ def _read_scan(scans: _Files, index: int, options: RecordingOptions, tally: Tall
     return Scan.from_arrays(points[:, :3], time_ns, points[:, 3], min_range=options.min_range, max_range=options.max_range)
 
 
-def _read_imu(imu: _Files, index: int, tally: Tally) -> ImuSamples | None:
+def _read_imu(imu: SensorFiles, index: int, tally: Tally) -> ImuSamples | None:
+    values = read_oxts(imu.paths[index])
+    if isinstance(values, str):
+        tally.rejected[f"messages: {values}"] += 1
+        return None
+    return ImuSamples.from_arrays(imu.time_ns[index : index + 1], values[:3], values[3:])
+
+
+def read_oxts(file: Path) -> NDArray[np.float64] | str:
+    """Angular velocity [rad/s] and specific force [m/s²] (6,) of one file, along the IMU's axes; or why there is none."""
     try:
-        values = np.array(imu.paths[index].read_text(errors="replace").split(), dtype=np.float64)
+        values = np.array(file.read_text(errors="replace").split(), dtype=np.float64)
     except (OSError, ValueError):
-        tally.rejected["messages: unreadable oxts file"] += 1
-        return None
+        return "unreadable oxts file"
     if len(values) < _OXTS_COLUMNS:
-        tally.rejected[f"messages: oxts file without its {_OXTS_COLUMNS} columns"] += 1
-        return None
-    return ImuSamples.from_arrays(imu.time_ns[index : index + 1], values[_GYRO_COLUMNS], values[_ACCEL_COLUMNS])
+        return f"oxts file without its {_OXTS_COLUMNS} columns"
+    return np.concatenate([values[_GYRO_COLUMNS], values[_ACCEL_COLUMNS]])

@@ -8,11 +8,12 @@ from boxplus.errors import RecordingError
 from boxplus.recordings.bag_probe import CLOUD_PARSERS
 from boxplus.recordings.cameras.bag import open_camera_bag
 from boxplus.recordings.cameras.bag_probe import IMAGE_PARSERS
-from boxplus.recordings.cameras.euroc import is_euroc, open_euroc
 from boxplus.recordings.cameras.events import CameraRecording
-from boxplus.recordings.cameras.numbered import is_kitti_odometry, is_seven_scenes, open_kitti_odometry, open_seven_scenes
+from boxplus.recordings.cameras.folders.euroc import is_euroc, open_euroc
+from boxplus.recordings.cameras.folders.kitti_raw import is_kitti_raw, open_kitti_raw
+from boxplus.recordings.cameras.folders.numbered import is_kitti_odometry, is_seven_scenes, open_kitti_odometry, open_seven_scenes
+from boxplus.recordings.cameras.folders.tum import is_tum, open_tum
 from boxplus.recordings.cameras.options import CameraRecordingOptions
-from boxplus.recordings.cameras.tum import is_tum, open_tum
 from boxplus.recordings.open_container import open_container
 
 
@@ -20,6 +21,8 @@ def has_cameras_only(path: Path) -> bool:
     """Whether this is a recording of cameras in which no LiDAR is found, as far as can be told without reading images."""
     if path.is_dir() and (is_euroc(path) or is_tum(path) or is_kitti_odometry(path) or is_seven_scenes(path)):
         return True
+    if path.is_dir() and is_kitti_raw(path):
+        return not (path / "velodyne_points").is_dir()
     try:
         container = open_container(path)
     except (RecordingError, OSError):
@@ -30,7 +33,7 @@ def has_cameras_only(path: Path) -> bool:
 
 
 def open_camera_recording(path: str | Path, options: CameraRecordingOptions | None = None) -> CameraRecording:
-    """Open a recording of cameras: a bag, a folder of EuRoC, TUM RGB-D, KITTI odometry or 7-Scenes.
+    """Open a recording of cameras: a bag, a folder of EuRoC, TUM RGB-D, KITTI (raw or odometry) or 7-Scenes.
 
     The format is found from the content. Calibration is taken from the recording and from `options.calibration`; the source
     of each number is in `info`, and what is not known is None there, with the reason, never guessed.
@@ -57,6 +60,8 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         return open_euroc(path, options)
     if path.is_dir() and is_tum(path):
         return open_tum(path, options)
+    if path.is_dir() and is_kitti_raw(path):
+        return open_kitti_raw(path, options)
     if path.is_dir() and is_kitti_odometry(path):
         return open_kitti_odometry(path, options)
     if path.is_dir() and is_seven_scenes(path):
@@ -67,7 +72,8 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         return open_camera_bag(path, options)
     raise RecordingError(
         "a ROS bag or MCAP, a EuRoC folder (mav0/cam0), a folder with cam0/<time [ns]>.png, a TUM RGB-D folder (rgb.txt), a "
-        "KITTI odometry sequence (image_0, calib.txt), or a 7-Scenes sequence (frame-000000.color.png)",
+        "KITTI raw drive (image_00/data, image_00/timestamps.txt), a KITTI odometry sequence (image_0, calib.txt), or a "
+        "7-Scenes sequence (frame-000000.color.png)",
         f"{path.name}",
         "convert the recording",
     )

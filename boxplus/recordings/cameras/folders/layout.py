@@ -159,7 +159,7 @@ def _found(layout: Layout, options: CameraRecordingOptions) -> tuple[list[FoundC
                 source=images.source,
                 time_ns=images.time_ns,
                 count=len(images.files),
-                size=_first_size(images),
+                size=first_size(images),
                 stated=stated,
                 depth_unit_m=unit,
                 depth_unit_source=unit_source,
@@ -176,7 +176,7 @@ def _of_registered(name: str, found: Sequence[FoundCamera], has_imu: bool) -> li
     return same
 
 
-def _first_size(images: ImageFiles) -> tuple[int, int]:
+def first_size(images: ImageFiles) -> tuple[int, int]:
     """(width, height) of the first image that can be decoded."""
     reason = "no files"
     for file in images.files[:_PROBED]:

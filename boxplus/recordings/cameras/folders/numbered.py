@@ -23,7 +23,7 @@ from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.calibration import StatedCamera, camera_model, on_first
 from boxplus.recordings.cameras.decode import Pixels
 from boxplus.recordings.cameras.events import CameraRecording
-from boxplus.recordings.cameras.folder import IMAGE_SUFFIXES, ImageFiles, Layout, nanoseconds, open_layout
+from boxplus.recordings.cameras.folders.layout import IMAGE_SUFFIXES, ImageFiles, Layout, nanoseconds, open_layout
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.info import Evidence
 

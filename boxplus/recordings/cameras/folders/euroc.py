@@ -26,7 +26,7 @@ from boxplus.recordings.cameras.calibration import (
     read_yaml,
 )
 from boxplus.recordings.cameras.events import CameraRecording
-from boxplus.recordings.cameras.folder import ImageFiles, Layout, open_layout, read_exposures, stamped_files
+from boxplus.recordings.cameras.folders.layout import ImageFiles, Layout, open_layout, read_exposures, stamped_files
 from boxplus.recordings.cameras.imu_table import ImuTable, read_imu_table
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.info import Evidence

@@ -15,7 +15,7 @@ import numpy as np
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.calibration import StatedCamera, camera_model, numbers, read_camchain, usable_mountings
 from boxplus.recordings.cameras.events import CameraRecording
-from boxplus.recordings.cameras.folder import ImageFiles, Layout, nanoseconds, open_layout, read_exposures
+from boxplus.recordings.cameras.folders.layout import ImageFiles, Layout, nanoseconds, open_layout, read_exposures
 from boxplus.recordings.cameras.imu_table import read_imu_table
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.info import Evidence

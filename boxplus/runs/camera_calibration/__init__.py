@@ -1,0 +1,1 @@
+"""A camera calibration over files: corners, target, IMU; and what it writes."""

@@ -1,0 +1,65 @@
+"""The other files of a calibration: Kalibr's target, and an IMU's samples with its noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from boxplus.errors import InputError, RecordingError
+from boxplus.recordings.cameras.calibration import imu_noise, read_yaml
+from boxplus.recordings.cameras.imu_table import imu_stream, read_imu_table
+from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.camera_calibration.target import AprilGrid
+
+
+def read_target(path: str | Path) -> AprilGrid:
+    """A target in Kalibr's form: target_type aprilgrid, tagCols, tagRows, tagSize [m], tagSpacing.
+
+    Raises:
+        InputError: no such file, another kind of target, numbers that make none.
+    """
+    content = read_yaml(Path(path))
+    kind = str(content.get("target_type", ""))
+    if kind != "aprilgrid":
+        raise InputError("target_type: 'aprilgrid'", f"{kind or 'none'!r} in {Path(path).name}", "boxplus knows no other target")
+    try:
+        return AprilGrid(
+            rows=int(content["tagRows"]),
+            columns=int(content["tagCols"]),
+            tag_size=float(content["tagSize"]),
+            spacing=float(content["tagSpacing"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            "tagRows, tagCols, tagSize [m] and tagSpacing", f"{type(error).__name__} {error} in {Path(path).name}", "complete it"
+        ) from None
+
+
+def read_imu(samples: str | Path, noise: str | Path) -> tuple[ImuSamples, ImuNoise]:
+    """An IMU: a table as EuRoC's `data.csv`, and Kalibr's file with its noise densities.
+
+    Raises:
+        InputError: files that are missing or of another form, or units that are not to be told.
+    """
+    table = read_imu_table(Path(samples), Path(samples).name)
+    content = read_yaml(Path(noise))
+    block = content.get("imu0", content)
+    densities = imu_noise(block) if isinstance(block, dict) else None
+    if densities is None:
+        raise RecordingError(
+            "gyroscope_noise_density, gyroscope_random_walk, accelerometer_noise_density and accelerometer_random_walk",
+            f"not all of them, or not positive, in {Path(noise).name}",
+            "give Kalibr's imu.yaml",
+        )
+    stream, _ = imu_stream(table, densities, Path(noise).name, CameraRecordingOptions())
+    order = np.argsort(table.time_ns, kind="stable")
+    order = order[np.concatenate([[True], np.diff(table.time_ns[order]) > 0])]
+    gyro = table.values[order, :3] * GYRO_SCALE[stream.gyro_unit]
+    accel = table.values[order, 3:] * ACCEL_SCALE[stream.accel_unit]
+    return ImuSamples.from_arrays(table.time_ns[order], gyro, accel), densities
