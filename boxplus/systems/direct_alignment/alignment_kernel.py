@@ -20,11 +20,35 @@ from boxplus.residuals.camera.photometric_sampling import sample_bilinear
 from boxplus.systems.direct_alignment.keyframe_kernel import LEAST_Y_Z
 
 CONVERGED, ITERATION_LIMIT, LITTLE_OVERLAP, NO_GRADIENT = 0, 1, 2, 3
+_Nine = tuple[float, float, float, float, float, float, float, float, float]
 _DOF = 8  # ξ = [w, v] of the pose, then relative gain and offset of the brightness
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-9, 1e4
 _SCALED_ON = 4096  # a median over so many residuals is known to 2 %
 _SCALE_MOVED = 0.1  # relative change of σ from which on the weights are computed anew
 _SHORTEST_GAIN = 0.2  # of the brightness in one step
+
+
+@kernel(inline=True, borrow=True)
+def _warped(
+    R: _Nine,
+    T_21: NDArray[np.float64],
+    mx: float,
+    my: float,
+    rho: float,
+    image_2: NDArray[np.float32],
+    c: NDArray[np.float64],
+    z_min: float,
+) -> tuple[bool, float]:
+    """Whether the point of a ray (mx, my, 1) at the inverse depth ρ is seen in image 2, and the grey value there."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R
+    x = r00 * mx + r01 * my + r02 + rho * T_21[4]
+    y = r10 * mx + r11 * my + r12 + rho * T_21[5]
+    z = r20 * mx + r21 * my + r22 + rho * T_21[6]
+    if not (z > z_min * rho and z > LEAST_Y_Z):
+        return False, 0.0
+    u, v, _, _, _, _, _, _ = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+    found, value, _, _ = sample_bilinear(image_2, u, v)
+    return found, value
 
 
 @kernel
@@ -51,23 +75,14 @@ def linearize(
     Returns:
         number of pixels that count, Σ ρ((e/σ)²), Σ |e|, Σ ρ'.
     """
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
-    tx, ty, tz = T_21[4], T_21[5], T_21[6]
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+    R = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
     H[:] = 0.0
     g[:] = 0.0
     row = np.empty(_DOF)
     count, cost, total, weights = np.uint64(0), 0.0, 0.0, 0.0
     information = 1.0 / (sigma * sigma)
     for n in range(np.uint64(len(grey_1))):
-        mx, my, rho = rays_1[n, 0], rays_1[n, 1], inverse_depth_1[n]
-        x = r00 * mx + r01 * my + r02 + rho * tx
-        y = r10 * mx + r11 * my + r12 + rho * ty
-        z = r20 * mx + r21 * my + r22 + rho * tz
-        if not (z > z_min * rho and z > LEAST_Y_Z):
-            continue
-        u, v, _, _, _, _, _, _ = project_point(x, y, z, fx, fy, cx, cy, k1, k2, p1, p2, k3)
-        found, value, _, _ = sample_bilinear(image_2, u, v)
+        found, value = _warped(R, T_21, rays_1[n, 0], rays_1[n, 1], inverse_depth_1[n], image_2, c, z_min)
         if not found:
             continue
         grey = grey_1[n]
@@ -118,19 +133,11 @@ def cell_scores(
     Returns:
         Σ ρ' and Σ (ρ' + 2 ρ'' e²/σ²), whose ratio is that of the weights to the slope of the influence ρ' e.
     """
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+    R = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
     scores[:] = 0.0
     information, weights, slopes = 1.0 / (sigma * sigma), 0.0, 0.0
     for n in range(np.uint64(len(grey_1))):
-        mx, my, rho = rays_1[n, 0], rays_1[n, 1], inverse_depth_1[n]
-        x = r00 * mx + r01 * my + r02 + rho * T_21[4]
-        y = r10 * mx + r11 * my + r12 + rho * T_21[5]
-        z = r20 * mx + r21 * my + r22 + rho * T_21[6]
-        if not (z > z_min * rho and z > LEAST_Y_Z):
-            continue
-        u, v, _, _, _, _, _, _ = project_point(x, y, z, fx, fy, cx, cy, k1, k2, p1, p2, k3)
-        found, value, _, _ = sample_bilinear(image_2, u, v)
+        found, value = _warped(R, T_21, rays_1[n, 0], rays_1[n, 1], inverse_depth_1[n], image_2, c, z_min)
         if not found:
             continue
         grey = grey_1[n]
