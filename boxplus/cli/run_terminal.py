@@ -98,7 +98,7 @@ class RunTerminal:
         table.add_row(unit, Text.assemble(f"{count} (", counts, ")"))
         if summary.start is not None:
             table.add_row("start", Text(f"{summary.start.kind}: {summary.start.text}"))
-        table.add_row("path length", f"{summary.path_length_m:.2f} m in {summary.duration_s:.1f} s")
+        table.add_row("path length", f"{summary.path_length_m:.2f} {summary.length_unit} in {summary.duration_s:.1f} s")
         for name, value in rows:
             table.add_row(name, Text(value))
         console.print(table)

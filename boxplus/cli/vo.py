@@ -1,4 +1,4 @@
-"""`boxplus vo`: a recording of an RGB-D or a stereo camera in, a trajectory, a sparse map and a report out."""
+"""`boxplus vo`: a recording of cameras without an IMU in, a trajectory, a sparse map and a report out."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 @takes_options(CameraRecordingOptions)
 def vo(
-    recording: Annotated[
-        Path, typer.Argument(help="TUM RGB-D, 7-Scenes, KITTI or EuRoC folder, or a ROS bag, with depth or two cameras.")
-    ],
+    recording: Annotated[Path, typer.Argument(help="TUM RGB-D, 7-Scenes, KITTI or EuRoC folder, ROS bag, or images.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
     ] = None,
@@ -29,6 +27,7 @@ def vo(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="One setting, e.g. patches=400; may be repeated.", metavar="KEY=VALUE")
     ] = None,
+    mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the scale is not known then.")] = False,
     ground_truth: Annotated[
         Path | None, typer.Option("--gt", help="Trajectory of the camera to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
     ] = None,
@@ -37,10 +36,11 @@ def vo(
     *,
     options: CameraRecordingOptions,
 ) -> None:
-    """Turn a recording of an RGB-D or a stereo camera into a trajectory of the camera, a sparse map and a report.
+    """Turn a recording of an RGB-D camera, a stereo camera or one camera into its trajectory, a sparse map and a report.
 
-    The world is the camera of the first frame. Exit codes: 0 done, 1 the results could not be written, 2 bad input, 3 finished,
-    but not to be trusted (the view was lost), 130 interrupted (results up to there are complete).
+    The world is the camera of the first frame; of one camera alone the scale is not known. Exit codes: 0 done, 1 the results
+    could not be written, 2 bad input, 3 finished, but not to be trusted (the view was lost, or something contradicts), 130
+    interrupted (results up to there are complete).
     """
     from boxplus.cli.camera_run import exit_for, run_cameras
     from boxplus.runs.cameras.folder import DirectFolder
@@ -48,7 +48,10 @@ def vo(
     from boxplus.runs.direct.direct_run import run_direct_odometry
     from boxplus.runs.settings_file import load_settings
 
-    overrides: dict[str, dict[str, object]] = {"recording": options.model_dump(exclude_defaults=True)}
+    overrides: dict[str, dict[str, object]] = {
+        "recording": options.model_dump(exclude_defaults=True),
+        "streams": {"mono": True} if mono else {},
+    }
     run_config = load_settings(DirectRunConfig, config, settings or (), overrides)
     folder = DirectFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
     summary = run_cameras(
@@ -57,7 +60,7 @@ def vo(
         folder,
         partial(run_direct_odometry, folder=folder, config=run_config),
         _rows,
-        lambda _: "se3",
+        lambda summary: "se3" if summary.scale == "metric" else "sim3",
         overwrite=overwrite,
         ground_truth=ground_truth,
         report=not no_report,
@@ -69,4 +72,7 @@ def _rows(summary: DirectSummary) -> list[tuple[str, str]]:
     """What the terminal shows of a run."""
     from boxplus.cli.camera_run import timing_rows
 
-    return [*timing_rows(summary.timing), ("landmarks", f"{summary.landmarks:,} of {summary.keyframes} keyframes")]
+    rows = []
+    if summary.frames_before_start:
+        rows.append(("before the start", f"{summary.frames_before_start} frames without a pose"))
+    return [*rows, *timing_rows(summary.timing), ("landmarks", f"{summary.landmarks:,} of {summary.keyframes} keyframes")]

@@ -36,7 +36,7 @@ def write_direct_report(data: Run) -> Path:
 
 
 def _body(data: Run) -> str:
-    summary = data.summary
+    summary, is_metric = data.summary, data.summary.scale == "metric"
     states = "ok; weak: there is a reason to doubt the pose; lost: no pose follows from the image, the last one is repeated."
     parts = [
         _head(data),
@@ -45,7 +45,7 @@ def _body(data: Run) -> str:
             "Landmarks and trajectory",
             f"{len(data.map_points):,} of {summary.landmarks:,} points of keyframes whose depth is known to a tenth, in the "
             "frame of the first camera: x right, y down, z ahead. Drag to turn, scroll to zoom, click in the legend to hide.",
-            figures.map_and_trajectory(data),
+            figures.map_and_trajectory(data, "m" if is_metric else "unit"),
         ),
         figure_section(
             "Status and residuals",
@@ -55,7 +55,9 @@ def _body(data: Run) -> str:
             weak_table(summary.weak_intervals, "frames"),
         ),
         figure_section(
-            "Uncertainty", "Standard deviations of the pose, relative to the first; they grow with the way.", figures.sigmas(data)
+            "Uncertainty",
+            "Standard deviations of the pose, relative to the first; they grow with the way.",
+            figures.sigmas(data, "cm" if is_metric else "% of the unit"),
         ),
         figure_section("Timing", timing_text(summary.timing), figures.timing(data, "frame")),
         _streams(data),
@@ -66,9 +68,14 @@ def _body(data: Run) -> str:
 
 def _head(data: Run) -> str:
     summary = data.summary
+    is_metric = summary.scale == "metric"
     numbers = [
         (f"{summary.frames}", f"frames, {summary.keyframes} of them keyframes"),
-        (f"{summary.path_length_m:.2f} m", f"path in {summary.duration_s:.1f} s"),
+        (
+            f"{summary.path_length_m:.2f} m" if is_metric else f"{summary.path_length_m:.2f}",
+            f"path in {summary.duration_s:.1f} s",
+        ),
+        *([] if is_metric else [("unknown", "scale: lengths in units of about the first view's median depth")]),
         (f"{summary.status.get('ok', 0) / max(summary.frames, 1):.1%}", "of the frames ok"),
         *timing_tiles(summary.timing.frame_ms),
         (f"{summary.landmarks:,}", "landmarks"),
@@ -105,8 +112,10 @@ def _trajectory_picture(data: Run) -> Figure:
     summary, turned = data.summary, np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     points = (data.map_points @ turned).astype(np.float32)
     seen = replace(data, position=data.position @ turned, map_points=points)
-    figure = close_trajectory_picture(seen, f"{summary.path_length_m:.2f} m in {summary.duration_s:.1f} s, from above")
-    figure.axes[0].set(xlabel="x [m], to the right of the first camera", ylabel="z [m], ahead of it")
+    figure = close_trajectory_picture(
+        seen, f"{summary.path_length_m:.2f} {summary.length_unit} in {summary.duration_s:.1f} s, from above"
+    )
+    figure.axes[0].set(xlabel="x, to the right of the first camera", ylabel="z, ahead of it")
     return figure
 
 

@@ -18,7 +18,7 @@ from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 
 
-def map_and_trajectory(data: Timeline) -> go.Figure:
+def map_and_trajectory(data: Timeline, unit: str = "m") -> go.Figure:
     """The map, coloured by height, and the trajectory, coloured by status."""
     figure = go.Figure()
     points = data.map_points
@@ -38,7 +38,7 @@ def map_and_trajectory(data: Timeline) -> go.Figure:
                 "cmin": float(low),
                 "cmax": float(high),
                 "opacity": 0.75,
-                "colorbar": {"title": {"text": "height [m]", "side": "right"}, "thickness": 12, "len": 0.6, "x": 1.0},
+                "colorbar": {"title": {"text": f"height [{unit}]", "side": "right"}, "thickness": 12, "len": 0.6, "x": 1.0},
             },
         )
     rows = shown_rows(data)
@@ -56,7 +56,7 @@ def map_and_trajectory(data: Timeline) -> go.Figure:
                 name=f"{name} ({int((data.status == name).sum())})",
                 marker={"size": 3.5 if name == "ok" else 5.5, "color": color},
                 customdata=seconds[here],
-                hovertemplate=f"{name}, %{{customdata:.1f}} s<br>(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m<extra></extra>",
+                hovertemplate=f"{name}, %{{customdata:.1f}} s<br>(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) {unit}<extra></extra>",
             )
     for label, row in (("start", 0), ("end", -1)):
         x, y, z = ([float(value)] for value in path[row])
@@ -74,7 +74,7 @@ def map_and_trajectory(data: Timeline) -> go.Figure:
             "aspectmode": "data",
             "dragmode": "orbit",
             "camera": {"eye": {"x": -0.85, "y": -0.85, "z": 1.5}},
-            **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
+            **{f"{name}axis": {**axis, "title": {"text": f"{name} [{unit}]"}} for name in "xyz"},
         },
     )
     return figure
@@ -167,14 +167,14 @@ def gravity(data: RunData) -> go.Figure:
     return over_time(figure, data, 300, bottom_row=2)
 
 
-def sigmas(data: Timeline) -> go.Figure:
+def sigmas(data: Timeline, unit: str = "cm") -> go.Figure:
     """Standard deviations of the pose."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     rows = shown_rows(data)
     _add_xyz(figure, data.seconds[rows], np.degrees(data.sigma[rows, :3]), row=1)
     _add_xyz(figure, data.seconds[rows], 100.0 * data.sigma[rows, 3:], row=2, legend=False)
     figure.update_yaxes(title_text="rotation [deg]", row=1, col=1, rangemode="tozero")
-    figure.update_yaxes(title_text="position [cm]", row=2, col=1, rangemode="tozero")
+    figure.update_yaxes(title_text=f"position [{unit}]", row=2, col=1, rangemode="tozero")
     return over_time(figure, data, 380, bottom_row=2)
 
 

@@ -96,6 +96,11 @@ class RunFacts(Part):
         raise NotImplementedError
 
     @property
+    def length_unit(self) -> str:
+        """Of positions and of the path."""
+        return "m"
+
+    @property
     def progress(self) -> float:
         """Share of the recording that was read, 0 to 1."""
         raise NotImplementedError

@@ -66,6 +66,15 @@ class Image:
         return images
 
 
+def as_image(values: Image | ArrayLike) -> Image:
+    """An image as it is, or from an array.
+
+    Raises:
+        InputError: as of `Image.from_array`.
+    """
+    return values if isinstance(values, Image) else Image.from_array(values)
+
+
 @kernel
 def _mean_of_two_by_two(grey: NDArray[np.float32], half: NDArray[np.float32]) -> None:
     for i in range(np.uint64(half.shape[0])):

@@ -10,12 +10,24 @@ from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 
 
+class StreamConfig(BaseModel):
+    """Which streams of a recording the odometry takes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mono: bool = Field(
+        default=False,
+        description="the first camera alone, whatever else there is; then the scale is not known",
+    )
+
+
 class DirectRunConfig(BaseModel):
     """Settings of a run of direct odometry; this is what `config.yaml` holds. None has to be given."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording: CameraRecordingOptions = Field(default_factory=lambda: CameraRecordingOptions())
+    streams: StreamConfig = Field(default_factory=lambda: StreamConfig())
     odometry: DirectOdometryConfig = Field(default_factory=lambda: DirectOdometryConfig())
 
 

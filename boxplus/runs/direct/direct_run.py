@@ -20,15 +20,19 @@ from boxplus.runs.cameras.folder import DirectFolder, claim_camera_folder
 from boxplus.runs.cameras.landmark_file import LandmarkFile
 from boxplus.runs.direct.config import DirectRunConfig, dump_direct_config
 from boxplus.runs.direct.frame_log import FrameLogWriter
-from boxplus.runs.direct.frame_pairs import FramePairs, choose_cameras
+from boxplus.runs.direct.frame_pairs import Frame, FramePairs, choose_cameras
 from boxplus.runs.direct.summary import DirectSummary, StreamFacts
 from boxplus.runs.estimate_statistics import EstimateStatistics
-from boxplus.runs.run_facts import State
+from boxplus.runs.run_facts import State, WarningFacts
 from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
 
+_NO_SCALE = (
+    "one camera alone does not tell the scale: all lengths are in units of about the median depth of the first view, and the "
+    "scale may drift along the way; compare with 'boxplus eval --align sim3'"
+)
 _MOST_LOST, _MOST_DOUBTED = 0.1, 0.5  # shares of the frames from which on the whole run is not to be trusted
 
 
@@ -58,8 +62,9 @@ def run_direct_odometry(
         The facts of the run, as in `run.json`.
 
     Raises:
-        RecordingError: no depth and no second camera, unknown calibration, depths that are not registered, nothing to read.
-        InputError: no frame could be used; the folder holds something else, or another process is writing there.
+        RecordingError: no camera of intensities, unknown calibration, depths that are not registered, nothing to read.
+        InputError: no frame could be used, or one camera alone never saw parallax; the folder holds something else, or another
+            process is writing there.
         OutputError: the folder cannot be written; what was written before is intact.
 
     Example:
@@ -83,15 +88,17 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
         text = dump_direct_config(config, recording.info)
         super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
         self._info, self._folder = recording.info, folder
-        self._cameras = choose_cameras(recording.info)
+        self._cameras = choose_cameras(recording.info, mono=config.streams.mono)
         self._pairs = FramePairs(self._cameras)
         self._odometry = DirectOdometry(self._cameras.camera, config.odometry, stereo=self._cameras.stereo)
-        self._images = dict.fromkeys((self._cameras.first.index, self._cameras.second.index), 0)
+        self._streams = [stream for stream in (self._cameras.first, self._cameras.second) if stream is not None]
+        self._images = {stream.index: 0 for stream in self._streams}
+        self._before_start, self._start_problem = 0, ""
         self._landmarks: list[NDArray[np.float32]] = []  # of keyframes that left the window
         self._landmark_file = LandmarkFile(folder.landmarks, self._all_landmarks)
 
     def _all_landmarks(self) -> NDArray[np.float32]:
-        return np.concatenate([*self._landmarks, self._odometry.window_points()])
+        return np.concatenate([*self._landmarks, self._odometry.window.points()])
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -109,10 +116,20 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
         """See `RunLoop.flush`."""
         return self._estimates(self._pairs.flush())
 
-    def _estimates(self, pairs: list[tuple[CameraImage, CameraImage]]) -> list[Estimate]:
-        if self._cameras.kind == "rgbd":
-            return [self._odometry.push_rgbd(one.time_ns, one.grey(), two.depth()) for one, two in pairs]
-        return [self._odometry.push_stereo(one.time_ns, one.grey(), two.grey()) for one, two in pairs]
+    def _estimates(self, frames: list[Frame]) -> list[Estimate]:
+        estimates = []
+        for one, two in frames:
+            if two is None:
+                estimate = self._odometry.push_mono(one.time_ns, one.grey())
+            elif self._cameras.kind == "rgbd":
+                estimate = self._odometry.push_rgbd(one.time_ns, one.grey(), two.depth())
+            else:
+                estimate = self._odometry.push_stereo(one.time_ns, one.grey(), two.grey())
+            if estimate is not None:
+                estimates.append(estimate)
+            else:
+                self._before_start, self._start_problem = self._before_start + 1, self._odometry.start_problem
+        return estimates
 
     def keep(self, estimate: Estimate) -> None:
         """Write one estimate."""
@@ -139,6 +156,12 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
 
     def nothing_found(self) -> InputError:
         """See `RunLoop.nothing_found`."""
+        if self._before_start:
+            return InputError(
+                "two views of one camera from which depths can be told",
+                f"none in {self._before_start} frames (at the end: {self._start_problem})",
+                "move the camera sideways, or record depth, a second camera or an IMU",
+            )
         rejected = "; ".join(f"{count} × {what}" for what, count in self._pairs.rejected.items())
         return InputError(
             "frames of an image and its depth, or of left and right",
@@ -158,9 +181,12 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
             updated=datetime.now(UTC),
             recording=recording_facts(info, self.recording.progress, with_imu=False),
             kind=self._cameras.kind,
-            cameras=self._streams(),
+            scale="unknown" if self._cameras.kind == "mono" else "metric",
+            cameras=self._stream_facts(),
             frames=counts.count,
             keyframes=self._odometry.keyframes,
+            frames_before_start=self._before_start,
+            start_problem=self._start_problem,
             landmarks=len(self._all_landmarks()),
             status=dict(counts.status),
             first_time_ns=counts.first_time_ns,
@@ -173,6 +199,7 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
             timing=frame_timing(self),
             peak_memory_mb=peak_memory_mb(),
             warnings=[
+                *([WarningFacts(text=_NO_SCALE, count=1)] if self._cameras.kind == "mono" else []),
                 *counts.status_warnings(),
                 *counts.warnings.facts(counts.first_time_ns),
                 *evidence_warnings(info),
@@ -194,8 +221,8 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
             return f"{doubted:.0%} of the poses are doubted ({_MOST_DOUBTED:.0%} at most)"
         return None
 
-    def _streams(self) -> list[StreamFacts]:
-        uses = ("image", "depth") if self._cameras.kind == "rgbd" else ("left", "right")
+    def _stream_facts(self) -> list[StreamFacts]:
+        uses = ("left", "right") if self._cameras.kind == "stereo" else ("image", "depth")
         return [
             StreamFacts(
                 name=printable(stream.name),
@@ -206,5 +233,5 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
                 images=self._images[stream.index],
                 sources={name: printable(source) for name, source in stream.sources.items()},
             )
-            for use, stream in zip(uses, (self._cameras.first, self._cameras.second), strict=True)
+            for use, stream in zip(uses, self._streams, strict=False)
         ]

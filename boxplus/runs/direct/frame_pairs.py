@@ -1,4 +1,4 @@
-"""Two streams of a camera recording as frames: an image with its depth, or left with right."""
+"""Streams of a camera recording as frames: an image with its depth, left with right, or one camera alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _SAME_PLACE = 1e-6
 _SHARE_OF_PERIOD = 0.5  # stamps of two streams may differ by this much of the time between images
 _MOST_WAITING = 20
 
-Kind = Literal["rgbd", "stereo"]
+Kind = Literal["rgbd", "stereo", "mono"]
+Frame = tuple[CameraImage, CameraImage | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +29,14 @@ class ChosenCameras:
     """Which streams an odometry takes, and what it has to know of them.
 
     Attributes:
-        kind: `rgbd` or `stereo`.
-        first, second: the images that have the poses; their depths, or the right images.
-        camera: of the first; stereo: of the second, None for depths.
+        kind: `rgbd`, `stereo` or `mono`.
+        first, second: the images that have the poses; their depths, the right images, or None.
+        camera: of the first; stereo: of the second where it has intensities.
     """
 
     kind: Kind
     first: CameraStream
-    second: CameraStream
+    second: CameraStream | None
     camera: Pinhole
     stereo: StereoPair | None
 
@@ -46,26 +47,28 @@ class ChosenCameras:
         return round(_SHARE_OF_PERIOD * 1e9 / rate_hz)
 
 
-def choose_cameras(info: CameraRecordingInfo) -> ChosenCameras:
-    """Depth with the first camera where there is depth, else the first two cameras.
+def choose_cameras(info: CameraRecordingInfo, *, mono: bool = False) -> ChosenCameras:
+    """Depth with the first camera where there is depth, else the first two cameras, else the only one.
+
+    Args:
+        mono: the first camera alone in any case.
 
     Raises:
-        RecordingError: neither depth nor a second camera; calibration that is not known; depths that are not registered.
+        RecordingError: no camera; calibration that is not known; depths that are not registered.
     """
     intensity = [camera for camera in info.cameras if camera.kind == "intensity"]
     depths = [camera for camera in info.cameras if camera.kind == "depth"]
-    if not intensity or (not depths and len(intensity) < 2):
-        raise RecordingError(
-            "images with depth, or of two cameras",
-            f"{', '.join(f'{camera.name} ({camera.kind})' for camera in info.cameras) or 'none'}",
-            "one camera alone does not tell how far it moved: record depth, a second camera or an IMU",
-        )
+    if not intensity:
+        found = ", ".join(f"{camera.name} ({camera.kind})" for camera in info.cameras) or "none"
+        raise RecordingError("images of intensities", found, "depth alone has no grey values to compare: record images with it")
     first = intensity[0]
     one = first.calibrated()
     if not isinstance(one.model, Pinhole):
         raise RecordingError(
             f"a pinhole for {first.name}", type(one.model).__name__, "undistort the images to those of a pinhole"
         )
+    if mono or (not depths and len(intensity) < 2):
+        return ChosenCameras("mono", first, None, one.model, None)
     if depths:
         second = depths[0]
         _check_registered(first, second)
@@ -114,17 +117,19 @@ class FramePairs:
         self._second: deque[CameraImage] = deque()
         self.rejected: Counter[str] = Counter()
 
-    def push(self, image: CameraImage) -> list[tuple[CameraImage, CameraImage]]:
-        """Take an image of one of the two; returns the frames that are complete."""
+    def push(self, image: CameraImage) -> list[Frame]:
+        """Take an image of one of the streams; returns the frames that are complete."""
+        if self._cameras.second is None:
+            return [(image, None)]
         (self._first if image.camera == self._cameras.first.index else self._second).append(image)
-        return list(self._matched(False))
+        return list(self._matched(self._cameras.second.name, False))
 
-    def flush(self) -> list[tuple[CameraImage, CameraImage]]:
+    def flush(self) -> list[Frame]:
         """The frames that are left, when no image follows."""
-        return list(self._matched(True))
+        return [] if self._cameras.second is None else list(self._matched(self._cameras.second.name, True))
 
-    def _matched(self, is_end: bool) -> Iterator[tuple[CameraImage, CameraImage]]:
-        first, second, names = self._first, self._second, (self._cameras.first.name, self._cameras.second.name)
+    def _matched(self, second_name: str, is_end: bool) -> Iterator[Frame]:
+        first, second, names = self._first, self._second, (self._cameras.first.name, second_name)
         while first:
             time_ns = first[0].time_ns
             # A closer partner may still come until one is there that is as late as the image.

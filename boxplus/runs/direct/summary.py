@@ -28,10 +28,13 @@ class DirectSummary(RunFacts):
 
     program: Literal["boxplus vo"] = "boxplus vo"
     recording: CameraRecordingFacts
-    kind: str = Field(description="rgbd or stereo")
+    kind: Literal["rgbd", "stereo", "mono"]
+    scale: Literal["metric", "unknown"] = Field(description="unknown: by about the first view's median depth")
     cameras: list[StreamFacts]
     frames: int = Field(0, description="with a pose or lost")
     keyframes: int = 0
+    frames_before_start: int = Field(0, description="of one camera alone, until two views told depths; they have no pose")
+    start_problem: str = Field("", description="why there was no start when the last frame without one was seen")
     landmarks: int = Field(0, description="points in landmarks.ply")
     timing: FrameTiming = FrameTiming()  # type: ignore[call-arg]
 
@@ -39,6 +42,11 @@ class DirectSummary(RunFacts):
     def estimates(self) -> tuple[int, str]:
         """See `RunFacts.estimates`."""
         return self.frames, "frames"
+
+    @property
+    def length_unit(self) -> str:
+        """See `RunFacts.length_unit`."""
+        return "m" if self.scale == "metric" else "units of unknown scale"
 
     @property
     def progress(self) -> float:

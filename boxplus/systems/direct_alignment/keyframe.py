@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.sensors.image import Image, half_camera
+from boxplus.sensors.image import Image, as_image, half_camera
 from boxplus.systems.direct_alignment.keyframe_kernel import half_depth, pixel_jacobians, select_pixels
 
 FEWEST_PIXELS = 100
@@ -104,7 +104,7 @@ class Keyframe:
                 that is no pinhole.
         """
         camera = check_pinhole(camera, "direct alignment")
-        first = image if isinstance(image, Image) else Image.from_array(image)
+        first = as_image(image)
         if points is not None and points < FEWEST_PIXELS:
             raise InputError(
                 f"at least {FEWEST_PIXELS} points a level", f"{points}", "leave it out for 3000, or give None for all"

@@ -24,7 +24,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Huber, Loss, Tukey
-from boxplus.sensors.image import Image
+from boxplus.sensors.image import Image, as_image
 from boxplus.systems.direct_alignment.alignment_kernel import (
     CONVERGED,
     ITERATION_LIMIT,
@@ -49,6 +49,7 @@ _FEWEST_ABOVE = 40  # pixels at levels above the finest, which only bring the po
 _CELLS = 48  # of the image, whose errors are taken for independent of each other
 _LEAST_SLOPE = 0.1  # of the influence, by the weights
 _NOISE_ALONE = 1.3  # signal up to which next to nothing is left of H without noise
+_SAME_LIGHT = 0.1  # of the spread of grey values: nearer starts of gain and offset are one
 _SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
 
 Status = Literal["converged", "iteration limit", "little overlap", "unobservable", "large residual"]
@@ -133,7 +134,7 @@ def track(
         >>> found.status, round(float(np.exp(found.brightness[0])), 3)
         ('converged', 1.25)
     """
-    second = image if isinstance(image, Image) else Image.from_array(image)
+    second = as_image(image)
     if second.shape != keyframe.shape:
         raise InputError(
             "two images of the same shape", f"{keyframe.shape} and {second.shape}", "resize one of them and its camera"
@@ -215,9 +216,7 @@ class _Descent:
         grid = grid[np.linalg.norm(grid, axis=1) <= np.radians(search_deg) + 1e-12]
         turns = se3.exp(np.concatenate([grid, np.zeros_like(grid)], axis=1))
         best, least = (self.T_21, self.light), np.inf
-        lights = _lights(level.grey, image.grey) if self.brightness else [self.light]
-        if light is not None and self.brightness:
-            lights.append(np.array([np.exp(light[0]), light[1]]))
+        lights = _lights(level.grey, image.grey, light) if self.brightness else [self.light]
         for gain_and_offset in lights:
             for start in (se3.compose(turn, start) for start in starts for turn in turns):
                 self.T_21, self.light = start, gain_and_offset.copy()
@@ -228,15 +227,25 @@ class _Descent:
         self.T_21, self.light = best
 
 
-def _lights(grey_1: Matrix, grey_2: NDArray[np.float32]) -> list[Matrix]:
-    """Gain and offset of image 2: none; and what makes its median and its spread those of image 1."""
+def _lights(grey_1: Matrix, grey_2: NDArray[np.float32], before: tuple[float, float] | None) -> list[Matrix]:
+    """Gain and offset of image 2: of the image before; none; what makes its median and its spread those of image 1.
+
+    Those that are next to the same as an earlier one are left out.
+    """
     median_1, median_2 = float(np.median(grey_1)), float(np.median(grey_2))
     spread_1, spread_2 = float(np.median(np.abs(grey_1 - median_1))), float(np.median(np.abs(grey_2 - median_2)))
-    lights = [np.array([1.0, 0.0])]
+    lights = [] if before is None else [np.array([np.exp(before[0]), before[1]])]
+    lights.append(np.array([1.0, 0.0]))
     if spread_1 > 0.0 and spread_2 > 0.0:
         gain = spread_1 / spread_2
         lights.append(np.array([gain, median_1 - gain * median_2]))
-    return lights
+    greys = np.array([median_2 - 2.0 * spread_2, median_2 + 2.0 * spread_2])
+    distinct: list[Matrix] = []
+    for light in lights:
+        off = [float(np.abs((light[0] - other[0]) * greys + light[1] - other[1]).max()) for other in distinct]
+        if not any(each < _SAME_LIGHT * spread_1 for each in off):
+            distinct.append(light)
+    return distinct
 
 
 def _without_brightness(H: Matrix) -> Matrix:

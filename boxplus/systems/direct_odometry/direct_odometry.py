@@ -1,4 +1,4 @@
-"""Direct odometry of an RGB-D or a stereo camera: poses from grey values, without features.
+"""Direct odometry of an RGB-D camera, a stereo camera or one camera alone: poses from grey values.
 
 For every frame:
 
@@ -6,7 +6,8 @@ For every frame:
    standstill; where that fails, from half and double of it, small turns, and against the other keyframes.
 2. **Judge** the alignment: a pose that the images do not support is not a pose.
 3. Where the image moved far enough, or its brightness changed, it becomes a **keyframe**: with its depths it enters the window,
-   whose poses, brightness and inverse depths are adjusted together (`window.py`).
+   whose poses, brightness and inverse depths are adjusted together (`window.py`). Depths that no sensor measures come from
+   the motion (`depth_filter.py`); one camera alone waits for two views that tell them (`two_view_start.py`).
 
 Source: Engel, Koltun and Cremers, Direct Sparse Odometry, TPAMI 2018; Kerl, Sturm and Cremers, Dense Visual SLAM for RGB-D
 Cameras, IROS 2013; docs/direct_odometry.md.
@@ -25,15 +26,19 @@ from boxplus.cameras.model import CameraModel, check_pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.sensors.image import Image
+from boxplus.sensors.image import Image, as_image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+from boxplus.systems.direct_odometry.depth_filter import depth_from, depth_of_two
 from boxplus.systems.direct_odometry.estimate import Estimate, Status
 from boxplus.systems.direct_odometry.image_motion import image_motion
 from boxplus.systems.direct_odometry.patches import choose_patches
+from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.search_starts import starts_around
 from boxplus.systems.direct_odometry.sensed_depth import SensedDepth, StereoPair, rgbd_depth
+from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
@@ -42,10 +47,13 @@ Matrix = NDArray[np.float64]
 
 _STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _WORLD = np.diag([1e-5**2] * 6)  # of the first pose, which is the world's
-_TURN_DEG = 3.0  # of the starts that are tried when tracking failed
 _SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lost
 _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
+_SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
+
+
+DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its pose and the logarithm of its gain
 
 
 class Tracked(NamedTuple):
@@ -98,16 +106,18 @@ class DirectOdometry:
         self._reference: WindowKeyframe | None = None
         self._time_ns: int | None = None
         self._seen_ns: int | None = None
-        self._watch, self._calibration = Watch(self.config), CalibrationWatch()
+        self._watch, self._calibration, self._registration = Watch(self.config), CalibrationWatch(), RegistrationWatch()
+        self._start: TwoViewStart | None = None
 
     @property
     def contradiction(self) -> str:
-        """Why no pose is to be trusted, whatever the status: the intrinsics that the grey values contradict; empty where none."""
+        """Why no pose is to be trusted, whatever the status: grey values contradict intrinsics, or where depths lie."""
         return self._watch.contradiction
 
-    def window_points(self) -> NDArray[np.float32]:
-        """(n, 3) the points of the keyframes that are still adjusted, in the world [m]; see `Estimate.finished_points`."""
-        return self.window.points()
+    @property
+    def start_problem(self) -> str:
+        """Why one camera alone had no pose so far, or had none before its start, with the number that was not met."""
+        return "" if self._start is None else self._start.problem
 
     def push_rgbd(self, time_ns: int, image: Image | ArrayLike, depth: ArrayLike) -> Estimate:
         """A frame of an RGB-D camera.
@@ -120,8 +130,8 @@ class DirectOdometry:
         Raises:
             InputError: arrays of another shape or not finite, a time that does not go on, depths that are no metres.
         """
-        grey = image if isinstance(image, Image) else Image.from_array(image)
-        return self._push(time_ns, grey, lambda: rgbd_depth(depth, grey, self.config.depth_noise))
+        grey = as_image(image)
+        return self._push(time_ns, grey, lambda *at: self._filled(rgbd_depth(depth, grey, self.config.depth_noise), grey, *at))
 
     def push_stereo(self, time_ns: int, left: Image | ArrayLike, right: Image | ArrayLike) -> Estimate:
         """A frame of a stereo camera: poses are those of the left one.
@@ -136,14 +146,44 @@ class DirectOdometry:
         if self.stereo is None:
             raise InputError("the second camera", "none", "give it as DirectOdometry(camera, stereo=StereoPair(…))")
         stereo = self.stereo
-        one, two = (each if isinstance(each, Image) else Image.from_array(each) for each in (left, right))
-        return self._push(time_ns, one, lambda: stereo.depth(one, two, self.camera))
+        one, two = as_image(left), as_image(right)
+        return self._push(time_ns, one, lambda *_: stereo.depth(one, two, self.camera))
 
-    def _push(self, time_ns: int, image: Image, depth_of: Callable[[], SensedDepth]) -> Estimate:
+    def push_mono(self, time_ns: int, image: Image | ArrayLike) -> Estimate | None:
+        """A frame of one camera alone. Lengths are in units that nothing tells: about the median depth of the first view.
+
+        Args:
+            time_ns: later than that of the frame before [ns].
+            image: grey values (H, W), or colours.
+
+        Returns:
+            None as long as no two views tell depths; `start_problem` says why.
+
+        Raises:
+            InputError: an image of another shape or not finite, a time that does not go on, OpenCV is not installed.
+        """
+        grey = as_image(image)
+        if self._reference is not None:
+            return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
+        self._check_time(time_ns)
+        watch = Stopwatch()
+        if self._start is None:
+            self._start = TwoViewStart(self.camera)
+        views, self._time_ns = self._start.push(time_ns, grey), time_ns
+        begun = None if views is None else self._begin_alone(self._start, views, watch)
+        if begun is not None or self._seen_ns is None:
+            return begun
+        reasons = (f"the view was lost, and no two views tell depths again: {self._start.problem}",)
+        return self._estimate(time_ns, -1, False, None, Verdict("lost", reasons, np.nan), watch)
+
+    def _check_time(self, time_ns: int) -> None:
         if self._time_ns is not None and time_ns <= self._time_ns:
             raise InputError(
                 "frames in the order of time", f"{time_ns} ns after {self._time_ns} ns", "sort them, or drop this one"
             )
+
+    def _push(self, time_ns: int, image: Image, depth_of: DepthOf) -> Estimate:
+        self._check_time(time_ns)
         watch = Stopwatch()
         if self._reference is None:
             return self._begin(time_ns, image, depth_of, watch)
@@ -159,10 +199,10 @@ class DirectOdometry:
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
         is_keyframe, added = self._asks_for_keyframe(keyframe, alignment), None
         if is_keyframe:
-            if self.stereo is None:  # depths of a stereo pair change with its intrinsics
-                self._calibration.add(keyframe, image.grey, alignment)
-            self._watch.contradiction = self._calibration.contradiction
-            added = self._keyframe(time_ns, image, depth_of(), T, keyframe.log_gain - alignment.brightness[0])
+            log_gain = keyframe.log_gain - alignment.brightness[0]
+            depth = depth_of(T, log_gain)
+            self._watch_sensor(keyframe, image, depth, alignment)
+            added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
             if added is not None:
                 watch.lap("keyframe")
@@ -180,9 +220,53 @@ class DirectOdometry:
             self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
 
-    def _begin(self, time_ns: int, image: Image, depth_of: Callable[[], SensedDepth], watch: Stopwatch) -> Estimate:
+    def _watch_sensor(self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment) -> None:
+        """What a new keyframe says of the intrinsics, and of where depths lie."""
+        if self.stereo is not None or self._start is not None:  # other depths change with the intrinsics
+            return
+        self._calibration.add(keyframe, image.grey, alignment)
+        self._registration.add(image, np.where(depth.is_measured, depth.z, np.float32(0.0)))
+        self._watch.contradiction = self._calibration.contradiction or self._registration.contradiction
+
+    def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
+        """Where a sensor measures little, with depths by the motion."""
+        missing = sensed.z == 0.0
+        if missing.mean() < _SCARCE or not self.window.keyframes:
+            return sensed
+        return sensed.filled(depth_from(self.window.keyframes, image, self.camera, T_world_camera, log_gain, missing))
+
+    def _begin_alone(self, start: TwoViewStart, views: TwoViews, watch: Stopwatch) -> Estimate | None:
+        """Two keyframes of one camera alone; None where grey values do not agree with how corners moved."""
+        first_ns, time_ns = views.time_ns
+        depth = depth_of_two(views.first, views.second, self.camera, views.T_21, views.within)
+        first = self._keyframe(first_ns, views.first, depth, self._T, 0.0)
+        alignment = None if first is None else track(first.tracker, views.second, T_21=views.T_21)
+        verdict = None if alignment is None or first is None else Watch(self.config).judge(alignment, first.tracker.median_depth)
+        if first is None or alignment is None or verdict is None or verdict.status == "lost":
+            why = "fewer than 100 pixels have a depth" if verdict is None else "; ".join(verdict.reasons)
+            start.problem = f"grey values do not confirm how corners moved: {why}"
+            return None
+        self.window.begin(first, self._covariance)
+        T = se3.compose(self._T, se3.inverse(alignment.T_21))
+        depth = depth_from(self.window.keyframes, views.second, self.camera, T, -alignment.brightness[0])
+        second = self._keyframe(time_ns, views.second, depth, T, -alignment.brightness[0])
+        self._time_ns = self._seen_ns = time_ns
+        self._T, self._covariance, self._reference, self._velocity_s = T, alignment.covariance, first, 0.0
+        self._log_gain, self._offset = -alignment.brightness[0], alignment.brightness[1]
+        if second is not None:
+            self.window.add(second, alignment.covariance, holds_scale=True)
+            if self.config.adjustments:
+                self.window.adjust(2 * self.config.adjustments)
+            self._T, self._covariance = second.T_world_camera, self.window.covariance(second)
+            self._reference, self._log_gain, self._offset = second, second.log_gain, 0.0
+        watch.lap("start")
+        reasons = (*self._watch.past_reasons, *verdict.reasons)
+        verdict = Verdict("weak" if reasons else "ok", reasons, np.nan)
+        return self._estimate(time_ns, first.number, second is not None, alignment, verdict, watch)
+
+    def _begin(self, time_ns: int, image: Image, depth_of: DepthOf, watch: Stopwatch) -> Estimate:
         """The first frame, or the first after the view was lost for good."""
-        keyframe = self._keyframe(time_ns, image, depth_of(), self._T, 0.0)
+        keyframe = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0)
         self._time_ns = time_ns
         reasons = list(self._watch.past_reasons)
         status: Status = "weak" if reasons else "ok"
@@ -211,9 +295,9 @@ class DirectOdometry:
         tracked: list[Tracked] = []
         for keyframe, is_hard in attempts:
             if is_hard and self._watch.lost:
-                starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, False)[1:], _SEARCH_DEG
+                starts, search_deg = starts_around(self._T, T_predicted, keyframe.T_world_camera, False)[1:], _SEARCH_DEG
             else:
-                starts, search_deg = _starts(self._T, T_predicted, keyframe.T_world_camera, is_hard), 0.0
+                starts, search_deg = starts_around(self._T, T_predicted, keyframe.T_world_camera, is_hard), 0.0
             offset = self._offset if keyframe is self._reference else 0.0
             light = keyframe.log_gain - self._log_gain, offset
             alignment = track(keyframe.tracker, image, T_21=starts, light=light, search_deg=search_deg)
@@ -253,7 +337,7 @@ class DirectOdometry:
             tracker = Keyframe.prepare(image, depth.z, self.camera, levels=self.config.levels, points=self.config.pixels)
         except InputError:
             return None
-        patches = choose_patches(image.grey, depth.z, depth.sigma, self.camera, self.config.patches)
+        patches = choose_patches(image.grey, depth, self.camera, self.config.patches)
         self.keyframes += 1
         return WindowKeyframe(self.keyframes - 1, time_ns, image.grey, T, log_gain, tracker, patches)
 
@@ -272,7 +356,7 @@ class DirectOdometry:
         self,
         time_ns: int,
         image: Image,
-        depth_of: Callable[[], SensedDepth],
+        depth_of: DepthOf,
         keyframe: WindowKeyframe,
         alignment: Alignment,
         verdict: Verdict,
@@ -286,7 +370,9 @@ class DirectOdometry:
             self._watch.begin_anew(gone_s)
             self._covariance = self._unseen_covariance(time_ns)
             self._reference = None
-            return self._begin(time_ns, image, depth_of, watch)
+            if self._start is None:
+                return self._begin(time_ns, image, depth_of, watch)
+            self._start = TwoViewStart(self.camera)
         return self._estimate(time_ns, keyframe.number, False, alignment, verdict, watch)
 
     def _estimate(
@@ -311,14 +397,3 @@ class DirectOdometry:
             finished_points=self.window.take_finished(),
             timing_s=watch.laps,
         )
-
-
-def _starts(T_last: Matrix, T_predicted: Matrix, T_world_keyframe: Matrix, is_hard: bool) -> Matrix:
-    """Starts T_camera_keyframe (n, 7): the motion going on, and standstill; then half and double of it, and small turns."""
-    poses = [T_predicted, T_last]
-    if is_hard:
-        step = se3.log(se3.compose(se3.inverse(T_last), T_predicted))
-        poses += [se3.compose(T_last, se3.exp(share * step)) for share in (0.5, 2.0)]
-        turns = np.radians(_TURN_DEG) * np.vstack([np.eye(3), -np.eye(3)])
-        poses += [se3.compose(T_predicted, se3.exp(np.concatenate([turn, np.zeros(3)]))) for turn in turns]
-    return np.array([se3.compose(se3.inverse(pose), T_world_keyframe) for pose in poses])

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.residuals.camera.photometric import DSO_PATTERN
 from boxplus.systems.direct_alignment.keyframe_kernel import select_pixels
+from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
 
 Matrix = NDArray[np.float64]
 _OFFSETS = np.array(DSO_PATTERN)
 _CENTRE = int(np.flatnonzero(~_OFFSETS.any(axis=1))[0])
+_GUESSED = 0.5  # standard deviation, by the depth, of one that came from the images themselves
 _KNOWN = 0.1  # standard deviation of a depth, by the depth, up to which a point enters the map
 _REACH = 2  # pixels of the pattern, and one more for gradients
 _SAME_SURFACE = 0.1  # share of the depth by which pixels of a patch may differ
@@ -30,6 +32,7 @@ class Patches:
         tilt: (n, 8) inverse depth of each pixel by that of the centre.
         rho: (n,) inverse depth [1/m], estimated.
         measured: (n,) as the sensor measured it; information: (n,) of that [m²].
+        deviation: (n,) standard deviation of the depth that it began with, by the depth.
     """
 
     pixels: Matrix
@@ -40,30 +43,30 @@ class Patches:
     rho: Matrix
     measured: Matrix
     information: Matrix
+    deviation: Matrix
 
     def __len__(self) -> int:
         return len(self.rho)
 
     def points(self) -> Matrix:
         """(k, 3) centres of those whose depth is known to a tenth, in the camera's frame [m]."""
-        known = self.rho * self.rho * self.information > _KNOWN**-2.0
+        known = self.deviation < _KNOWN
         rays = self.rays[known, _CENTRE]
         return np.column_stack([rays, np.ones(len(rays))]) / self.rho[known, None]
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
         """Forget the others."""
-        for name in ("pixels", "rays", "grey", "share", "tilt", "rho", "measured", "information"):
+        for name in ("pixels", "rays", "grey", "share", "tilt", "rho", "measured", "information", "deviation"):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[kept]))
 
 
-def choose_patches(
-    grey: NDArray[np.float32], depth: NDArray[np.float32], sigma_depth: NDArray[np.float32], camera: Pinhole, count: int
-) -> Patches:
+def choose_patches(grey: NDArray[np.float32], sensed: SensedDepth, camera: Pinhole, count: int) -> Patches:
     """About `count` patches with depth, of steep gradients, spread over the image.
 
     Args:
-        grey: (H, W); depth: (H, W) [m], 0 where there is none; sigma_depth: (H, W) its standard deviation [m].
+        grey: (H, W); sensed: depths, measured or not; those that are not say next to nothing beside the images.
     """
+    depth = sensed.z
     height, width = grey.shape
     inner = np.zeros_like(depth)
     border = _REACH + 1
@@ -80,12 +83,13 @@ def choose_patches(
     rays, seen = camera.unproject(of_pattern.astype(np.float64))
     kept = np.asarray(seen.all(axis=1) & (slope.max(axis=1) > 0.0))
     row, column = centres[:, 1], centres[:, 0]
-    z, sigma = depth[row, column].astype(np.float64), sigma_depth[row, column].astype(np.float64)
+    z, sigma = depth[row, column].astype(np.float64), sensed.sigma[row, column].astype(np.float64)
+    prior = np.where(sensed.is_measured[row, column], sigma, _GUESSED * z)
     rho = 1.0 / z
     tilt = _tilt(depth[v, u].astype(np.float64), z)
     patches = Patches(
         pixels[:found], rays[..., :2], grey[v, u].astype(np.float64), 1.0 / (1.0 + (slope / steep) ** 2), tilt, rho, rho.copy(),
-        (z * z / sigma) ** 2,
+        (z * z / prior) ** 2, sigma / z,
     )  # fmt: skip
     patches.keep(kept)
     return patches

@@ -29,11 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
-from boxplus.manifolds import se3
+from boxplus.manifolds import quaternion, se3
 from boxplus.systems.direct_odometry.window_system import DOF, Matrix, System, WindowKeyframe, linearize
 
 _SIGMA_GAIN = 1e-3  # standard deviation of the first keyframe's a: it is the unit
 _ANY_GAIN = 1.0  # of the others', where nothing else says it
+_SIGMA_SCALE = 1e-3  # standard deviation of the distance that is the unit of length, by itself
 _MEAN_TO_SIGMA = 1.2533  # of normal errors
 _LEAST_SIGMA = 1e-3  # of the range of grey values
 _DAMPING, _LARGEST_DAMPING = 1e-5, 1e3
@@ -107,8 +108,12 @@ class Window:
         self.g_prior = np.zeros(DOF)
         self._visible = {}
 
-    def add(self, keyframe: WindowKeyframe, covariance: Matrix) -> None:
-        """A new keyframe, with pose and covariance by tracking until the window is adjusted; one leaves if there are too many."""
+    def add(self, keyframe: WindowKeyframe, covariance: Matrix, *, holds_scale: bool = False) -> None:
+        """A new keyframe, with pose and covariance by tracking until the window is adjusted; one leaves if there are too many.
+
+        Args:
+            holds_scale: its distance from the keyframe before is the unit of length: no depth was measured.
+        """
         if len(self.keyframes) >= self.size:
             self._marginalize(self._leaving(keyframe))
         self.keyframes.append(keyframe)
@@ -116,6 +121,11 @@ class Window:
         H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
         H[:-DOF, :-DOF], g[:-DOF], C[:-DOF, :-DOF] = self.H_prior, self.g_prior, self._covariance
         H[-1, -1] = _ANY_GAIN**-2.0
+        if holds_scale:
+            keyframe.freeze()
+            way = keyframe.T_world_camera[4:] - self.keyframes[-2].T_world_camera[4:]
+            along = quaternion.to_matrix(keyframe.T_world_camera[:4]).T @ way  # of |way|, as a share is held
+            H[-4:-1, -4:-1] += np.outer(along, along) / (_SIGMA_SCALE * float(way @ way)) ** 2
         C[-DOF:-1, -DOF:-1], C[-1, -1] = covariance, _ANY_GAIN**2.0
         self.H_prior, self.g_prior, self._covariance = H, g, C
 

@@ -40,7 +40,7 @@ def _sample(image: NDArray[np.float32], u: float, v: float) -> tuple[bool, float
     return True, value, 0.5 * ((1.0 - a) * upper + a * lower), 0.5 * ((1.0 - b) * before + b * after)
 
 
-@kernel
+@kernel(fastmath=True)
 def patch_pair(
     T_th: NDArray[np.float64],
     T_th_first: NDArray[np.float64],
@@ -203,3 +203,25 @@ def eliminate(
     for i in range(size):
         for j in range(i):
             H[j, i] = H[i, j]
+
+
+@kernel(fastmath=True)
+def add_rows(
+    rows: NDArray[np.float64],
+    adjoint: NDArray[np.float64],
+    scale: float,
+    host: int,
+    target: int,
+    total: NDArray[np.float64],
+) -> None:
+    """total (n, m) += scale · rows (n, 7) of [ξ, a], mapped to the state (ξ = Ad ξ_h − ξ_t, a_t − a_h), at columns of h and t."""
+    for n in range(np.uint64(rows.shape[0])):
+        row, out = rows[n], total[n]
+        for j in range(6):
+            by_host = 0.0
+            for i in range(6):
+                by_host += row[i] * adjoint[i, j]
+            out[host + j] += scale * by_host
+            out[target + j] -= scale * row[j]
+        out[host + 6] -= scale * row[6]
+        out[target + 6] += scale * row[6]

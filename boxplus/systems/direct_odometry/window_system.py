@@ -12,7 +12,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, se3
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.patches import Patches
-from boxplus.systems.direct_odometry.window_kernel import GOOD, OUTLIER, OUTSIDE, eliminate, patch_pair
+from boxplus.systems.direct_odometry.window_kernel import GOOD, OUTLIER, OUTSIDE, add_rows, eliminate, patch_pair
 
 Matrix = NDArray[np.float64]
 
@@ -214,9 +214,8 @@ def _add_pair(
     system.H[of_t, of_t] += M_t.T @ HM_t
     system.g[of_h] += scale * (g @ M_h)
     system.g[of_t] += scale * (g @ M_t)
-    of_host.W[:, of_h] += scale * (cross @ M_h)
-    of_host.W[:, of_t] += scale * (cross @ M_t)
-    of_host.pulls[:, of_h] += scale * (pulls @ M_h)
-    of_host.pulls[:, of_t] += scale * (pulls @ M_t)
+    adjoint = between.adjoints[target, host]
+    add_rows(cross, adjoint, scale, of_h.start, of_t.start, of_host.W)
+    add_rows(pulls, adjoint, scale, of_h.start, of_t.start, of_host.pulls)
     of_host.H_rho += scale * h_rho
     of_host.g_rho += scale * g_rho

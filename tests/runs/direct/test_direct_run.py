@@ -28,6 +28,7 @@ from boxplus.runs.direct.frame_pairs import FramePairs, choose_cameras
 from boxplus.runs.direct.summary import read_direct_summary
 from boxplus.runs.settings_file import load_settings
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.simulation.cameras import make_rig, simulate_cameras, write_camera_recording
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room, drive, errors
 
 pytest.importorskip("cv2")
@@ -177,6 +178,31 @@ def test_wrong_settings_are_refused(tmp_path: Path, words: list[str]) -> None:
     assert words[1].partition("=")[0] in text
 
 
+def test_one_camera_says_that_the_scale_is_not_known(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room_moving", 1, duration_s=1.6, rig=make_rig("mono", None, 0.4, 20.0))
+    recording = write_camera_recording(simulation, tmp_path / "room", "tum", images="pgm")
+    out = tmp_path / "out"
+    code, text = run(str(recording), "-o", str(out), "--gt", str(recording / "groundtruth.txt"))
+    assert code == 0, text
+    summary = read_direct_summary(out / "run.json")
+    assert (summary.kind, summary.scale) == ("mono", "unknown")
+    assert summary.frames_before_start > 0 and "pixels" in summary.start_problem
+    assert summary.frames + summary.frames_before_start == summary.cameras[0].images
+    assert json.loads((out / "evaluation.json").read_text())["alignment"]["kind"] == "sim3"
+    words = " ".join(text.split())
+    assert "units of unknown scale" in words and "one camera alone does not tell the scale" in words
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "scale: lengths in units of about" in page and "rotation and scale aligned" in page
+
+
+def test_one_camera_that_only_sees_its_first_frames_is_refused_with_the_reason(recorded: Path, tmp_path: Path) -> None:
+    code, text = run(str(recorded), "-o", str(tmp_path / "out"), "--mono", "--duration", "0.25")
+    words = " ".join(text.split())
+    assert code == 2
+    assert "two views of one camera" in words and "of which a rotation leaves" in words
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["frames_before_start"] == 3
+
+
 def stream(index: int, name: str, kind: str = "intensity", **other: object) -> CameraStream:
     unit = 0.001 if kind == "depth" else None
     made = CameraStream(index, name, kind, name, "", 160, 120, 10, 10.0, unit, CAMERA, np.eye(4), None)  # type: ignore[arg-type]
@@ -194,8 +220,9 @@ def test_cameras_are_chosen_or_refused() -> None:
     assert pair.kind == "stereo"
     assert pair.stereo is not None
     np.testing.assert_allclose(np.asarray(pair.stereo.T_right_left)[4:], [-0.1, 0.0, 0.0])
-    with pytest.raises(RecordingError, match="one camera alone"):
-        choose_cameras(info(one))
+    assert choose_cameras(info(one)).kind == choose_cameras(info(one, depth), mono=True).kind == "mono"
+    with pytest.raises(RecordingError, match="depth alone has no grey values"):
+        choose_cameras(info(depth))
     with pytest.raises(RecordingError, match="register the depth to the images"):
         choose_cameras(info(one, replace(depth, width=320, height=240)))
     with pytest.raises(RecordingError, match="depths that are registered"):

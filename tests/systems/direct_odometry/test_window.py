@@ -11,6 +11,7 @@ from boxplus.residuals.camera.photometric import DSO_PATTERN
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.patches import choose_patches
+from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_kernel import eliminate
 from boxplus.systems.direct_odometry.window_system import DOF, WindowKeyframe, linearize
@@ -27,7 +28,7 @@ def keyframes(seed: int, count: int, step: int = 3) -> list[WindowKeyframe]:
     for k in range(count):
         grey, depth = room.render(T[k])
         image, z = Image.from_array(grey), depth.astype(np.float32)
-        patches = choose_patches(image.grey, z, 0.01 * z, CAMERA, 60)
+        patches = choose_patches(image.grey, SensedDepth(z, 0.01 * z, z > 0.0), CAMERA, 60)
         made.append(WindowKeyframe(k, k, image.grey, T[k], 0.0, Keyframe.prepare(image, z, CAMERA, levels=1), patches))
     return made
 
@@ -165,7 +166,8 @@ def test_the_keyframe_nobody_sees_leaves_first() -> None:
 
 def test_pixels_of_a_patch_lie_on_its_plane() -> None:
     grey, depth = Room(6).render(path(6, 30)[-1])
-    patches = choose_patches(grey.astype(np.float32), depth.astype(np.float32), (0.01 * depth).astype(np.float32), CAMERA, 100)
+    z = depth.astype(np.float32)
+    patches = choose_patches(grey.astype(np.float32), SensedDepth(z, 0.01 * z, z > 0.0), CAMERA, 100)
     u, v = patches.pixels.astype(int).T
     of_pattern = patches.pixels[:, None, :].astype(int) + np.array(DSO_PATTERN)
     true = depth[v, u][:, None] / depth[of_pattern[..., 1], of_pattern[..., 0]]
