@@ -92,6 +92,7 @@ BENCHMARKS = {
     "imu": Benchmark(("--rounds", "2")),
     "residuals": Benchmark(("--edges", "1000", "--rounds", "1")),
     "direct": Benchmark(("--rounds", "1")),
+    "direct_runs": Benchmark(()),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
 

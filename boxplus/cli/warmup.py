@@ -120,8 +120,9 @@ def _follow_camera_and_imu() -> None:
 
     if importlib.util.find_spec("cv2") is None:  # then there is no run either
         return
-    # At rest for two seconds, then moving: a start, and a window from which keyframes leave.
-    simulation = simulate_cameras("room", 1, duration_s=4.0, rig=make_rig("stereo", None, 0.3, 15.0))
+    # A start at rest and one in motion, and a window from which keyframes leave.
     config = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})
-    with tempfile.TemporaryDirectory() as folder:
-        run_visual_odometry(as_camera_recording(simulation), Path(folder) / "run", config)
+    for scenario in ("room", "room_moving"):
+        simulation = simulate_cameras(scenario, 1, duration_s=4.0, rig=make_rig("stereo", None, 0.3, 15.0))
+        with tempfile.TemporaryDirectory() as folder:
+            run_visual_odometry(as_camera_recording(simulation), Path(folder) / "run", config)

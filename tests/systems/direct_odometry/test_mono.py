@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.evaluation.alignment import align
-from boxplus.manifolds import se3, so3
+from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
 from boxplus.simulation.cameras import make_rig, simulate_cameras
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
@@ -105,6 +105,17 @@ def test_the_path_is_true_up_to_scale() -> None:
     turned_true = T[0, :3, :3].T @ T[-1, :3, :3]
     assert np.degrees(np.linalg.norm(so3.log(turned.T @ turned_true))) < 0.7
     assert np.linalg.eigvalsh(found[-1].pose_covariance)[0] > 0.0
+
+
+def test_the_unit_of_length_is_held() -> None:
+    odometry, estimates = run(images(Room(4), sideways(4, 16), 4))
+    assert estimates[-1] is not None
+    first, second = odometry.window.keyframes[:2]
+    way = second.T_world_camera[4:] - first.T_world_camera[4:]
+    along = quaternion.to_matrix(second.T_world_camera[:4]).T @ way
+    share = np.sqrt(along @ odometry.window.covariance(second)[3:, 3:] @ along) / (way @ way)
+    assert share < 2e-3  # the rest is known far less well
+    assert np.sqrt(np.trace(odometry.window.covariance(second)[3:, 3:])) > 2.0 * share * np.linalg.norm(way)
 
 
 def test_after_a_view_that_was_lost_for_good_nothing_is_trusted() -> None:

@@ -13,7 +13,7 @@ from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.window import Window
-from boxplus.systems.direct_odometry.window_kernel import eliminate
+from boxplus.systems.direct_odometry.window_kernel import add_rows, eliminate
 from boxplus.systems.direct_odometry.window_system import DOF, WindowKeyframe, linearize
 from tests.systems.direct_odometry.scenes import CAMERA, Room, path
 
@@ -173,3 +173,15 @@ def test_pixels_of_a_patch_lie_on_its_plane() -> None:
     true = depth[v, u][:, None] / depth[of_pattern[..., 1], of_pattern[..., 0]]
     assert np.abs(true - 1.0).max() > 1e-3  # walls are seen at an angle
     assert np.median(np.abs(patches.tilt - true).max(axis=1)) < 1e-5
+
+
+def test_rows_of_a_pair_are_those_of_its_two_keyframes() -> None:
+    rng = np.random.default_rng(4)
+    rows, adjoint, total = rng.normal(size=(9, 7)), rng.normal(size=(6, 6)), rng.normal(size=(9, 21))
+    expected = total.copy()
+    expected[:, 14:20] += 0.3 * rows[:, :6] @ adjoint
+    expected[:, 20] -= 0.3 * rows[:, 6]
+    expected[:, 0:6] -= 0.3 * rows[:, :6]
+    expected[:, 6] += 0.3 * rows[:, 6]
+    add_rows(rows, adjoint, 0.3, 14, 0, total)
+    np.testing.assert_allclose(total, expected, atol=1e-14)
