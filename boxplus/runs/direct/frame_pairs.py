@@ -14,7 +14,7 @@ from boxplus.errors import RecordingError
 from boxplus.manifolds import quaternion
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.sensors.camera_image import CameraImage
-from boxplus.systems.direct_odometry.sensed_depth import StereoPair
+from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 
 _SAME_PLACE = 1e-6
 _SHARE_OF_PERIOD = 0.5  # stamps of two streams may differ by this much of the time between images

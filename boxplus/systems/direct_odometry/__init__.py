@@ -1,4 +1,4 @@
-"""Direct (photometric) odometry of RGB-D and stereo cameras."""
+"""Direct (photometric) odometry of RGB-D cameras, stereo cameras and one camera alone."""
 
 import lazy_loader
 

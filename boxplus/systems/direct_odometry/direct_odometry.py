@@ -31,13 +31,13 @@ from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
-from boxplus.systems.direct_odometry.depth_filter import depth_from, depth_of_two
+from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth_of_two
+from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.estimate import Estimate, Status
 from boxplus.systems.direct_odometry.image_motion import image_motion
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window

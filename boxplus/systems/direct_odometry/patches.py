@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.residuals.camera.photometric import DSO_PATTERN
 from boxplus.systems.direct_alignment.keyframe_kernel import select_pixels
-from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
+from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth
 
 Matrix = NDArray[np.float64]
 _OFFSETS = np.array(DSO_PATTERN)

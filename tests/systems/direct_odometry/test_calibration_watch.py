@@ -12,8 +12,8 @@ from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import track
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
+from boxplus.systems.direct_odometry.depth.sensed_depth import rgbd_depth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
-from boxplus.systems.direct_odometry.sensed_depth import rgbd_depth
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 

@@ -12,9 +12,9 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
+from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
-from boxplus.systems.direct_odometry.sensed_depth import StereoPair
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Drive, Room, drive, errors
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"

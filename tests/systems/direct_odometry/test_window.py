@@ -10,8 +10,8 @@ from boxplus.manifolds import se3
 from boxplus.residuals.camera.photometric import DSO_PATTERN
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
+from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.patches import choose_patches
-from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_kernel import add_rows, eliminate
 from boxplus.systems.direct_odometry.window_system import DOF, WindowKeyframe, linearize

@@ -1,4 +1,4 @@
-"""Search along epipolar lines for the inverse depth of patches, in compiled code (see `epipolar.py`)."""
+"""Search along epipolar lines for the inverse depth of patches, in compiled code (see `epipolar_search.py`)."""
 
 from __future__ import annotations
 

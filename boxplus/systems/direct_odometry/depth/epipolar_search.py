@@ -11,7 +11,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion
 from boxplus.sensors.image import Image, half_camera
 from boxplus.systems.direct_alignment.keyframe_kernel import select_pixels
-from boxplus.systems.direct_odometry.epipolar_kernel import FOUND, OUTSIDE, search_lines
+from boxplus.systems.direct_odometry.depth.epipolar_kernel import FOUND, OUTSIDE, search_lines
 
 Matrix = NDArray[np.float64]
 Pixels = NDArray[np.int64]

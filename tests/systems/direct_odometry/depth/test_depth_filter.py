@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
-from boxplus.systems.direct_odometry.depth_filter import DepthFilter, depth_from, depth_of_two
+from boxplus.systems.direct_odometry.depth.depth_filter import DepthFilter, depth_from, depth_of_two
+from boxplus.systems.direct_odometry.depth.epipolar_search import pixels_per_inverse_depth
+from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
-from boxplus.systems.direct_odometry.epipolar_search import pixels_per_inverse_depth
-from boxplus.systems.direct_odometry.sensed_depth import SensedDepth
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 ONE = np.ones(1, dtype=np.bool_)

@@ -10,7 +10,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
-from boxplus.systems.direct_odometry.sensed_depth import StereoPair, rgbd_depth
+from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair, rgbd_depth
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 NOISE = (0.0012, 0.0019, 0.4)

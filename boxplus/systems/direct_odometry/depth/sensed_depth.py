@@ -12,8 +12,8 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.sensors.image import Image
-from boxplus.systems.direct_odometry.epipolar_kernel import FOUND
-from boxplus.systems.direct_odometry.epipolar_search import View, choose_candidates, search
+from boxplus.systems.direct_odometry.depth.epipolar_kernel import FOUND
+from boxplus.systems.direct_odometry.depth.epipolar_search import View, choose_candidates, search
 
 Depths = NDArray[np.float32]
 
