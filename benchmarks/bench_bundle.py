@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from metrics import Metric, run_as_script
 
-from boxplus.formats.bal import BalProblem, read_bal, write_bal
+from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.problem import Problem

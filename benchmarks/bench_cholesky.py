@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, tril
 from scipy.sparse.linalg import splu
 
-from boxplus.formats.g2o import read_g2o
+from boxplus.formats.graphs.g2o import read_g2o
 from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.cholesky import SparseCholesky
 

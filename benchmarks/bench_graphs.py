@@ -25,8 +25,8 @@ from typing import Any, Literal
 import numpy as np
 from metrics import Metric, run_as_script
 
-from boxplus.formats.g2o import read_g2o
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.g2o import read_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from metrics import Metric, run_as_script
 
-from boxplus.formats.g2o import read_g2o
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.g2o import read_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3

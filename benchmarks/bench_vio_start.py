@@ -32,9 +32,9 @@ from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras.feature_tracks import TrackModel, track_points
 from boxplus.simulation.imu import BiasWalk, ImuModel, Vibration, measure
-from boxplus.simulation.manoeuvres import constant_turn, constant_velocity, drone_within, handheld, level
-from boxplus.simulation.spline import Motion, Trajectory
-from boxplus.simulation.trajectories import at_rest, spin_in_place
+from boxplus.simulation.motions.manoeuvres import constant_turn, constant_velocity, drone_within, handheld, level
+from boxplus.simulation.motions.spline import Motion, Trajectory
+from boxplus.simulation.motions.trajectories import at_rest, spin_in_place
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start

@@ -17,9 +17,9 @@ from .errors import SingularProblemError as SingularProblemError
 from .evaluation.evaluation import Evaluation as Evaluation
 from .evaluation.evaluation import evaluate as evaluate
 from .filtering.nav_state import NavState as NavState
-from .formats.pose_graph import PoseGraph as PoseGraph
-from .formats.pose_graph_file import read_pose_graph as read_pose_graph
-from .formats.reconstruction import read_reconstruction as read_reconstruction
+from .formats.graphs.pose_graph import PoseGraph as PoseGraph
+from .formats.graphs.pose_graph_file import read_pose_graph as read_pose_graph
+from .formats.reconstructions.reconstruction import read_reconstruction as read_reconstruction
 from .formats.trajectory import Trajectory as Trajectory
 from .formats.trajectory import read_trajectory as read_trajectory
 from .manifolds.body_pose import BodyPose as BodyPose

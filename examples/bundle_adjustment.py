@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.reconstruction import read_reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.reconstruction import read_reconstruction
 from boxplus.manifolds import so3
 from boxplus.optimization.losses import Cauchy
 from boxplus.systems.bundle_adjustment import adjust_bundle

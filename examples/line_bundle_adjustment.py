@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 import boxplus as bp
-from boxplus.formats.vgg_lines import VggLines, read_vgg_lines
+from boxplus.formats.reconstructions.vgg_lines import VggLines, read_vgg_lines
 from boxplus.manifolds import quaternion
 from boxplus.systems.bundle_adjustment import LineAdjustmentConfig, adjust_lines
 

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 
 import boxplus as bp
-from boxplus.formats.pose_graph_file import read_pose_graph
+from boxplus.formats.graphs.pose_graph_file import read_pose_graph
 from boxplus.manifolds import se2
 from boxplus.optimization.losses import GemanMcClure
 

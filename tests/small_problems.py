@@ -8,10 +8,10 @@ import numpy as np
 
 from boxplus.cameras.distortion import Radial, RadialTangential
 from boxplus.cameras.pinhole import Pinhole
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.gbp import GbpProblem
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.manifolds import quaternion, se2, se3, so3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
@@ -130,8 +130,8 @@ def loop_graph(dimension: int, with_poses: bool = True, count: int = 24) -> Pose
 
 def write_small_files(folder: Path) -> None:
     """scene.txt.bz2 (BAL) and loops.g2o."""
-    from boxplus.formats.bal import write_bal
-    from boxplus.formats.g2o import write_g2o
+    from boxplus.formats.graphs.g2o import write_g2o
+    from boxplus.formats.reconstructions.bal import write_bal
 
     write_bal(folder / "scene.txt.bz2", bal_problem())
     write_g2o(folder / "loops.g2o", loop_graph(3))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from draw_filter import Filtered
 from imu_grades import IMU_GRADES, draw_imu
 from numpy.typing import NDArray
 
-from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting
+from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.lidar import LidarModel
+from boxplus.simulation.motions import manoeuvres
 from lio_campaign.places import MOTIONS, PLACES, Place, make_motion
 from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Setting, deliver, draw_spoiling
 
@@ -26,7 +28,7 @@ _IMU_RATES_HZ = (100.0, 125.0, 200.0, 250.0, 400.0)
 
 
 @dataclass(frozen=True)
-class Kinds:
+class Kinds(Filtered):
     """What a seed is about, without its worlds and motions: cheap.
 
     Attributes:
@@ -43,11 +45,6 @@ class Kinds:
     extrinsic: str
     fault: str
     bag: str
-
-    def matches(self, only: dict[str, str]) -> bool:
-        """Whether all `only` hold; KeyError names an unknown key."""
-        mine = asdict(self)
-        return all(mine[key] == value for key, value in only.items())
 
 
 @dataclass(frozen=True)

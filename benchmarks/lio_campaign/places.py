@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from boxplus.simulation import manoeuvres, sites, trajectories, worlds
-from boxplus.simulation.spline import Trajectory
-from boxplus.simulation.world import World
+from boxplus.simulation.motions import manoeuvres, trajectories
+from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.worlds import sites, worlds
+from boxplus.simulation.worlds.world import World
 
 CLEARANCE_M = 0.35
 _TRIES = 20

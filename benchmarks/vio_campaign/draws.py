@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from draw_filter import Filtered
 from imu_grades import IMU_GRADES, draw_imu
 
 from boxplus.simulation import faults as imu_faults
-from boxplus.simulation import manoeuvres
 from boxplus.simulation.cameras import (
     CameraFault,
     CameraRig,
@@ -25,7 +25,8 @@ from boxplus.simulation.cameras import (
 )
 from boxplus.simulation.cameras import faults as camera_faults
 from boxplus.simulation.cameras.scenarios import ROOM_HIGH, ROOM_LOW
-from boxplus.simulation.spline import Trajectory
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions.spline import Trajectory
 
 MOTIONS = {
     "handheld": ("room", "warehouse"),
@@ -50,7 +51,7 @@ _IMU_RATES_HZ = (100.0, 200.0, 400.0)
 
 
 @dataclass(frozen=True)
-class Kinds:
+class Kinds(Filtered):
     """What a seed is about, without its worlds and motions: cheap."""
 
     world: str
@@ -60,11 +61,6 @@ class Kinds:
     light: str
     imu: str
     fault: str
-
-    def matches(self, only: dict[str, str]) -> bool:
-        """Whether all `only` hold; KeyError names an unknown key."""
-        mine = asdict(self)
-        return all(mine[key] == value for key, value in only.items())
 
 
 @dataclass(frozen=True)

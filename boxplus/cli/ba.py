@@ -24,7 +24,7 @@ from boxplus.cli.optimization_terminal import (
 )
 
 if TYPE_CHECKING:
-    from boxplus.formats.reconstruction import Reconstruction, ReconstructionFormat
+    from boxplus.formats.reconstructions.reconstruction import Reconstruction, ReconstructionFormat
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
     from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentResult
@@ -91,7 +91,7 @@ def ba(
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.errors import InputError
-    from boxplus.formats.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
+    from boxplus.formats.reconstructions.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
     from boxplus.runs.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
     from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
@@ -150,7 +150,7 @@ def ba(
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Files and folders that this command writes."""
-    from boxplus.formats import colmap_binary, colmap_text
+    from boxplus.formats.reconstructions import colmap_binary, colmap_text
     from boxplus.runs.optimization_summary import PLOTS
 
     model, plots = folder / "adjusted", folder / "plots"
@@ -166,8 +166,8 @@ def _describe(start: Reconstruction) -> str:
 
 
 def _kind(start: Reconstruction) -> str:
-    from boxplus.formats.bal import BalProblem
-    from boxplus.formats.colmap_model import ColmapModel
+    from boxplus.formats.reconstructions.bal import BalProblem
+    from boxplus.formats.reconstructions.colmap_model import ColmapModel
 
     if isinstance(start, ColmapModel):
         return f"COLMAP model ({start.format}, cameras {', '.join(sorted(set(start.camera_models)))})"
@@ -190,36 +190,26 @@ def _summary(
     loss: Loss | None,
     stopped: bool,
 ) -> OptimizationSummary:
-    from boxplus.cli.optimization_terminal import state_and_reason, versions
-    from boxplus.runs.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+    from boxplus.cli.optimization_terminal import summary_of
+    from boxplus.runs.optimization_summary import ErrorFacts
 
-    solution = result.solution
-    state, reason = state_and_reason(solution, stopped)
     rho = "" if loss is None else f", ρ {loss!r}"
-    return OptimizationSummary(
+    return summary_of(
+        result.solution,
+        config,
+        loss,
+        stopped,
         program="boxplus ba",
-        versions=versions(),
         started=started,
-        state=state,
         input=str(file),
         output=output,
         sizes={**_sizes(start), "used": len(result.errors)},
-        settings={**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), "loss": repr(loss) if loss else "none"},
-        status=solution.status,
-        reason=reason,
-        method=solution.method,
-        linear_solver=solution.linear_solver,
         convention=f"cost ½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over the observations, σ = {config.sigma_px:g} px{rho}",
         start=_start(result, loss),
-        cost_initial=solution.cost_initial,
-        cost=solution.cost,
         errors_initial=ErrorFacts.of(result.errors_start),
         errors=ErrorFacts.of(result.errors),
-        invalid=solution.invalid,
         notes=list(result.notes),
         doubt=result.doubt,
-        timing_s=solution.timing_s,
-        history=iteration_facts(solution),
     )
 
 

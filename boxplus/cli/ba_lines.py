@@ -12,7 +12,7 @@ from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
 
 if TYPE_CHECKING:
     from boxplus.cli.optimization_terminal import MethodChoice
-    from boxplus.formats.vgg_lines import VggLines
+    from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
     from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig, LineAdjustmentResult
@@ -39,8 +39,8 @@ def adjust_line_set(
     """Read, adjust, write and report; exit codes as those of the command."""
     from boxplus.cli.optimization_terminal import OptimizationTerminal
     from boxplus.cli.run_terminal import stop_on_interrupt
-    from boxplus.formats.vgg_lines import read_vgg_lines
-    from boxplus.formats.vgg_writer import write_vgg_lines
+    from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
+    from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
     from boxplus.runs.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.line_adjustment import adjust_lines
 
@@ -99,11 +99,9 @@ def _summary(
 ) -> OptimizationSummary:
     import numpy as np
 
-    from boxplus.cli.optimization_terminal import state_and_reason, versions
-    from boxplus.runs.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+    from boxplus.cli.optimization_terminal import summary_of
+    from boxplus.runs.optimization_summary import ErrorFacts
 
-    solution = result.solution
-    state, reason = state_and_reason(solution, stopped)
     rho = "" if loss is None else f", ρ {loss!r}"
     what = f"½ Σ {'ρ' if loss else ''}(‖e‖²/σ²) over both ends of the segments, σ = {config.sigma_px:g} px"
     if result.points is not None:
@@ -112,32 +110,24 @@ def _summary(
         np.concatenate(errors)
         for errors in ((result.errors_start, result.point_errors_start), (result.errors, result.point_errors))
     )
-    return OptimizationSummary(
+    return summary_of(
+        result.solution,
+        config,
+        loss,
+        stopped,
         program="boxplus ba",
-        versions=versions(),
         started=started,
-        state=state,
         input=str(file),
         output=_ADJUSTED,
         sizes=sizes,
-        settings={**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), "loss": repr(loss) if loss else "none"},
-        status=solution.status,
-        reason=reason,
-        method=solution.method,
-        linear_solver=solution.linear_solver,
         convention=f"cost {what}{rho}",
         start="cameras of the files, lines triangulated from the segments"
         if config.triangulate
         else "cameras and lines of the files",
-        cost_initial=solution.cost_initial,
-        cost=solution.cost,
         errors_initial=ErrorFacts.of(before),
         errors=ErrorFacts.of(after),
-        invalid=solution.invalid,
         notes=list(result.notes),
         doubt=result.doubt,
-        timing_s=solution.timing_s,
-        history=iteration_facts(solution),
     )
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich import box
@@ -115,6 +115,35 @@ def versions() -> dict[str, str]:
 
     libraries = {name: version(name) for name in ("numpy", "numba", "scipy")}
     return {"boxplus": boxplus.__version__, "python": platform.python_version(), **libraries}
+
+
+def summary_of(solution: Solution, config: Any, loss: Loss | None, stopped: bool, **own: Any) -> OptimizationSummary:
+    """The summary of a run: what a solution and its settings say, and what is the command's own.
+
+    Args:
+        config: a model of settings with those of the solver in `solver`.
+        stopped: by the user.
+        own: the other fields; they win.
+    """
+    from boxplus.runs.optimization_summary import OptimizationSummary, iteration_facts
+
+    state, reason = state_and_reason(solution, stopped)
+    settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump()}
+    facts = {
+        "versions": versions(),
+        "state": state,
+        "settings": {**settings, "loss": repr(loss) if loss else "none"},
+        "status": solution.status,
+        "reason": reason,
+        "method": solution.method,
+        "linear_solver": solution.linear_solver,
+        "cost_initial": solution.cost_initial,
+        "cost": solution.cost,
+        "invalid": solution.invalid,
+        "timing_s": solution.timing_s,
+        "history": iteration_facts(solution),
+    }
+    return OptimizationSummary(**{**facts, **own})
 
 
 class OptimizationTerminal:

@@ -24,7 +24,7 @@ from boxplus.cli.optimization_terminal import (
 )
 
 if TYPE_CHECKING:
-    from boxplus.formats.pose_graph import PoseGraph
+    from boxplus.formats.graphs.pose_graph import PoseGraph
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, PoseGraphResult
@@ -117,7 +117,7 @@ def pgo(
     """
     from boxplus.cli.optimization_terminal import OptimizationTerminal, parse_loss, solver_options
     from boxplus.cli.run_terminal import stop_on_interrupt
-    from boxplus.formats.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
+    from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
     from boxplus.runs.output_folder import output_folder
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
 
@@ -201,40 +201,36 @@ def _summary(
     reading: dict[str, str],
     stopped: bool,
 ) -> OptimizationSummary:
-    from boxplus.cli.optimization_terminal import state_and_reason, versions
-    from boxplus.runs.optimization_summary import ErrorFacts, OptimizationSummary, iteration_facts
+    from boxplus.cli.optimization_terminal import summary_of
+    from boxplus.runs.optimization_summary import ErrorFacts
 
-    solution = result.solution
-    state, reason = state_and_reason(solution, stopped)
-    settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), **reading}
-    return OptimizationSummary(
+    return summary_of(
+        result.solution,
+        config,
+        loss,
+        stopped,
         program="boxplus pgo",
-        versions=versions(),
         started=started,
-        state=state,
         input=str(file),
         output=output,
         sizes={"poses": len(graph.ids), "edges": len(graph.edges), "held": len(result.held)},
-        settings={**settings, "loss": repr(loss) if loss else "none"},
-        status=solution.status,
-        reason=reason,
-        method=solution.method,
-        linear_solver=solution.linear_solver,
+        settings={
+            **config.model_dump(exclude={"solver"}),
+            **config.solver.model_dump(),
+            **reading,
+            "loss": repr(loss) if loss else "none",
+        },
         convention=_convention(graph, config, loss, reading),
         start=result.start_reason,
-        cost_initial=solution.cost_initial,
-        cost=solution.cost,
         chi2_initial=result.chi2_start,
         chi2=result.chi2,
         errors_initial=ErrorFacts.of(result.errors_start),
         errors=ErrorFacts.of(result.errors),
-        invalid=solution.invalid,
         loops=None if result.loops is None else result.loops.report.sentence("loop closures"),
         certificate=None if result.certificate is None else result.certificate.sentence,
         doubt=result.doubt,
         notes=[*graph.warnings, *result.notes],
-        timing_s={"start": result.timing_s["start"], **solution.timing_s},
-        history=iteration_facts(solution),
+        timing_s={"start": result.timing_s["start"], **result.solution.timing_s},
     )
 
 

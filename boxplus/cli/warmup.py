@@ -50,7 +50,7 @@ def _run_odometry() -> None:
 def _optimize_pose_graphs() -> None:
     import numpy as np
 
-    from boxplus.formats.pose_graph import PoseGraph
+    from boxplus.formats.graphs.pose_graph import PoseGraph
     from boxplus.manifolds import se2, se3
     from boxplus.manifolds.se2 import SE2
     from boxplus.manifolds.se3 import SE3
@@ -76,8 +76,8 @@ def _optimize_pose_graphs() -> None:
 def _adjust_bundle() -> None:
     import numpy as np
 
-    from boxplus.formats.bal import BalProblem
-    from boxplus.formats.gbp import GbpProblem
+    from boxplus.formats.reconstructions.bal import BalProblem
+    from boxplus.formats.reconstructions.gbp import GbpProblem
     from boxplus.manifolds import se3
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 

@@ -11,7 +11,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.report.bundle_scene import BundleScene, Viewpoint, frustum_lines, scene_of
 from boxplus.report.optimization_figures import FONT
 from boxplus.report.optimization_page import write_optimization_page

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.systems.bundle_adjustment.reconstruction_problem import mean_error_of_points
 

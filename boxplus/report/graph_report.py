@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.report.optimization_figures import FONT
 from boxplus.report.optimization_page import write_optimization_page
 from boxplus.report.optimization_plots import plain, write_optimization_plots

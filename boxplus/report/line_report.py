@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from boxplus.formats.vgg_lines import VggLines
+from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import quaternion
 from boxplus.report.bundle_scene import BundleScene, Viewpoint, frustum_lines
 from boxplus.report.optimization_figures import FONT

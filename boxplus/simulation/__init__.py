@@ -4,12 +4,12 @@ from boxplus.simulation.faults import FAULTS, Fault, make_fault
 from boxplus.simulation.imu import ImuModel
 from boxplus.simulation.lidar import RosetteLidar, SpinningLidar
 from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.motions.spline import Motion, SplineTrajectory, Trajectory
+from boxplus.simulation.motions.thrust import ThrustTrajectory
 from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import SCENARIOS, Scenario, make_scenario, mounting
 from boxplus.simulation.simulation import Simulation, SimulationConfig, simulate
-from boxplus.simulation.spline import Motion, SplineTrajectory, Trajectory
-from boxplus.simulation.thrust import ThrustTrajectory
-from boxplus.simulation.world import World, box, cylinder, rectangle, sphere
+from boxplus.simulation.worlds.world import World, box, cylinder, rectangle, sphere
 
 __all__ = [
     "FAULTS",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus.formats.trajectory_rows import tum_row
 from boxplus.manifolds import quaternion
-from boxplus.simulation.spline import Trajectory
+from boxplus.simulation.motions.spline import Trajectory
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.sensors.imu import ImuSamples
-from boxplus.simulation.spline import Motion, Trajectory
+from boxplus.simulation.motions.spline import Motion, Trajectory
 
 GRAVITY = 9.81
 """Free fall in simulated worlds [m/s²], along −z."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3

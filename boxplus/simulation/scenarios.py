@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.simulation import trajectories, worlds
 from boxplus.simulation.imu import ImuModel
 from boxplus.simulation.lidar import LidarModel, RosetteLidar, SpinningLidar
-from boxplus.simulation.spline import SplineTrajectory, Trajectory
-from boxplus.simulation.world import World
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
+from boxplus.simulation.worlds import worlds
+from boxplus.simulation.worlds.world import World
 
 
 def mounting(roll_deg: float, pitch_deg: float, yaw_deg: float, p_imu_lidar: tuple[float, float, float]) -> NDArray[np.float64]:

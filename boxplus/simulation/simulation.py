@@ -14,9 +14,9 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation.imu import ImuModel, SimulatedImu
 from boxplus.simulation.lidar import LidarModel
+from boxplus.simulation.motions.spline import Motion, span_of
 from boxplus.simulation.scenarios import Scenario, make_scenario
-from boxplus.simulation.spline import Motion, span_of
-from boxplus.simulation.world import World
+from boxplus.simulation.worlds.world import World
 
 Event = Scan | ImuSamples
 

@@ -9,8 +9,8 @@ import numpy as np
 from typer.testing import CliRunner, Result
 
 from boxplus.cli import app
-from boxplus.formats.vgg_lines import read_vgg_lines
-from boxplus.formats.vgg_writer import write_vgg_lines
+from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
+from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
 from tests.systems.bundle_adjustment.line_scenes import house, perturbed
 
 

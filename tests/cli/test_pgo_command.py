@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 
 from boxplus.cli import app
 from boxplus.errors import SingularProblemError
-from boxplus.formats.g2o import read_g2o, write_g2o
-from boxplus.formats.pose_graph import PoseGraph
-from boxplus.formats.toro import read_toro, write_toro
+from boxplus.formats.graphs.g2o import read_g2o, write_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.graphs.toro import read_toro, write_toro
 from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph import pose_graph

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem, read_bal, write_bal
-from boxplus.formats.colmap import read_colmap, write_colmap
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.g2o import read_g2o, write_g2o
-from boxplus.formats.pose_graph import PoseGraph
-from boxplus.formats.toro import read_toro, write_toro
+from boxplus.formats.graphs.g2o import read_g2o, write_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.graphs.toro import read_toro, write_toro
+from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
+from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
 
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
 

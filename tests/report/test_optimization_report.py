@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
 from boxplus.cli import app
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.g2o import write_g2o
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.g2o import write_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.report.bundle_scene import Viewpoint, camera_centers, frustum_lines, scene_of
 from boxplus.report.graph_report import _kinds, _panels
 from boxplus.report.optimization_figures import cost_over_iterations, counts_per_bin, error_bins, error_histogram

@@ -14,11 +14,13 @@ from boxplus.manifolds import so3
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
 from boxplus.runs.config import load_run_config
-from boxplus.simulation import Scenario, Simulation, SpinningLidar, faults, manoeuvres, trajectories, worlds, write_recording
+from boxplus.simulation import Scenario, Simulation, SpinningLidar, faults, write_recording
 from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.motions import manoeuvres, trajectories
+from boxplus.simulation.motions.spline import SplineTrajectory
+from boxplus.simulation.motions.trajectories import START_NS
 from boxplus.simulation.scenarios import mounting
-from boxplus.simulation.spline import SplineTrajectory
-from boxplus.simulation.trajectories import START_NS
+from boxplus.simulation.worlds import worlds
 
 T_IMU_LIDAR = mounting(20.0, -35.0, 110.0, (0.12, -0.08, 0.15))
 LIDAR = SpinningLidar(channels=12, azimuth_steps=150)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.manifolds import so3
-from boxplus.simulation import ImuModel, Simulation, trajectories
+from boxplus.simulation import ImuModel, Simulation
 from boxplus.simulation.imu import GRAVITY, BiasWalk
+from boxplus.simulation.motions import trajectories
 from boxplus.simulation.scenarios import Scenario
-from boxplus.simulation.worlds import room
+from boxplus.simulation.worlds.worlds import room
 
 
 def imu_only(trajectory: trajectories.SplineTrajectory, imu: ImuModel, seed: int = 0) -> Simulation:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from boxplus.errors import InputError
-from boxplus.formats.g2o import read_g2o
+from boxplus.formats.graphs.g2o import read_g2o
 from boxplus.sparse import numeric_factor, subtrees
 from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky

@@ -20,12 +20,12 @@ from boxplus.recordings.cameras.calibration import inverse
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation import faults as imu_faults
-from boxplus.simulation import manoeuvres
 from boxplus.simulation.cameras.scenarios import ROOM_HIGH, ROOM_LOW, CameraScenario
 from boxplus.simulation.cameras.sensor import CameraRig
-from boxplus.simulation.spline import SplineTrajectory
-from boxplus.simulation.trajectories import START_NS, control_times, fade_in, from_angles
-from boxplus.simulation.world import Solid, World, box
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions.spline import SplineTrajectory
+from boxplus.simulation.motions.trajectories import START_NS, control_times, fade_in, from_angles
+from boxplus.simulation.worlds.world import Solid, World, box
 
 Event = CameraImage | ImuSamples
 Events = Callable[[Iterable[Event]], Iterator[Event]]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.simulation.cameras.textures import Pictures, read_filtered, read_round
-from boxplus.simulation.raycast import BOX, SPHERE, hit_distance
+from boxplus.simulation.worlds.raycast import BOX, SPHERE, hit_distance
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.uint32]

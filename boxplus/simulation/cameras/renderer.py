@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter
 from boxplus.simulation.cameras.raster import NOTHING, SURFACE_WIDTH, TILE, cast_pixels, list_solids, shade_pixels
 from boxplus.simulation.cameras.sensor import CameraSensor
 from boxplus.simulation.cameras.textures import KINDS, OFFSETS, SIDE, texture_pyramids
-from boxplus.simulation.raycast import REFLECTIVITY
-from boxplus.simulation.world import Solid, World
+from boxplus.simulation.worlds.raycast import REFLECTIVITY
+from boxplus.simulation.worlds.world import Solid, World
 
 Floats = NDArray[np.float64]
 

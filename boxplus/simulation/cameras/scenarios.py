@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
-from boxplus.simulation import manoeuvres, scenarios, sites, worlds
+from boxplus.simulation import scenarios
 from boxplus.simulation.cameras.sensor import CameraRig, make_rig
 from boxplus.simulation.imu import ImuModel
-from boxplus.simulation.spline import Trajectory
-from boxplus.simulation.world import Solid, World
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.worlds import sites, worlds
+from boxplus.simulation.worlds.world import Solid, World
 
 Movers = Callable[[float, NDArray[np.float64], NDArray[np.float64]], Sequence[Solid]]
 """From the time since the start [s] and the IMU's pose R_world_imu (3, 3), p_world_imu (3,) to what else is in the world then."""

@@ -17,8 +17,8 @@ from boxplus.simulation.cameras.renderer import Renderer, Surfaces
 from boxplus.simulation.cameras.scenarios import CameraScenario, Light, make_camera_scenario
 from boxplus.simulation.cameras.sensor import ELECTRONS_PER_GREY, GREY_PER_LIGHT_SECOND, CameraRig
 from boxplus.simulation.imu import ImuModel, SimulatedImu
-from boxplus.simulation.spline import Motion, span_of
-from boxplus.simulation.world import Solid
+from boxplus.simulation.motions.spline import Motion, span_of
+from boxplus.simulation.worlds.world import Solid
 
 Floats = NDArray[np.float64]
 CameraEvent = CameraImage | ImuSamples

@@ -12,7 +12,7 @@ from boxplus.cameras.model import CameraModel
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.imu import ImuModel, SimulatedImu
-from boxplus.simulation.spline import SplineTrajectory
+from boxplus.simulation.motions.spline import SplineTrajectory
 from boxplus.systems.camera_calibration.corners import TargetCorners
 from boxplus.systems.camera_calibration.target import AprilGrid
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.convex_start import solve_from_convex
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text
 from boxplus.systems.bundle_adjustment.triangulation import intersect_rays, pose_from_points

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution

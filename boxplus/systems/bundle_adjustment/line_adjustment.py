@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.formats.vgg_lines import VggLines
+from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import lines as line_manifold
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.euclidean import Euclidean

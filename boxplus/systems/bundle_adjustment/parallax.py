@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.residuals.prior import Prior

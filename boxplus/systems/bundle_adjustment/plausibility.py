@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.gbp import GbpProblem
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3Left

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from boxplus.cameras.distortion import Radial, RadialTangential
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.gbp import GbpProblem
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 
 # Which of COLMAP's parameters stands where in `Pinhole.parameters`; −1: a coefficient that is zero.

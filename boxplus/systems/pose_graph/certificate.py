@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 from boxplus.residuals.chordal_pose import chordal_weights
 from boxplus.sparse.block_matrix import BlockPattern

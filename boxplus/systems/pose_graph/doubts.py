@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.solution import Solution
 from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start

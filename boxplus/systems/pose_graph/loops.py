@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import SingularProblemError
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.graduated import graduate
 from boxplus.optimization.group import Group
 from boxplus.optimization.inlier_report import InlierReport, inlier_report

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.convex_start import convex_cost
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback

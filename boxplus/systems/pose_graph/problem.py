@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss

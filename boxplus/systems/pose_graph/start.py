@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import compose_into, inverse_into
 from boxplus.sparse.block_matrix import BlockPattern

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.pose_graph import PoseGraph
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimize import Callback
 from boxplus.optimization.problem import Problem

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.formats.vgg_lines import VggLines, read_vgg_lines
+from boxplus.formats.reconstructions.vgg_lines import VggLines, read_vgg_lines
 from boxplus.manifolds import lines
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.se3 import SE3Left

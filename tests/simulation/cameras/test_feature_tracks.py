@@ -7,8 +7,8 @@ import pytest
 
 from boxplus import InputError
 from boxplus.simulation.cameras.feature_tracks import TrackModel, track_points
-from boxplus.simulation.manoeuvres import handheld
-from boxplus.simulation.spline import Trajectory
+from boxplus.simulation.motions.manoeuvres import handheld
+from boxplus.simulation.motions.spline import Trajectory
 
 ROOM = np.array([[-4.0, -4.0, -3.0], [4.0, 4.0, 3.0]])
 T_IMU_CAMERA = np.array([[0.5, -0.5, 0.5, -0.5, 0.05, 0.0, 0.02], [0.5, -0.5, 0.5, -0.5, 0.05, -0.11, 0.02]])

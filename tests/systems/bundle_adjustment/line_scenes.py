@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from boxplus.formats.vgg_lines import VggLines
+from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import SE3Left
 

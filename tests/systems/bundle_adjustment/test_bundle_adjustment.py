@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import read_bal
-from boxplus.formats.gbp import read_gbp
+from boxplus.formats.reconstructions.bal import read_bal
+from boxplus.formats.reconstructions.gbp import read_gbp
 from boxplus.manifolds import quaternion, so3
 from boxplus.optimization import losses
 from boxplus.optimization.solver_options import SolverOptions

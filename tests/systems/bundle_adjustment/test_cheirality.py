@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem, write_bal
+from boxplus.formats.reconstructions.bal import BalProblem, write_bal
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.cheirality import make_sound
 from boxplus.systems.bundle_adjustment.sightings import Sightings

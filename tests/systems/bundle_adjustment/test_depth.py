@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import boxplus as bp
 from boxplus.cli import app
-from boxplus.formats.gbp import write_gbp
+from boxplus.formats.reconstructions.gbp import write_gbp
 from boxplus.manifolds import quaternion
 from boxplus.optimization.losses import Huber
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle

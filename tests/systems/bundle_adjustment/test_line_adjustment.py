@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.formats.vgg_lines import read_vgg_lines
+from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
 from boxplus.optimization.losses import Huber
 from boxplus.systems.bundle_adjustment import LineAdjustmentConfig, adjust_lines
 from tests.systems.bundle_adjustment.line_scenes import house, looking, perturbed, seen

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError
-from boxplus.formats.vgg_lines import VggLines
+from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, triangulate_lines
 from tests.systems.bundle_adjustment.line_scenes import house, looking, seen
 

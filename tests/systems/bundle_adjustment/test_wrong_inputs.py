@@ -9,7 +9,7 @@ import pytest
 
 import boxplus as bp
 from boxplus.errors import BoxplusError, InputError, NotFiniteError
-from boxplus.formats.reconstruction import Reconstruction
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from tests.small_problems import scene

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, manoeuvres, worlds
+from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]

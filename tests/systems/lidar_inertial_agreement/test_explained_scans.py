@@ -9,7 +9,9 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, manoeuvres, worlds
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.backwards import lidar_path_backwards, surer_path
 from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.simulation import Scenario, Simulation, SpinningLidar, manoeuvres, sites, worlds
-from boxplus.simulation.world import World
+from boxplus.simulation import Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import sites, worlds
+from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed

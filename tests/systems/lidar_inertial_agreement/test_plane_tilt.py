@@ -9,8 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, manoeuvres, mounting, sites, worlds
-from boxplus.simulation.world import World
+from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, mounting
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import sites, worlds
+from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.simulation import ImuModel, Scenario, Simulation, manoeuvres, trajectories, worlds
-from boxplus.simulation.spline import Trajectory
+from boxplus.simulation import ImuModel, Scenario, Simulation
+from boxplus.simulation.motions import manoeuvres, trajectories
+from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, LIDAR, data

@@ -9,7 +9,9 @@ import numpy as np
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
-from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate, trajectories, worlds
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

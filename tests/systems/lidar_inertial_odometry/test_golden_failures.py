@@ -14,8 +14,10 @@ from boxplus.recordings.open import open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, trajectories, worlds, write_recording
+from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, write_recording
 from boxplus.simulation.faults import Event
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

@@ -11,7 +11,9 @@ from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.simulation import Scenario, SpinningLidar, simulate, sites, trajectories
+from boxplus.simulation import Scenario, SpinningLidar, simulate
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.worlds import sites
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
 from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, frames, room_walk

@@ -9,7 +9,9 @@ import numpy as np
 from boxplus.filtering.degeneracy import pose_directions
 from boxplus.filtering.iterated_update import Information, Posterior
 from boxplus.filtering.nav_state import T_P, T_V, TANGENT
-from boxplus.simulation import Scenario, Simulation, manoeuvres, worlds
+from boxplus.simulation import Scenario, Simulation
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion

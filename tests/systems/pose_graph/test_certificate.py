@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus import SE2, SE3, InputError, PoseGraph, PoseGraphConfig, optimize_pose_graph
-from boxplus.formats.g2o import read_g2o
+from boxplus.formats.graphs.g2o import read_g2o
 from boxplus.residuals.chordal_pose import chordal_weights
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph.certificate import _matrices, certify

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import special_ortho_group
 
 from boxplus import SE2, SE3, InputError, PoseGraph, PoseGraphConfig, losses, optimize_pose_graph
-from boxplus.formats.g2o import read_g2o
+from boxplus.formats.graphs.g2o import read_g2o
 from boxplus.manifolds import se2, se3
 from boxplus.systems.pose_graph.problem import chi2
 from boxplus.systems.pose_graph.start import _nearest_rotations, chordal_start, held_poses, spanning_tree_start

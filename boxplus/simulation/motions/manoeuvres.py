@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.simulation.sites import STOREY_M
-from boxplus.simulation.spline import SplineTrajectory
-from boxplus.simulation.thrust import ThrustTrajectory
-from boxplus.simulation.trajectories import START_NS, along_route, control_times, fade_in, from_angles
+from boxplus.simulation.motions.spline import SplineTrajectory
+from boxplus.simulation.motions.thrust import ThrustTrajectory
+from boxplus.simulation.motions.trajectories import START_NS, along_route, control_times, fade_in, from_angles
+from boxplus.simulation.worlds.sites import STOREY_M
 
 Floats = NDArray[np.float64]
 

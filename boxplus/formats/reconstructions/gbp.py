@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.bal import check_indices
-from boxplus.formats.bal_text import read_bal_text
 from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
+from boxplus.formats.reconstructions.bal import check_indices
+from boxplus.formats.reconstructions.bal_text import read_bal_text
 from boxplus.manifolds import quaternion, so3
 
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from boxplus.simulation.world import Solid, World, box, cylinder, rectangle, sphere
-from boxplus.simulation.worlds import house, pavements
+from boxplus.simulation.worlds.world import Solid, World, box, cylinder, rectangle, sphere
+from boxplus.simulation.worlds.worlds import house, pavements
 
 STOREY_M = 3.2
 """Height of a storey of the stairwell [m]."""

@@ -9,12 +9,12 @@ from typing import BinaryIO
 import numpy as np
 
 from boxplus.errors import InputError
-from boxplus.formats.colmap_model import CAMERA_MODELS, ColmapModel
-from boxplus.formats.colmap_parts import ColmapParts
 from boxplus.formats.numbers.lines import NumberLines, read_number_lines, rest_of_line
 from boxplus.formats.numbers.parser import INTEGER, OTHER
 from boxplus.formats.numbers.writer import rows_to_text
 from boxplus.formats.output import atomic_file
+from boxplus.formats.reconstructions.colmap_model import CAMERA_MODELS, ColmapModel
+from boxplus.formats.reconstructions.colmap_parts import ColmapParts
 
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
 _CAMERA = "a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
-from boxplus.formats.colmap_model import CAMERA_MODELS, ColmapModel
-from boxplus.formats.colmap_parts import ColmapParts
 from boxplus.formats.output import atomic_file
+from boxplus.formats.reconstructions.colmap_model import CAMERA_MODELS, ColmapModel
+from boxplus.formats.reconstructions.colmap_parts import ColmapParts
 
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.formats.graph_builder import GraphBuilder
-from boxplus.formats.information_matrix import triangle_index
+from boxplus.formats.graphs.graph_builder import GraphBuilder
+from boxplus.formats.graphs.information_matrix import triangle_index
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.formats.numbers.lines import NumberLines, read_number_lines
 from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
-from boxplus.formats.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 
 _TAGS = ("VERTEX2", "EDGE2", "VERTEX3", "EDGE3")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.simulation.spline import SplineTrajectory
+from boxplus.simulation.motions.spline import SplineTrajectory
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from boxplus.simulation.world import Solid, World, box, cylinder, rectangle, sphere
+from boxplus.simulation.worlds.world import Solid, World, box, cylinder, rectangle, sphere
 
 
 def _random(seed: int, stream: int) -> np.random.Generator:

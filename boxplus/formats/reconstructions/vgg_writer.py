@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.output import atomic_file, make_folder
-from boxplus.formats.vgg_lines import VggLines
+from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import quaternion
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.information_matrix import ASYMMETRIC, INDEFINITE, NOT_FINITE, examine, smallest_eigenvalue
+from boxplus.formats.graphs.information_matrix import ASYMMETRIC, INDEFINITE, NOT_FINITE, examine, smallest_eigenvalue
 
 QUATERNION_TOLERANCE = 1e-2
 """Largest |‖q‖ − 1| that is taken for rounding and normalised away."""

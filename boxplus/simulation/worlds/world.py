@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.simulation import raycast
+from boxplus.simulation.worlds import raycast
 
 Solid = NDArray[np.float64]
 """One row of numbers, made by `box`, `rectangle`, `cylinder` or `sphere`; its layout is described in raycast.py."""

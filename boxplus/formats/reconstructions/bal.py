@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.bal_text import read_bal_text
 from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
+from boxplus.formats.reconstructions.bal_text import read_bal_text
 
 CAMERA_SIZE = 9
 

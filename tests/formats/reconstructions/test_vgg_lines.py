@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.formats.vgg_lines import read_vgg_lines
-from boxplus.formats.vgg_writer import write_vgg_lines
+from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
+from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
 from boxplus.manifolds import lines, quaternion
 from boxplus.residuals.camera.line_reprojection import LineReprojection
 

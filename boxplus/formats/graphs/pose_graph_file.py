@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from boxplus.errors import InputError
-from boxplus.formats.g2o import CrossBlock, RotationError, read_g2o, write_g2o
-from boxplus.formats.pose_graph import PoseGraph
-from boxplus.formats.toro import read_toro, write_toro
+from boxplus.formats.graphs.g2o import CrossBlock, RotationError, read_g2o, write_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.graphs.toro import read_toro, write_toro
 
 GraphFormat = Literal["g2o", "toro"]
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem, read_bal, write_bal
-from boxplus.formats.gbp import read_gbp
 from boxplus.formats.numbers import lines as number_lines
-from boxplus.formats.reconstruction import read_reconstruction
+from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
+from boxplus.formats.reconstructions.gbp import read_gbp
+from boxplus.formats.reconstructions.reconstruction import read_reconstruction
 
 NAMES = ("cameras", "points", "camera_of", "point_of", "pixels")
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 from boxplus.errors import InputError
-from boxplus.formats.bal import BalProblem, read_bal, write_bal
-from boxplus.formats.colmap import read_colmap, write_colmap
-from boxplus.formats.colmap_model import ColmapModel
-from boxplus.formats.gbp import GbpProblem, read_gbp, write_gbp
 from boxplus.formats.numbers.lines import first_text
+from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
+from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem, read_gbp, write_gbp
 
 Reconstruction = BalProblem | GbpProblem | ColmapModel
 ReconstructionFormat = Literal["auto", "bal", "gbp", "colmap"]

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
-from boxplus.formats.g2o import read_g2o, write_g2o
-from boxplus.formats.pose_graph import PoseGraph
-from boxplus.formats.toro import read_toro, write_toro
+from boxplus.formats.graphs.g2o import read_g2o, write_g2o
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.formats.graphs.toro import read_toro, write_toro
 
 ROW = "0 0 0 0 0 0 1"
 UNIT = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.graph_builder import GraphBuilder
-from boxplus.formats.information_matrix import INDEFINITE, examine, triangle_index
+from boxplus.formats.graphs.graph_builder import GraphBuilder
+from boxplus.formats.graphs.information_matrix import INDEFINITE, examine, triangle_index
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.formats.numbers.lines import NumberLines, read_number_lines
 from boxplus.formats.numbers.writer import write_rows
 from boxplus.formats.output import atomic_file
-from boxplus.formats.pose_graph import PoseGraph
 
 RotationError = Literal["rotation_vector", "quaternion"]
 CrossBlock = Literal["auto", "upper", "transposed", "dropped"]

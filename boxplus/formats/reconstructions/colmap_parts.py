@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
 
 _TABLE_PER_ID = 16  # ids are looked up in a table where they are this dense, else by bisection
 _Scalar = TypeVar("_Scalar", np.int64, np.float64, np.uint8)

@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline
 
 from boxplus.errors import InputError
 from boxplus.simulation.imu import GRAVITY
-from boxplus.simulation.spline import Motion, checked_times
+from boxplus.simulation.motions.spline import Motion, checked_times
 
 _DEGREE = 5
 

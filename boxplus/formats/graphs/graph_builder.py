@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.formats.numbers.lines import NumberLines
 from boxplus.formats.numbers.parser import UNKNOWN_TAG
-from boxplus.formats.pose_graph import PoseGraph
 
 _Scalar = TypeVar("_Scalar", np.int64, np.float64)
 

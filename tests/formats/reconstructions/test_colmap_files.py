@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
-from boxplus.formats import colmap_binary
-from boxplus.formats.colmap import read_colmap, write_colmap
-from boxplus.formats.colmap_model import CAMERA_MODELS, ColmapModel
 from boxplus.formats.numbers import lines as number_lines
+from boxplus.formats.reconstructions import colmap_binary
+from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
+from boxplus.formats.reconstructions.colmap_model import CAMERA_MODELS, ColmapModel
 
 
 def random_model(seed: int, images: int = 4, points: int = 6, observations: int = 20) -> ColmapModel:

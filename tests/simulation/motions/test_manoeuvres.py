@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.simulation import Motion, manoeuvres, sites
+from boxplus.simulation import Motion
 from boxplus.simulation.imu import GRAVITY
-from boxplus.simulation.spline import Trajectory
-from boxplus.simulation.world import World
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.worlds import sites
+from boxplus.simulation.worlds.world import World
 
 LOW, HIGH = np.array([-3.0, -1.0, 1.0]), np.array([2.0, 1.5, 2.0])
 

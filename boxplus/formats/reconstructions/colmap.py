@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from boxplus.errors import InputError
-from boxplus.formats import colmap_binary, colmap_text
-from boxplus.formats.colmap_model import ColmapModel
 from boxplus.formats.output import make_folder
+from boxplus.formats.reconstructions import colmap_binary, colmap_text
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
 
 
 def read_colmap(path: str | Path) -> ColmapModel:

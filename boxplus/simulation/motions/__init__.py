@@ -1,0 +1,1 @@
+"""How a simulated body moves: splines with exact derivatives, and the motions made of them."""

@@ -1,0 +1,1 @@
+"""What simulated sensors see: solids, the worlds made of them, and rays that meet them."""
