@@ -93,6 +93,7 @@ BENCHMARKS = {
     "residuals": Benchmark(("--edges", "1000", "--rounds", "1")),
     "direct": Benchmark(("--rounds", "1")),
     "direct_runs": Benchmark(()),
+    "vio": Benchmark(("--only", "mh01")),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
 

@@ -88,6 +88,9 @@ def run_chunks(work: Callable[[int, int, int], None], items: int, chunk: int, th
     partial result and adds the partial results in chunk order gets the same bits for any number of threads. Returns the
     number of chunks. `work` should spend its time in kernels, which release the GIL.
     """
+    if 0 < items <= chunk:
+        work(0, 0, items)
+        return 1
     bounds = [(index, begin, min(begin + chunk, items)) for index, begin in enumerate(range(0, items, chunk))]
     if threads <= 1 or len(bounds) <= 1:
         for bound in bounds:

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 
+_FLOATS = np.dtype(np.float64)
+
 
 def as_batch(name: str, values: ArrayLike, tail: tuple[int, ...]) -> tuple[NDArray[np.float64], tuple[int, ...]]:
     """View `values` as (N, *tail) float64; return it with the leading shape to restore.
@@ -17,7 +19,7 @@ def as_batch(name: str, values: ArrayLike, tail: tuple[int, ...]) -> tuple[NDArr
     Raises:
         InputError: the trailing axes are not `tail`.
     """
-    array = as_floats(values, name)
+    array = values if type(values) is np.ndarray and values.dtype is _FLOATS else as_floats(values, name)
     if array.shape[array.ndim - len(tail) :] != tail or array.ndim < len(tail):
         shape = ", ".join(["...", *map(str, tail)])
         raise InputError(f"{name} of shape ({shape})", f"shape {array.shape}", f"put the {'×'.join(map(str, tail))} values last")

@@ -70,19 +70,21 @@ def check_connections(residual: Residual, rows: Sequence[VariableRows], groups: 
         raise InputError(
             f"{role} of {type(residual).__name__} on {native.name}", f"{connection.block.name!r} on {actual.name}", advice
         )
-    # Variables may be shared between groups and within one.
+    # Variables may be shared between groups and within one; only roles that mean something can contradict another.
+    telling = [
+        (role, meaning, c) for role, c in zip(residual.roles, rows, strict=True) if (meaning := _meaning(role)) is not None
+    ]
+    if not telling:
+        return
     used = [
-        (group.name, role, connection)
+        (group.name, role, meaning, connection)
         for group in groups
         for role, connection in zip(group.residual.roles, group.connections, strict=True)
+        if (meaning := _meaning(role)) is not None
     ]
-    for role, connection in zip(residual.roles, rows, strict=True):
-        meaning = _meaning(role)
-        for name, other_role, other in used:
-            if meaning is None or other.block is not connection.block:
-                continue
-            other_meaning = _meaning(other_role)
-            if other_meaning is None or meaning == other_meaning:
+    for role, meaning, connection in telling:
+        for name, other_role, other_meaning, other in used:
+            if other.block is not connection.block or meaning == other_meaning:
                 continue
             if len(np.intersect1d(other.rows, connection.rows)):
                 raise InputError(
@@ -90,7 +92,7 @@ def check_connections(residual: Residual, rows: Sequence[VariableRows], groups: 
                     f"{connection.block.name!r}, which {name!r} takes for {other_role}, {other_meaning}",
                     "add variables for each meaning, or take residuals that agree",
                 )
-        used.append((type(residual).__name__, role, connection))
+        used.append((type(residual).__name__, role, meaning, connection))
 
 
 @lru_cache(maxsize=1024)

@@ -105,7 +105,7 @@ class Covariances:
         problem = self._problem
         if is_determined and not self._is_factorized and self._is_where_it_was_solved():
             try:
-                problem.solve(None)
+                problem.factorize(None)
                 return
             except NotPositiveDefinite:  # it is not: see why
                 pass

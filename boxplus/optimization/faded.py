@@ -15,8 +15,12 @@ FADED = 0.1
 _LARGE = 0.05  # share of a group that makes a sentence
 
 
-def faded_shares(groups: Sequence[Group], values: Sequence[NDArray[np.float64]]) -> dict[str, float]:
-    """For every group with a robust loss, by name, the share of its valid residuals whose weight is below `FADED`."""
+def faded_shares(groups: Sequence[Group], values: Sequence[NDArray[np.float64]] | None) -> dict[str, float]:
+    """For every group with a robust loss, by name, the share of its valid residuals whose weight is below `FADED`.
+
+    Args:
+        values: the point; None where the groups are linearised at it.
+    """
     shares = {}
     for group in groups:
         if group.loss.code == SQUARED:

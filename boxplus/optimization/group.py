@@ -72,7 +72,8 @@ class Group:
         left_out: (N,) residuals of weight zero that the structure of the problem leaves out; None for none.
         removed: (N,) residuals that are gone for good and count nothing; None for none.
         revision: grows when residuals are removed.
-        r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,).
+        r, jacobians, valid: whitened and weighted linearisation, (N, dim), (N, dim, dof) each, (N,); Jacobians for a block all of
+            which is fixed, which nobody reads, are as the residual gave them.
     """
 
     def __init__(
@@ -97,7 +98,8 @@ class Group:
         self.set_loss(loss)
         self.left_out: NDArray[np.bool_] | None = None
         self._root: NDArray[np.float64] | None = None
-        self._sums = np.zeros((-(-residual.count // _CHUNK), 4))
+        self._chunk = residual.count if residual.count <= 2 * _CHUNK else _CHUNK
+        self._sums = np.zeros((-(-residual.count // self._chunk) if residual.count else 0, 4))
 
     def __getitem__(self, rows: ArrayLike | slice) -> ResidualRows:
         """Residuals by their rows, or by a mask (N,).
@@ -120,6 +122,16 @@ class Group:
         if self.removed is None or self.left_out is None:
             return self.removed if self.left_out is None else self.left_out
         return self.removed | self.left_out
+
+    @property
+    def tangents(self) -> int:
+        """Columns of all Jacobians together."""
+        return sum(J.shape[2] for J in self.jacobians)
+
+    @property
+    def remaining(self) -> int:
+        """How many residuals were not removed."""
+        return self.residual.count if self.removed is None else int((~self.removed).sum())
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Let residuals (N,) count nothing from now on, for `Problem.remove`; one at least is left."""
@@ -152,12 +164,13 @@ class Group:
         """Count ‖W r‖² (N,) times from the next linearisation on, whatever the loss; None for once. See `Problem.set_weights`."""
         self._root = None if weights is None else np.sqrt(weights)
 
-    def loss_weights(self, values: Sequence[NDArray[np.float64]], threads: int = 1) -> NDArray[np.float64]:
+    def loss_weights(self, values: Sequence[NDArray[np.float64]] | None, threads: int = 1) -> NDArray[np.float64]:
         """(N,) weights ρ′ of the loss at the point `values`, 1 for least squares; 0 where a residual cannot be evaluated.
 
-        Overwrites `r` and `valid`, as `evaluate` does.
+        Overwrites `r` and `valid`, as `evaluate` does. Without `values` at the point that was linearised or evaluated last.
         """
-        self.evaluate(values, threads)
+        if values is not None:
+            self.evaluate(values, threads)
         return self._factor**2 if self.loss.code != SQUARED else self.valid.astype(np.float64)
 
     def squares(self, values: Sequence[NDArray[np.float64]], threads: int = 1) -> NDArray[np.float64]:
@@ -203,7 +216,11 @@ class Group:
         """Residuals, and unless `changes` is None Jacobians with the change of tangent of every connected variable."""
         x = tuple(values[c.block.number] for c in self.connections)
         # Jacobians where the variables were first known, residuals where they are.
-        x0 = tuple(c.block.linearized_at(values[c.block.number]) for c in self.connections) if self._at_first else x
+        x0 = x
+        if self._at_first:
+            at = {c.block.number: c.block for c in self.connections}
+            points = {number: block.linearized_at(values[number]) for number, block in at.items()}
+            x0 = tuple(points[c.block.number] for c in self.connections)
         residual, factors, diagonal = self.residual, self.residual.whitening.factors, self.residual.whitening.is_diagonal
 
         def work(chunk: int, begin: int, end: int) -> None:
@@ -226,6 +243,8 @@ class Group:
             if changes is None:
                 return
             for slot, J in enumerate(self.jacobians):
+                if self.connections[slot].block.is_all_fixed:
+                    continue
                 change = changes[slot]
                 if change is not None:
                     change(begin, end, x0[slot], self._index[slot], J)
@@ -239,7 +258,7 @@ class Group:
                 if self.loss.code != SQUARED:
                     weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
 
-        run_chunks(work, residual.count, _CHUNK, threads)
+        run_chunks(work, residual.count, self._chunk, threads)
         cost, common, lost, valid = self._sums.sum(axis=0) if len(self._sums) else (0.0, 0.0, 0, 0)
         return GroupCost(float(cost), float(common), int(lost), int(valid))
 
@@ -252,6 +271,8 @@ class Group:
 
     def _leave_out(self, begin: int, end: int, rows: NDArray[np.bool_], with_jacobians: bool) -> None:
         """Let the marked ones of the residuals [begin, end) be invalid."""
+        if not rows.any():
+            return
         self.valid[begin:end][rows] = False
         self.r[begin:end][rows] = 0.0
         if with_jacobians:

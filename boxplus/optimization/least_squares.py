@@ -76,6 +76,11 @@ class LeastSquares:
                 cost = self.linearize(values)
         self.accept(values, cost)
 
+    @property
+    def is_linearized(self) -> bool:
+        """Whether the groups are linearised at the accepted point; not so after a rejected step."""
+        return self._linearized is self.values
+
     def require_current(self) -> None:
         """Raises InputError where variables or residuals were removed since the problem was analysed."""
         revisions = tuple(group.revision for group in self.groups)
@@ -111,17 +116,25 @@ class LeastSquares:
             self._explain_not_finite(values)
         self.timing_s["normal equations"] += time.perf_counter() - begin
 
+    def factorize(self, damping: NDArray[np.float64] | None) -> None:
+        """Factorise H + diag(damping) at the accepted point.
+
+        Raises:
+            NotPositiveDefinite: see `LinearSystem.factorize`.
+        """
+        if self.system.reads_jacobians and not self.is_linearized:
+            self.linearize(self.values)  # after a rejected step
+        self.system.factorize(damping)
+
     def solve(self, damping: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """δ (dof,) with (H + diag(damping)) δ = −g.
 
         Raises:
             NotPositiveDefinite: see `LinearSystem.factorize`.
         """
-        if self.system.reads_jacobians and self._linearized is not self.values:
-            self.linearize(self.values)  # after a rejected step
         begin = time.perf_counter()
         try:
-            self.system.factorize(damping)
+            self.factorize(damping)
             return self.system.solve(-self.system.gradient)
         finally:
             self.timing_s["linear solve"] += time.perf_counter() - begin

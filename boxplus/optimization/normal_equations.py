@@ -17,12 +17,12 @@ from boxplus._jit import kernel, run_chunks
 from boxplus.optimization.group import Group
 from boxplus.optimization.layout import Layout, connected_numbers
 from boxplus.sparse.block_matrix import BlockPattern
-from boxplus.sparse.counting_sort import order_by
+from boxplus.sparse.counting_sort import gather_by
 from boxplus.sparse.product_tiles import add_sums, tile_of
 
 # Pieces for every thread, so that one with more work does not hold up the others; more cost more calls than they even out.
 _PIECES = 4
-_FEW = 4  # variables of a residual whose products are worth a call each
+_MANY, _AT_ONCE = 4, 256  # variables of a residual, and of all of a group, whose products are not worth a call each
 
 
 def piece(items: int, threads: int) -> int:
@@ -53,9 +53,8 @@ class Gather:
         cls, group: Group, a: int, b: int, item: NDArray[np.int64], place: NDArray[np.int64], residual: NDArray[np.intp]
     ) -> Gather:
         """From the item that each of the residuals adds to, and the place of every item."""
-        order, begin = order_by(item, len(place))
-        touched = np.flatnonzero(np.diff(begin))
-        return cls(group, a, b, place[touched], np.append(begin[touched], len(item)), residual[order].astype(np.uint32))
+        touched, begin, ordered = gather_by(item, len(place), residual)
+        return cls(group, a, b, place[touched], begin, ordered)
 
 
 @kernel
@@ -82,13 +81,13 @@ def _accumulate_gradient(
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A group of a single residual of many variables, such as a marginal prior: all its products JₐᵀJ_b in one go.
+    """A group of few residuals of many variables, such as a marginal prior: all its products JₐᵀJ_b in one go.
 
     Attributes:
-        group: of one residual.
+        group: of N residuals.
         column: (slots + 1,) where the Jacobian of each variable begins among all columns.
-        start: (slots,) where each variable begins in the tangent vector; −1 where it is fixed.
-        place: (slots, slots) where the values of block (a, b) begin; −1 where it is not in the lower triangle, or fixed.
+        start: (N, slots) where each variable begins in the tangent vector; −1 where it is fixed.
+        place: (N, slots, slots) where the values of block (a, b) begin; −1 where it is not in the lower triangle, or fixed.
     """
 
     group: Group
@@ -98,8 +97,8 @@ class Joint:
 
     def add(self, values: NDArray[np.float64], gradient: NDArray[np.float64]) -> None:
         """Add JᵀJ and Jᵀr of the current linearisation."""
-        Jt = np.ascontiguousarray(np.concatenate([J[0] for J in self.group.jacobians], axis=1).T)
-        _add_joint(Jt, self.group.r[0], self.column, self.start, self.place, values, gradient)
+        Jt = np.ascontiguousarray(np.concatenate(self.group.jacobians, axis=2).transpose(0, 2, 1))
+        _add_joint(Jt, self.group.r, self.column, self.start, self.place, values, gradient)
 
 
 @kernel(fastmath=True)
@@ -112,26 +111,27 @@ def _add_joint(
     values: NDArray[np.float64],
     gradient: NDArray[np.float64],
 ) -> None:
-    depth = np.uint64(Jt.shape[1])
-    for a in range(len(start)):
-        if start[a] < 0:
-            continue
-        for i in range(column[a], column[a + 1]):
-            total = 0.0
-            for k in range(depth):
-                total += Jt[i, k] * r[k]
-            gradient[start[a] + i - column[a]] += total
-        for b in range(len(start)):
-            at = place[a, b]
-            if at < 0:
+    depth = np.uint64(Jt.shape[2])
+    for n in range(Jt.shape[0]):
+        for a in range(start.shape[1]):
+            if start[n, a] < 0:
                 continue
             for i in range(column[a], column[a + 1]):
-                for j in range(column[b], column[b + 1]):
-                    total = 0.0
-                    for k in range(depth):
-                        total += Jt[i, k] * Jt[j, k]
-                    values[at] += total
-                    at += 1
+                total = 0.0
+                for k in range(depth):
+                    total += Jt[n, i, k] * r[n, k]
+                gradient[start[n, a] + i - column[a]] += total
+            for b in range(start.shape[1]):
+                at = place[n, a, b]
+                if at < 0:
+                    continue
+                for i in range(column[a], column[a + 1]):
+                    for j in range(column[b], column[b + 1]):
+                        total = 0.0
+                        for k in range(depth):
+                            total += Jt[n, i, k] * Jt[n, j, k]
+                        values[at] += total
+                        at += 1
 
 
 def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> None:
@@ -168,32 +168,31 @@ class NormalEquations:
     def __init__(self, layout: Layout, groups: Sequence[Group]) -> None:
         rows: list[NDArray[np.int64]] = []
         columns: list[NDArray[np.int64]] = []
-        parts: list[tuple[Group, int, int, NDArray[np.intp]]] = []
+        parts: list[tuple[Group, int, int, NDArray[np.int64]]] = []
         self._gradients: list[Gather] = []
         joint: list[tuple[Group, NDArray[np.int64], NDArray[np.bool_]]] = []
         for group in groups:
             numbers = connected_numbers(layout, group)
-            if group.residual.count == 1 and len(numbers) > _FEW:
-                number = np.concatenate(numbers)
-                joint.append((group, number, (number[:, None] >= number) & (number >= 0)))
+            count = group.residual.count
+            if len(numbers) >= _MANY and (count == 1 or 0 < count * len(numbers) <= _AT_ONCE):
+                number = np.stack(numbers, axis=1)
+                joint.append((group, number, (number[:, :, None] >= number[:, None]) & (number[:, None] >= 0)))
                 continue
             moving = [(a, number) for a, number in enumerate(numbers) if (number >= 0).any()]
             for a, number_a in moving:
-                free = np.flatnonzero(number_a >= 0)
-                self._gradients.append(Gather.sorted_by(group, a, a, number_a[free], layout.start[:-1], free))
                 for b, number_b in moving:
-                    # The lower triangle; a residual connected to the same variable twice adds both its cross products.
-                    lower = (number_a > number_b) | (number_a == number_b)
-                    selected = np.flatnonzero((number_a >= 0) & (number_b >= 0) & lower)
+                    selected, row, column = _lower_pairs(number_a, number_b)
+                    if b == a:
+                        self._gradients.append(Gather.sorted_by(group, a, a, row, layout.start[:-1], selected))
                     if len(selected):
-                        rows.append(number_a[selected])
-                        columns.append(number_b[selected])
+                        rows.append(row)
+                        columns.append(column)
                         parts.append((group, a, b, selected))
         ends = np.cumsum([len(selected) for *_, selected in parts], dtype=np.int64)
         for _, number, lower in joint:
-            first, second = np.nonzero(lower)
-            rows.append(number[first])
-            columns.append(number[second])
+            residual, first, second = np.nonzero(lower)
+            rows.append(number[residual, first])
+            columns.append(number[residual, second])
         none = [np.zeros(0, dtype=np.int64)]
         self.pattern, pairs = BlockPattern.from_pairs(layout.sizes, np.concatenate(rows or none), np.concatenate(columns or none))
         self._joint = []
@@ -227,6 +226,24 @@ class NormalEquations:
     def diagonal(self) -> NDArray[np.float64]:
         """Diagonal of H (dof,)."""
         return self.values[self._diagonal]
+
+
+@kernel
+def _lower_pairs(
+    number_a: NDArray[np.int64], number_b: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Residuals whose pair of free variables lies in the lower triangle, and the two variables (−1 where fixed).
+
+    A residual connected to the same variable twice adds both its cross products.
+    """
+    n = len(number_a)
+    residual, row, column = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    count = 0
+    for k in range(n):
+        if number_b[k] >= 0 and number_a[k] >= number_b[k]:
+            residual[count], row[count], column[count] = k, number_a[k], number_b[k]
+            count += 1
+    return residual[:count], row[:count], column[:count]
 
 
 def _diagonal_places(pattern: BlockPattern) -> NDArray[np.int64]:

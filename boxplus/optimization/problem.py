@@ -28,7 +28,7 @@ from boxplus.optimization.solver_options import SolverOptions, options_from
 from boxplus.optimization.variables import VariableRows, Variables
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
-from boxplus.sparse.cholesky import NotPositiveDefinite
+from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite
 
 # Share of a group that may have lost its weight before the problem is analysed anew without it.
 _STALE = 0.05
@@ -48,6 +48,7 @@ class Problem:
         self.groups: list[Group] = []
         self._added = 0  # groups, ever: the number in a name is not given twice
         self._analysed: tuple[tuple[Any, ...], LeastSquares, tuple[str, ...]] | None = None
+        self._factor: Analysis | None = None  # of the last matrix, whose pattern often comes again
 
     @changes
     def add_variables(self, manifold: Manifold, values: ArrayLike, *, name: str | None = None) -> Variables:
@@ -141,13 +142,30 @@ class Problem:
         Example:
             `problem.remove(pixels[is_outlier], points[lost])`
         """
+        if all(isinstance(part, Group) for part in leaving):
+            return self._remove_groups(leaving)
         gone, chosen = self._selection(leaving)
         require_forgettable(self.groups, gone, chosen)
         for rows, touched in zip(chosen, touching(self.groups, gone), strict=True):
             rows |= touched
+        return self.take_out(gone, chosen)
+
+    @changes
+    def take_out(self, gone: Masks, chosen: Masks) -> dict[str, int]:
+        """`remove` for what `reach_of` has found: the variables, and the residuals, all that touch these among them."""
         self.groups, counts = take_out(self.blocks, self.groups, gone, chosen)
         self._analysed = None
         return counts
+
+    def _remove_groups(self, leaving: Sequence[Any]) -> dict[str, int]:
+        """`remove` for whole groups, which leave the variables and the other groups as they are."""
+        numbers = {self._number_of(group) for group in leaving}
+        whole = [group for number, group in enumerate(self.groups) if number in numbers]
+        self.groups = [group for number, group in enumerate(self.groups) if number not in numbers]
+        if any(isinstance(group.residual, MarginalPrior) for group in whole):
+            keep_first_estimates(self.blocks, self.groups)
+        self._analysed = None
+        return {group.name: group.remaining for group in whole if group.remaining}
 
     def reach_of(self, leaving: Sequence[VariableRows | Variables]) -> tuple[Masks, Masks]:
         """For every block which variables are selected, and for every group which residuals touch them.
@@ -313,7 +331,7 @@ class Problem:
             status, reason, history = minimize(model, strategy, options, callback, begin)
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(model, error)) from error
-        faded = faded_shares(self.groups, model.values)
+        faded = faded_shares(self.groups, None if model.is_linearized and callback is None else model.values)
         return Solution(
             status=status,
             reason=reason,
@@ -371,7 +389,8 @@ class Problem:
             if layout.dof == 0:
                 raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
             groups = [*self.groups, *held_groups(self.blocks)]
-            system = choose_system(layout, groups, options)
+            system = choose_system(layout, groups, options, self._factor)
+            self._factor = system.analysis
             model = LeastSquares(layout, groups, system, options.threads, keeps_tangents=not options.examine)
             self._analysed = (key, model, tuple(self.defects()) if options.examine else ())
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin

@@ -7,7 +7,6 @@ block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F �
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from boxplus.optimization.schur_kernels import (
 )
 from boxplus.optimization.schur_structure import Entries, Products, build_entries, build_products, eliminated_numbers
 from boxplus.optimization.variables import Variables
-from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite, SparseCholesky
 from boxplus.sparse.product_tiles import add_sums, tile_of
 
 
@@ -36,7 +35,9 @@ class SchurSystem(LinearSystem):
 
     reads_jacobians = True
 
-    def __init__(self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int) -> None:
+    def __init__(
+        self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int, analysis: Analysis | None = None
+    ) -> None:
         self._layout, self._threads = layout, threads
         self._rest = layout.without(eliminated)
         own = layout.number[eliminated.number]
@@ -52,7 +53,8 @@ class SchurSystem(LinearSystem):
         self._entries = build_entries(layout, self._rest, groups, eliminated, count)
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
         self._values = np.zeros(int(self._pattern.value_start[-1]))
-        self._cholesky = SparseCholesky(self._pattern, threads=threads)
+        self._cholesky = SparseCholesky(self._pattern, threads=threads, analysis=analysis)
+        self.analysis = self._cholesky.analysis
         self.gradient, self.diagonal = np.zeros(layout.dof), np.zeros(layout.dof)
         self.description = (
             f"Schur elimination of {count} {eliminated.name!r} ({e} degrees of freedom each, no residual connects two of them), "
@@ -114,10 +116,9 @@ class SchurSystem(LinearSystem):
 
     def _add_and_substitute(self, entries: Entries) -> None:
         """Z of entries to which several groups add."""
-        size = entries.Z.shape[1] * entries.Z.shape[2]
         entries.Z[:] = 0.0
         for gather in entries.gathers:
-            add_products(replace(gather, target=gather.target * size), entries.Z.reshape(-1), self._threads)
+            add_products(gather, entries.Z.reshape(-1), self._threads)
         self._run(len(entries.eliminated), substitute_entries, entries.eliminated, self._L, entries.Z)
 
     def _reduce(self) -> None:

@@ -29,7 +29,7 @@ class Entries:
         Z: (m, e, dof), Zᵀ = L⁻¹ Wᵀ.
         of_eliminated, order: (n_e + 1,), (m,): E variable p has the entries order[of_eliminated[p]:of_eliminated[p + 1]].
         start_of_entry: (m,) where the kept variable of each entry begins.
-        gathers: the residuals that add to W.
+        gathers: the residuals that add to W, by where the entry begins in Z.
     """
 
     dof: int
@@ -112,10 +112,10 @@ def _entries_of(
     variables, begin = np.unique(kept, return_index=True)
     order, of_eliminated = order_by(of, count)
     gathers = []
-    end = 0
+    place, end = np.arange(len(kept)) * (e * dof), 0
     for group, slot, other, selected, *_ in parts:
         end += len(selected)
-        gathers.append(Gather.sorted_by(group, slot, other, entry[end - len(selected) : end], np.arange(len(kept)), selected))
+        gathers.append(Gather.sorted_by(group, slot, other, entry[end - len(selected) : end], place, selected))
     return Entries(
         dof=dof,
         start=rest.start[variables],

@@ -26,6 +26,7 @@ class Variables:
         values: (n, size), where the next search starts; a solution has its own.
         is_fixed: (n,) bool, held where they start by the solver; set by `Problem.fix` and `free` only.
         is_held: (n, dof) bool, single components that are held; None for none. Set likewise.
+        is_all_fixed: whether all of them are.
         number: of the block in its problem.
         revision: grows when something happens that invalidates what was worked out about the block; not when it is extended.
     """
@@ -33,12 +34,11 @@ class Variables:
     def __init__(self, number: int, name: str, manifold: Manifold, values: NDArray[np.float64]) -> None:
         self.number, self.name, self.manifold, self.values = number, name, manifold, values
         self.ids = np.arange(len(values))
-        self.is_fixed = np.zeros(len(values), dtype=np.bool_)
-        self.is_fixed.flags.writeable = False
+        self.set_fixed(np.zeros(len(values), dtype=np.bool_))
         self.is_held: NDArray[np.bool_] | None = None
         self.revision = 0
         self.next_id = len(values)
-        self._is_first = np.zeros(len(values), dtype=np.bool_)
+        self._is_first, self._has_first = np.zeros(len(values), dtype=np.bool_), False
         self._first = values
 
     def __len__(self) -> int:
@@ -99,6 +99,7 @@ class Variables:
         """Take over (n,) which are fixed, for `Problem.fix` and `free`."""
         self.is_fixed = is_fixed
         self.is_fixed.flags.writeable = False
+        self.is_all_fixed = bool(is_fixed.all())
 
     def set_held(self, is_held: NDArray[np.bool_]) -> None:
         """Take over (n, dof) which components are held, for `Problem.fix` and `free`."""
@@ -114,12 +115,14 @@ class Variables:
         """Take Jacobians of the variables `known` (n,) at their points x0 (n, size) from now on, others where they are."""
         if not np.array_equal(known, self._is_first):
             self.revision += 1
-        self._is_first, self._first = known, x0
+        self._is_first, self._has_first, self._first = known, bool(known.any()), x0
 
     def linearized_at(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where Jacobians are taken when the block is at `values`: there, or at the first estimates."""
+        if not self._has_first:
+            return values
         known = self._is_first[: len(values)]  # a solution may be older than the last variables
-        return np.where(known[:, None], self._first[: len(values)], values) if known.any() else values
+        return np.where(known[:, None], self._first[: len(values)], values)
 
 
 class VariableRows:
@@ -136,6 +139,10 @@ class VariableRows:
         self.block = block
         if isinstance(selected, slice):
             selected = block.ids[selected]
+        elif isinstance(selected, (int, np.integer)) and 0 <= selected < block.next_id:
+            self.ids = np.array([selected], dtype=np.int64)
+            self._rows, self._revision = block.rows_of(self.ids), block.revision
+            return
         given = np.asarray(selected)
         if given.dtype == np.bool_ and given.shape == (len(block),):
             given = block.ids[given]
@@ -148,8 +155,8 @@ class VariableRows:
                 "select with integers",
             )
         given = np.atleast_1d(given)
-        outside = (given < 0) | (given >= block.next_id)
-        if outside.any():
+        if len(given) and (given.min() < 0 or given.max() >= block.next_id):
+            outside = (given < 0) | (given >= block.next_id)
             at = int(np.argmax(outside))
             raise InputError(
                 f"rows of {block.name!r} from 0 to {block.next_id - 1}",

@@ -37,6 +37,15 @@ def whiten_jacobian(begin: int, end: int, W: NDArray[np.float64], is_diagonal: b
     """J ← W J for the rows [begin, end); J is (N, d, k)."""
     dim, width = J.shape[1], J.shape[2]
     shared = W.shape[0] == 1
+    if shared and is_diagonal:
+        is_even = True
+        for i in range(1, dim):
+            is_even &= W[0, i, i] == W[0, 0, 0]
+        if is_even:  # one factor for all: a pass that vectorises
+            w00, flat = W[0, 0, 0], J.reshape(-1)
+            for k in range(np.uint64(begin * dim * width), np.uint64(end * dim * width)):
+                flat[k] *= w00
+            return
     product = np.empty((dim, width))
     for n in range(begin, end):
         w = W[0] if shared else W[n]
@@ -120,8 +129,16 @@ def weigh_jacobian(
 ) -> None:
     """J ← √ρ′ (I − α r rᵀ/‖r‖²) J for the rows [begin, end), with the weighed r of `weigh_residuals`."""
     dim, width = J.shape[1], J.shape[2]
+    each = np.uint64(dim * width)
+    flat = J.reshape(-1)
     for n in range(begin, end):
         root, share = factor[n], projection[n]
+        if share == 0.0:  # as for everything that the loss counts in full
+            if root != 1.0:
+                at = np.uint64(n) * each
+                for k in range(at, at + each):
+                    flat[k] *= root
+            continue
         for c in range(width):
             along = 0.0
             for i in range(dim):

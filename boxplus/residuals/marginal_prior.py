@@ -60,7 +60,7 @@ class MarginalPrior(Residual):
             raise InputError("finite J and r0", "NaN or infinity", "marginalise where all residuals can be evaluated")
         self.keeps_first_estimates = keeps_first_estimates
         ends = np.cumsum([m.dof for m in manifolds])
-        self._columns = tuple(slice(int(end) - m.dof, int(end)) for end, m in zip(ends, manifolds, strict=True))
+        self._J = tuple(np.ascontiguousarray(self.J[:, end - m.dof : end]) for end, m in zip(ends, manifolds, strict=True))
         # Variables on one manifold are checked and compared with their points all at once.
         points: dict[int, Array] = {}
         self._alike = []
@@ -83,17 +83,30 @@ class MarginalPrior(Residual):
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         """See `Residual.linearize_into`."""
-        self.evaluate_into(begin, end, x, index, r, valid)
-        for k, (manifold, columns) in enumerate(zip(self.manifolds, self._columns, strict=True)):
-            at = x[k][index[k][begin:end]]
-            jacobians[k][begin:end] = self.J[:, columns]
-            if not (at == self.x0[k]).all():  # as it is where first estimates are kept
-                jacobians[k][begin:end] = self.J[:, columns] @ manifold.boxminus_jacobian(at, self.x0[k])
+        has_moved = False
+        for manifold, slots, x0, _ in self._alike:
+            at = _points(slots, x, index)
+            away = (at != x0).any(axis=1)
+            has_moved |= bool(away.any())
+            for n, k in enumerate(slots):
+                J = self._J[k]
+                jacobians[k][begin:end] = J @ manifold.boxminus_jacobian(at[n], x0[n]) if away[n] else J
+        if has_moved:
+            self.evaluate_into(begin, end, x, index, r, valid)
+        else:  # as where first estimates are kept
+            r[begin:end], valid[begin:end] = self.r0, True
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         """See `Residual.evaluate_into`."""
         moved = np.empty(self.J.shape[1])
         for manifold, slots, x0, columns in self._alike:
-            moved[columns] = manifold.boxminus(np.stack([x[k][index[k][0]] for k in slots]), x0).reshape(-1)
+            moved[columns] = manifold.boxminus(_points(slots, x, index), x0).reshape(-1)
         r[begin:end] = self.r0 + (self.J * moved).sum(axis=1)
         valid[begin:end] = True
+
+
+def _points(slots: list[int], x: Arrays, index: Rows) -> Array:
+    """(len(slots), size) of the variables in these slots."""
+    if all(x[k] is x[slots[0]] for k in slots):
+        return x[slots[0]][[int(index[k][0]) for k in slots]]
+    return np.stack([x[k][index[k][0]] for k in slots])

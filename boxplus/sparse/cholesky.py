@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,7 +12,7 @@ from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.inverse_blocks import SelectedInverse, locate_blocks
 from boxplus.sparse.numeric_factor import NumericFactor
 from boxplus.sparse.ordering import Method, order
-from boxplus.sparse.supernodes import lay_out
+from boxplus.sparse.supernodes import Fronts, lay_out
 from boxplus.sparse.triangular_solve import solve_many, solve_one
 
 SOLVED_VARIABLES = 8
@@ -37,6 +39,34 @@ class NotPositiveDefinite(BoxplusError, ArithmeticError):
         self.pivot = pivot
 
 
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """The symbolic part of a factorisation, which does not depend on the values.
+
+    Attributes:
+        pattern: of the matrix.
+        ordering: name of the method, None where the ordering was given.
+        threads: it was made for.
+        fronts: the result.
+    """
+
+    pattern: BlockPattern
+    ordering: Method | None
+    threads: int
+    fronts: Fronts
+
+    def holds_for(self, pattern: BlockPattern, ordering: Method | NDArray[np.int64], threads: int) -> bool:
+        """Whether an analysis of this pattern would give the same."""
+        own = self.pattern
+        return (
+            isinstance(ordering, str)
+            and (self.ordering, self.threads) == (ordering, threads)
+            and np.array_equal(own.sizes, pattern.sizes)
+            and np.array_equal(own.col_start, pattern.col_start)
+            and np.array_equal(own.row, pattern.row)
+        )
+
+
 class SparseCholesky:
     """L Lᵀ = P H Pᵀ for symmetric positive definite H with the given pattern.
 
@@ -47,24 +77,28 @@ class SparseCholesky:
         pattern: of H.
         ordering: name of the fill-reducing ordering, or (n,) integers: the variable at each position.
         threads: that factorise subtrees and large fronts side by side; too small a matrix is left to one.
+        analysis: of a matrix before, which is taken over where pattern, ordering and threads are the same.
 
     Raises:
         InputError: an ordering that is no permutation of the variables, or no thread.
     """
 
-    def __init__(self, pattern: BlockPattern, *, ordering: Method | NDArray[np.int64] = "auto", threads: int = 1) -> None:
+    def __init__(
+        self,
+        pattern: BlockPattern,
+        *,
+        ordering: Method | NDArray[np.int64] = "auto",
+        threads: int = 1,
+        analysis: Analysis | None = None,
+    ) -> None:
         if threads < 1:
             raise InputError("at least one thread", f"{threads}", "give the number of threads")
         self.pattern = pattern
-        if isinstance(ordering, str):
-            first = order(pattern.col_start, pattern.row, pattern.sizes, ordering).permutation
-        else:
-            first = np.asarray(ordering, np.int64)
-            if not np.array_equal(np.sort(first), np.arange(len(pattern.sizes))):
-                raise InputError(
-                    f"a permutation of 0 … {len(pattern.sizes) - 1}", f"{first}", "give every variable its place once"
-                )
-        self._fronts = fronts = lay_out(pattern, first, threads)
+        if analysis is None or not analysis.holds_for(pattern, ordering, threads):
+            method = ordering if isinstance(ordering, str) else None
+            analysis = Analysis(pattern, method, threads, _analysed(pattern, ordering, threads))
+        self.analysis = analysis
+        self._fronts = fronts = analysis.fronts
         size = int(pattern.start[-1])
         self._factor, self._diagonal = NumericFactor(fronts, threads), np.zeros(size)
         self._most_below = int(fronts.table["below"].max())
@@ -204,3 +238,13 @@ class SparseCholesky:
     def _require_factor(self) -> None:
         if not self._factorized:
             raise InputError("a factorised matrix", "none, or one that is not positive definite", "call factorize first")
+
+
+def _analysed(pattern: BlockPattern, ordering: Method | NDArray[np.int64], threads: int) -> Fronts:
+    """The fronts of a pattern in an ordering that is checked, or found by the method named."""
+    if isinstance(ordering, str):
+        return lay_out(pattern, order(pattern.col_start, pattern.row, pattern.sizes, ordering).permutation, threads)
+    first = np.asarray(ordering, np.int64)
+    if not np.array_equal(np.sort(first), np.arange(len(pattern.sizes))):
+        raise InputError(f"a permutation of 0 … {len(pattern.sizes) - 1}", f"{first}", "give every variable its place once")
+    return lay_out(pattern, first, threads)

@@ -205,3 +205,38 @@ def test_holding_every_translation_fixes_the_gauge_of_a_ring():
         problem.fix(ring.poses[0], components=[6])
     with pytest.raises(InputError, match="places in the tangent"):
         problem.fix(ring.poses[0], components=[0.5])
+
+
+def test_a_pattern_that_comes_again_is_not_analysed_again_and_the_bits_stay():
+    rng = np.random.default_rng(4)
+    truth = SE3.random(rng, 40)
+    i, j = np.array([(a, b) for a in range(40) for b in (a + 1, a + 3) if b < 40]).T
+    measured = [edges_between(rng, truth, i, j) for _ in range(2)]
+    solutions = []
+    problem = Problem()
+    poses = problem.add_variables(SE3, truth, name="poses")
+    problem.fix(poses[0])
+    for Z in measured:
+        group = problem.add_residuals(RelativePose(Z, sigma=NOISE), poses[i], poses[j])
+        analysis = problem._factor
+        solutions.append(problem.solve(linear_solver="sparse"))
+        problem.remove(group)
+    assert analysis is not None and problem._factor is analysis
+    fresh = Problem()
+    own = fresh.add_variables(SE3, truth, name="poses")
+    fresh.fix(own[0])
+    fresh.add_residuals(RelativePose(measured[1], sigma=NOISE), own[i], own[j])
+    assert np.array_equal(fresh.solve(linear_solver="sparse")[own], solutions[1][poses])
+
+
+def test_whole_groups_leave_without_the_others():
+    rng = np.random.default_rng(5)
+    truth = SE3.random(rng, 5)
+    problem = Problem()
+    poses = problem.add_variables(SE3, truth, name="poses")
+    kept = problem.add_residuals(Prior(SE3, truth, sigma=0.1), poses, name="kept")
+    gone = problem.add_residuals(Prior(SE3, truth, sigma=0.1), poses, name="gone")
+    assert problem.remove(gone) == {"gone": 5} and problem.groups == [kept]
+    with pytest.raises(InputError, match="a group of this problem"):
+        problem.remove(gone)
+    problem.solve()

@@ -8,10 +8,12 @@ import types
 from pathlib import Path
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 
-from boxplus import InputError
-from boxplus.report.live_view import LiveView
+from boxplus import InputError, VioConfig
+from boxplus.report.live_view import LiveCameraView, LiveView
+from tests.systems.visual_inertial_odometry.simulated_rays import PIXEL_SIGMA, Flight, rig, run
 
 _VIEWER = """
 import socket, sys
@@ -28,7 +30,8 @@ server.accept()
 @pytest.fixture
 def rerun(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     module = MagicMock(spec=types.ModuleType("rerun"))
-    for name in ("init", "connect_grpc", "log", "ViewCoordinates"):
+    shapes = ("Transform3D", "Quaternion", "Arrows3D", "LineStrips3D", "Points3D", "Scalars")
+    for name in ("init", "connect_grpc", "log", "set_time", "ViewCoordinates", *shapes):
         setattr(module, name, MagicMock())
     monkeypatch.setitem(sys.modules, "rerun", module)
     return module
@@ -64,3 +67,24 @@ def test_nothing_is_started_where_none_is_asked_for(rerun: MagicMock, monkeypatc
     monkeypatch.setattr(subprocess, "Popen", MagicMock(side_effect=AssertionError))
     LiveView("walk.bag", spawn=False)
     rerun.connect_grpc.assert_not_called()
+
+
+def test_frames_of_cameras_are_shown_with_pose_path_and_landmarks(rerun: MagicMock) -> None:
+    _, estimates = run(Flight(3, 2.5), rig(), VioConfig(pixel_sigma=PIXEL_SIGMA))
+    view = LiveCameraView("room", spawn=False)
+    logged = []
+    for estimate in estimates:
+        rerun.log.reset_mock()
+        view.show(estimate)
+        names = [call.args[0] for call in rerun.log.call_args_list]
+        if estimate.status == "starting":
+            assert not names  # there is no pose
+            continue
+        assert {"world/imu", "world/path", "world/landmarks", "tracked"} <= set(names)
+        assert any(name.startswith("world/map/") for name in names) == estimate.is_keyframe
+        logged.append(estimate)
+    assert len(logged) > 5
+    points, last = rerun.Points3D.call_args_list, logged[-1]
+    assert any(np.array_equal(call.args[0], last.landmarks) for call in points)
+    assert np.array_equal(rerun.LineStrips3D.call_args.args[0][0][-1], view._path[-1])
+    assert np.linalg.norm(view._path[-1] - last.T_world_imu[:3, 3]) <= 0.02

@@ -297,3 +297,20 @@ def test_agrees_with_superlu_on_pose_graphs(shared_data: Path, graph: str, threa
         unit = np.zeros((matrix.shape[0], dof))
         unit[dof * k : dof * (k + 1)] = np.eye(dof)
         np.testing.assert_allclose(block, oracle.solve(unit)[dof * k : dof * (k + 1)], rtol=1e-7, atol=1e-10)
+
+
+def test_an_analysis_is_taken_over_where_it_would_be_the_same() -> None:
+    pattern, values, dense = random_matrix(7, [3, 6, 2, 6, 6, 1], 9)
+    first = check(pattern, values, dense)
+    twin = BlockPattern(pattern.sizes.copy(), pattern.col_start.copy(), pattern.row.copy())
+    other_values, other_dense = positive_definite(twin, np.random.default_rng(8))
+    again = check(twin, other_values, other_dense, analysis=first.analysis)
+    assert again.analysis is first.analysis
+    first.factorize(values)  # the values of the two are apart
+    assert np.array_equal(again.solve(other_dense[0]), check(twin, other_values, other_dense).solve(other_dense[0]))
+    another, *rest = random_matrix(9, [3, 6, 2, 6, 6, 1], 4)
+    assert check(another, *rest, analysis=first.analysis).analysis is not first.analysis
+    assert SparseCholesky(pattern, threads=2, analysis=first.analysis).analysis is not first.analysis
+    order = np.arange(6)
+    given = check(pattern, values, dense, ordering=order[::-1].copy(), analysis=first.analysis)
+    assert given.analysis is not first.analysis

@@ -24,6 +24,8 @@ class GrowingVariables(Variables):
         numbers: (capacity,) number of each variable in the tree, −1 where it is fixed.
     """
 
+    is_all_fixed = False  # not worked out: it spares nothing here
+
     def __init__(self, number: int, name: str, manifold: Manifold) -> None:
         self.number, self.name, self.manifold = number, name, manifold
         self.points, self.estimates = np.zeros((0, manifold.size)), np.zeros((0, manifold.size))

@@ -95,7 +95,7 @@ def marginalize(
     if moved:
         r0 -= (J * np.concatenate([m.reshape(-1) for m in moved])).sum(axis=1)  # r₀ is that of x₀
     variables = tuple(block[block.ids[rows]] for block, rows in staying)
-    absorbed = problem.remove(*(g[rows] for g, rows in zip(problem.groups, touched, strict=True) if rows.any()), *chosen)
+    absorbed = problem.take_out(gone, touched)
     leak = None if gauge is None else leak_of(J, points, gauge, is_anchored=is_anchored)
     if not len(J):
         return Marginal(None, (), absorbed, leak)

@@ -139,18 +139,19 @@ def _reflection(B: NDArray[np.float64], c: np.uint64, rows: np.uint64, triangle:
 
 
 @kernel(fastmath=True)
-def merge_batch(B: NDArray[np.float64], start: int, used: int, triangle: NDArray[np.float64]) -> None:
+def merge_batch(B: NDArray[np.float64], start: int, stop: int, used: int, triangle: NDArray[np.float64]) -> None:
     """triangle ← R of [triangle; rows of B], two reflections at a time; B is used up and left at zero.
 
     Args:
-        B: (w + 1, BATCH), the last column the residuals; its columns before `start` are zero.
+        B: (w + 1, BATCH), the last column the residuals; its columns before `start` and from `stop` on are zero.
+        stop: columns of the triangle from here on are zero as well, but for the residuals.
         used: rows.
         triangle: (w, w + 1).
     """
     width, rows = np.uint64(triangle.shape[0]), np.uint64(used)
-    one = np.uint64(1)
+    one, last = np.uint64(1), np.uint64(stop)
     c = np.uint64(start)
-    while c < width:
+    while c < last:
         d = c + one
         head_c, factor_c = _reflection(B, c, rows, triangle)
         along = head_c * triangle[c, d]
@@ -166,7 +167,8 @@ def merge_batch(B: NDArray[np.float64], start: int, used: int, triangle: NDArray
         cross = 0.0
         for i in range(rows):
             cross += B[c, i] * B[d, i]
-        for j in range(d + one, width + one):
+        for q in range(d + one, max(last, d + one) + one):
+            j = q if q < last else width
             s, t = head_c * triangle[c, j], head_d * triangle[d, j]
             for i in range(rows):
                 s += B[c, i] * B[j, i]
@@ -178,7 +180,8 @@ def merge_batch(B: NDArray[np.float64], start: int, used: int, triangle: NDArray
             for i in range(rows):
                 B[j, i] -= s * B[c, i] + t * B[d, i]
         c += one + one
-    for j in range(np.uint64(start), width + one):
+    for q in range(min(np.uint64(start), last), last + one):
+        j = q if q < last else width
         for i in range(rows):
             B[j, i] = 0.0
 
@@ -225,7 +228,7 @@ def add_rows(
     W = np.empty((TOGETHER, width + 1))
     B = np.zeros((STEPS, width + 1, BATCH + 8))  # columns apart by no power of two, which would share sets of the cache
     used = np.zeros(STEPS, dtype=np.int64)
-    start = np.full(STEPS, width)
+    start, stop = np.full(STEPS, width), 0  # no row so far reaches a column from `stop` on
     for landmark in range(len(own)):
         k = own[landmark]
         height, count = 0, 0
@@ -255,7 +258,7 @@ def add_rows(
                 rows += dim[n]
                 for q in range(slot[n], slot[n + 1]):
                     if column[q] >= 0:
-                        lowest = min(lowest, column[q])
+                        lowest, stop = min(lowest, column[q]), max(stop, column[q] + dof[q])
                         reach = max(reach, place[column[q]] + dof[q])
                 e += 1
             A[:, kept:rows] = 0.0
@@ -297,7 +300,7 @@ def add_rows(
             done = rank
             while done < rows:
                 if used[now] == BATCH:
-                    merge_batch(B[now], start[now], used[now], triangle)
+                    merge_batch(B[now], start[now], stop, used[now], triangle)
                     used[now] = 0
                 fresh, below = min(rows - done, BATCH - used[now]), used[now]
                 for c in range(1, reach):
@@ -313,4 +316,4 @@ def add_rows(
         for c in range(count):
             place[touched[c]] = -1
     for now in range(STEPS):
-        merge_batch(B[now], start[now], used[now], triangle)
+        merge_batch(B[now], start[now], stop, used[now], triangle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from boxplus.optimization.group import Group
 from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, eliminate_columns
 from boxplus.optimization.removal import Masks
 from boxplus.optimization.variables import Variables
+from boxplus.sparse.counting_sort import order_by
 
 _RANK = 1e-10  # share of a column's length: what is left of it below this is rounding
 _NONE = -1
@@ -44,8 +46,9 @@ class Columns:
         """From the residuals `touched` of every group and the variables `gone` of every block."""
         met = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
         for group, chosen in zip(groups, touched, strict=True):
-            for c in group.connections:
-                met[c.block.number][c.rows[chosen]] = True
+            if chosen.any():
+                for c in group.connections:
+                    met[c.block.number][c.rows if chosen.all() else c.rows[chosen]] = True
         for block in blocks:
             met[block.number] &= ~block.is_fixed
         alone = _independent(blocks, groups, touched, [m & g for m, g in zip(met, gone, strict=True)])
@@ -80,7 +83,8 @@ def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: 
         candidates = leaving[block.number].copy()
         alone[block.number] = candidates
         for group, chosen in zip(groups, touched, strict=True):
-            if candidates.any() and chosen.any():
+            is_met = any(c.block is block for c in group.connections)
+            if is_met and len(group.connections) > 1 and candidates.any() and chosen.any():
                 hits = [alone[c.block.number][c.rows] for c in group.connections]
                 shared = (np.sum(hits, axis=0) > 1) & chosen
                 for c in group.connections:
@@ -89,24 +93,26 @@ def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: 
     return alone
 
 
-def _packed(group: Group, chosen: NDArray[np.bool_], columns: Columns) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """[J, r] of the chosen residuals, one after the other, and of each: dim, slots, size, landmark, first column, columns."""
+def _pack(group: Group, chosen: NDArray[np.bool_], columns: Columns, data: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """[J, r] of the chosen residuals into `data`; of each: dim, slots, size, landmark, first column, columns."""
     rows = np.flatnonzero(chosen)
     count = len(rows)
     dofs = np.array([c.block.manifold.dof for c in group.connections])
-    data = np.empty((len(rows), group.residual.dim, int(dofs.sum()) + 1))
+    packed = data.reshape(count, group.residual.dim, -1)
     end = 0
     for J in group.jacobians:
-        data[:, :, end : end + J.shape[2]] = J if count == len(chosen) else J[rows]
+        packed[:, :, end : end + J.shape[2]] = J if count == len(chosen) else J[rows]
         end += J.shape[2]
-    data[:, :, end] = group.r[rows]
-    column = np.stack([columns.place[c.block.number][c.rows[rows]] for c in group.connections], axis=1)
-    landmark = np.max([columns.landmark[c.block.number][c.rows[rows]] for c in group.connections], axis=0)
+    packed[:, :, end] = group.r if count == len(chosen) else group.r[rows]
+    at = [c.rows if count == len(chosen) else c.rows[rows] for c in group.connections]
+    column = np.stack([columns.place[c.block.number][k] for c, k in zip(group.connections, at, strict=True)], axis=1)
+    own = [columns.landmark[c.block.number][k] for c, k in zip(group.connections, at, strict=True) if len(columns.own)]
+    landmark = functools.reduce(np.maximum, own, np.full(count, _NONE))
     first = np.where(column >= 0, column, columns.width).min(axis=1)
-    return data.reshape(-1), [
+    return [
         np.full(count, group.residual.dim),
         np.full(count, len(dofs)),
-        np.full(count, data[0].size),
+        np.full(count, packed[0].size),
         landmark,
         first,
         np.full(count, dofs.sum()),
@@ -117,20 +123,24 @@ def _packed(group: Group, chosen: NDArray[np.bool_], columns: Columns) -> tuple[
 
 def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """R (w, w + 1) of all rows without their landmarks, residuals in the last column, and (w,) the lengths of the columns."""
-    parts = [_packed(group, chosen, columns) for group, chosen in zip(groups, touched, strict=True) if chosen.any()]
+    leaving = [(group, chosen) for group, chosen in zip(groups, touched, strict=True) if chosen.any()]
     triangle, squares = np.zeros((columns.width, columns.width + 1)), np.zeros(columns.width)
-    if parts and columns.width:
-        data = np.concatenate([part[0] for part in parts])
-        dim, slots, size, landmark, first, width, column, dof = (
-            np.concatenate(a) for a in zip(*(part[1] for part in parts), strict=True)
-        )
+    if leaving and columns.width:
+        sizes = [int(chosen.sum()) * group.residual.dim * (group.tangents + 1) for group, chosen in leaving]
+        ends = np.cumsum(sizes)
+        data = np.empty(int(ends[-1]))
+        parts = [
+            _pack(group, chosen, columns, data[end - size : end])
+            for (group, chosen), size, end in zip(leaving, sizes, ends, strict=True)
+        ]
+        dim, slots, size, landmark, first, width, column, dof = (np.concatenate(a) for a in zip(*parts, strict=True))
         # Residuals without a landmark follow the landmarks, each alone.
         single = np.flatnonzero(landmark < 0)
         landmark[single] = len(columns.own) + np.arange(len(single))
         own = np.concatenate([columns.own, np.zeros(len(single), dtype=np.int64)])
         slot = np.concatenate([[0], np.cumsum(slots)])
         step = np.minimum(first * STEPS // columns.width, STEPS - 1)
-        residual = np.argsort(landmark * STEPS + (STEPS - 1 - step), kind="stable")
+        residual = order_by(landmark * STEPS + (STEPS - 1 - step), len(own) * STEPS)[0].astype(np.int64)
         begin = np.concatenate([[0], np.cumsum(np.bincount(landmark, minlength=len(own)))])
         rows = np.bincount(landmark, weights=dim, minlength=len(own))
         reach = np.bincount(landmark, weights=width, minlength=len(own))

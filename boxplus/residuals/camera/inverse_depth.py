@@ -26,12 +26,16 @@ Source: SPEC.md 8.3; Civera et al., Inverse depth parametrization for monocular 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_numbers
 from boxplus.cameras.model import CameraModel
 from boxplus.cameras.projection import project_any
+from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.quaternion import multiply_scalars, rotate, rotation_entries
 from boxplus.manifolds.se3 import SE3Left
@@ -104,9 +108,10 @@ def _inverse_depth(
     points: NDArray[np.float64],
     point_of: NDArray[np.uint32],
     pixels: NDArray[np.float64],
-    code: int,
-    c: NDArray[np.float64],
-    nearest: float,
+    camera_of: NDArray[np.uint32],
+    codes: NDArray[np.int64],
+    parameters: NDArray[np.float64],
+    nearest: NDArray[np.float64],
     r: NDArray[np.float64],
     J_anchor: NDArray[np.float64],
     J_observer: NDArray[np.float64],
@@ -124,8 +129,10 @@ def _inverse_depth(
         y = R[3] * m0 + R[4] * m1 + R[5] + rho * ty
         z = R[6] * m0 + R[7] * m1 + R[8] + rho * tz
         # A NaN passes on into the residual, where it is seen and named.
+        of = camera_of[n]
+        c = parameters[of]
         seen, u, v, p00, p01, p02, p10, p11, p12 = project_any(
-            code, with_jacobians, x, y, z, nearest * rho, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
+            codes[of], with_jacobians, x, y, z, nearest[of] * rho, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
         )
         valid[n] = seen
         if not seen:
@@ -155,27 +162,31 @@ class InverseDepthReprojection(PixelResidual):
     nothing ties the bearing to what the anchor saw.
 
     Args:
-        camera: the observer.
+        camera: the observer; a sequence where several take part, which `camera_of` then tells apart.
         pixels: (N, 2) where the observer sees them [px].
+        camera_of: (N,) number of the observer among several cameras.
         sigma, covariance, information: of a pixel measurement, as in `Whitening.of`; none of them stands for 1 px.
 
     Raises:
-        InputError: pixels of another shape or not finite, or noise that `Whitening.of` refuses.
+        InputError: pixels of another shape or not finite, a camera that is not there, or noise that `Whitening.of` refuses.
     """
 
     no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))
 
     def __init__(
         self,
-        camera: CameraModel,
+        camera: CameraModel | Sequence[CameraModel],
         pixels: ArrayLike,
         *,
+        camera_of: ArrayLike | None = None,
         sigma: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
-        self.camera, self.pixels = camera, check_pixels("pixels", pixels)
+        self.cameras = (camera,) if isinstance(camera, CameraModel) else tuple(camera)
+        self.pixels = check_pixels("pixels", pixels)
         count = len(self.pixels)
+        self.camera_of = _checked_numbers(camera_of, len(self.cameras), count)
         super().__init__(
             dim=2,
             count=count,
@@ -183,12 +194,27 @@ class InverseDepthReprojection(PixelResidual):
             roles=("T_anchor_world", "T_observer_world", "bearing_rho"),
             whitening=Whitening.of(2, count, sigma=sigma, covariance=covariance, information=information),
         )
-        self._parameters = camera.padded_parameters
+        self._models = (
+            np.array([c.code for c in self.cameras], dtype=np.int64),
+            np.array([c.padded_parameters for c in self.cameras]),
+            np.array([c.nearest for c in self.cameras], dtype=np.float64),
+        )
 
     def _run(
         self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask, with_jacobians: bool
     ) -> None:
         _inverse_depth(
-            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.camera.code,
-            self._parameters, self.camera.nearest, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
+            begin, end, x[0], index[0], x[1], index[1], x[2], index[2], self.pixels, self.camera_of,
+            *self._models, r, jacobians[0], jacobians[1], jacobians[2], valid, with_jacobians,
         )  # fmt: skip
+
+
+def _checked_numbers(camera_of: ArrayLike | None, cameras: int, count: int) -> NDArray[np.uint32]:
+    """(count,) which camera saw each row; all of them the only one where it is left out."""
+    if camera_of is None and cameras == 1:
+        return np.zeros(count, dtype=np.uint32)
+    of = as_numbers([] if camera_of is None else camera_of, "camera_of")
+    if of.shape != (count,) or of.dtype.kind not in "iu" or (count and not 0 <= of.min() <= of.max() < cameras):
+        got = "none" if camera_of is None else f"{of.dtype} of shape {of.shape}" + (f" up to {of.max()}" if of.size else "")
+        raise InputError(f"camera_of ({count},), integers from 0 to {cameras - 1}", got, "give the camera of every pixel")
+    return np.ascontiguousarray(of, dtype=np.uint32)

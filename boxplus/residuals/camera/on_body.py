@@ -32,7 +32,7 @@ monocular visual-inertial systems, IROS 2018.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,6 +73,16 @@ class _Place:
     poses: tuple[Array, ...]
     T: Array
     jacobians: tuple[Array, ...]
+    _known: list[tuple[NDArray[np.uint32], NDArray[np.uint32], int, NDArray[np.uint32]]] = field(default_factory=list)
+
+    def table_rows(self, body_of: NDArray[np.uint32], mounting_of: NDArray[np.uint32], mountings: int) -> NDArray[np.uint32]:
+        """(N,) the rows of a table of the poses of all `mountings` on all bodies, mounting by mounting; the last are kept."""
+        for body, mounting, count, rows in self._known:
+            if body is body_of and mounting is mounting_of and count == mountings:
+                return rows
+        rows = body_of * np.uint32(mountings) + mounting_of
+        self._known[:] = [(body_of, mounting_of, mountings, rows)]
+        return rows
 
 
 class OnBody(Residual):
@@ -195,6 +205,16 @@ class OnBody(Residual):
         """Variables and rows of the camera residual; moves what it measures to the time of the poses."""
         own_x, own_index = [], []
         for place in self._places:
+            if len(place.poses) == 1:
+                body, mounting = place.first, place.first + 1
+                bodies, mountings = len(x[body]), len(x[mounting])
+                if 2 * bodies * mountings <= end - begin:
+                    # The poses of all cameras at all times once, not one for every residual.
+                    T, each = np.empty((bodies * mountings, 7)), np.arange(bodies * mountings, dtype=np.uint32)
+                    camera_poses(0, len(T), x[body], each // np.uint32(mountings), x[mounting], each % np.uint32(mountings), T)
+                    own_x.append(T)
+                    own_index.append(place.table_rows(index[body], index[mounting], mountings))
+                    continue
             for pair, T in enumerate(place.poses):
                 body, mounting = place.first + 2 * pair, place.first + 2 * pair + 1
                 camera_poses(begin, end, x[body], index[body], x[mounting], index[mounting], T)

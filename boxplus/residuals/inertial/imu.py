@@ -265,6 +265,7 @@ class ImuPreintegration(Residual):
             whitening=_whitening(preintegration),
         )
         self._is_variable = (True, True, True, True, gravity_direction, time_offset)
+        self._optional_at = (4 if gravity_direction else None, 4 + gravity_direction if time_offset else None)
         # What is no variable stands in its place as a constant.
         once = np.zeros(count, dtype=np.uint32)
         self._constants = (None,) * 4 + (self.gravity[None], np.full((1, 1), self.time_offset_s))
@@ -325,8 +326,7 @@ class ImuPreintegration(Residual):
 
     def _all(self, given: tuple[object, ...], otherwise: tuple[object, ...]) -> tuple[object, ...]:
         """One array for each of the six places: the next one given where it is a variable, else its constant."""
-        following = iter(given)
-        return tuple(next(following) if asked else constant for asked, constant in zip(self._is_variable, otherwise, strict=True))
+        return *given[:4], *(otherwise[4 + k] if at is None else given[at] for k, at in enumerate(self._optional_at))
 
 
 def _whitening(preintegration: Preintegration) -> Whitening:

@@ -43,3 +43,30 @@ class LandmarkFile:
         now = time.perf_counter()
         self._due = now + max(_EVERY_S, _SHARE * (now - began))
         return now - began
+
+
+class LandmarksById:
+    """The last known place of every landmark of a run, 12 bytes for every id up to the largest.
+
+    Ids count up from 0, so that a table by id is much smaller than a dictionary.
+    """
+
+    def __init__(self) -> None:
+        self._points = np.full((1024, 3), np.nan, dtype=np.float32)
+        self._end = 0
+
+    def __len__(self) -> int:
+        return int(np.isfinite(self._points[: self._end, 0]).sum())
+
+    def update(self, ids: NDArray[np.int64], points: NDArray[np.float64]) -> None:
+        """Take the places (n, 3) [m] of the landmarks `ids` (n,), in place of those known before."""
+        self._end = max(self._end, int(ids.max(initial=-1)) + 1)
+        if self._end > len(self._points):
+            more = np.full((max(self._end, 2 * len(self._points)) - len(self._points), 3), np.nan, dtype=np.float32)
+            self._points = np.concatenate([self._points, more])
+        self._points[ids] = points
+
+    def points(self) -> NDArray[np.float32]:
+        """(n, 3) [m] in the order of their ids."""
+        known = self._points[: self._end]
+        return known[np.isfinite(known[:, 0])]

@@ -9,16 +9,16 @@ from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus.errors import InputError, printable
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recording_facts
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
-from boxplus.runs.cameras.landmark_file import LandmarkFile
+from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById
 from boxplus.runs.estimate_statistics import EstimateStatistics
 from boxplus.runs.run_facts import StartFacts, State
 from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
@@ -43,6 +43,12 @@ _TOLD = {
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
+class View(Protocol):
+    """Is shown every frame of a run: `boxplus.report.LiveCameraView`."""
+
+    def show(self, estimate: VioEstimate) -> None: ...
+
+
 def run_visual_odometry(
     recording: CameraRecording,
     folder: str | Path | VioFolder,
@@ -50,6 +56,7 @@ def run_visual_odometry(
     *,
     overwrite: bool = False,
     progress: Callable[[Progress], None] | None = None,
+    view: View | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> VioSummary:
     """Run visual-inertial odometry over a recording and write trajectory, frames, landmarks and facts to a folder.
@@ -63,6 +70,7 @@ def run_visual_odometry(
         config: settings; each has a default.
         overwrite: replace the results of an earlier run in the folder.
         progress: called after every event that was read.
+        view: shown every frame, those before the start too.
         should_stop: asked between events; True ends the run in good order, with the state "interrupted".
 
     Returns:
@@ -83,30 +91,35 @@ def run_visual_odometry(
     run = folder if isinstance(folder, VioFolder) else VioFolder(Path(folder))
     claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite)
     with claimed as vio_folder:
-        return _Run(recording, vio_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
+        run_of_recording = _Run(recording, vio_folder, config, progress or (lambda _: None), view)
+        return run_of_recording.execute(should_stop or (lambda: False))
 
 
 class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
     """One run of visual-inertial odometry: its writers and its landmarks."""
 
     def __init__(
-        self, recording: CameraRecording, folder: VioFolder, config: VioRunConfig, progress: Callable[[Progress], None]
+        self,
+        recording: CameraRecording,
+        folder: VioFolder,
+        config: VioRunConfig,
+        progress: Callable[[Progress], None],
+        view: View | None,
     ) -> None:
         text = dump_vio_config(config, recording.info)
         super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
         self._info, self._folder, self._config = recording.info, folder, config
         self._rig = rig_of_recording(recording.info, config.odometry)
         self._odometry = VisualInertialOdometry(config.odometry, self._rig)
+        self._view = view
         self._images: Counter[int] = Counter()
         self._rejected: Counter[str] = Counter()
         self._keyframes = self._before_start = 0
         self._push_s = 0.0  # since the frame before
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
         self._time_offset_s = 0.0
-        self._landmarks: dict[int, NDArray[np.float64]] = {}
-        self._landmark_file = LandmarkFile(
-            folder.landmarks, lambda: np.array(list(self._landmarks.values()), dtype=np.float32).reshape(-1, 3)
-        )
+        self._landmarks = LandmarksById()
+        self._landmark_file = LandmarkFile(folder.landmarks, self._landmarks.points)
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -135,6 +148,8 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         stages["window"] = max(self._push_s - sum(stages.values()), 0.0)
         self._push_s, self.status = 0.0, estimate.status
         self._rejected.update(estimate.rejected)
+        if self._view is not None:
+            self._view.show(estimate)
         if estimate.status == "starting":
             self._before_start += 1
             return
@@ -147,9 +162,7 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         if estimate.is_keyframe:
             self._keyframes += 1
             good = estimate.landmark_sigmas < _VAGUE_M
-            self._landmarks.update(
-                zip(estimate.landmark_ids[good].tolist(), estimate.landmarks[good].astype(np.float64), strict=True)
-            )
+            self._landmarks.update(estimate.landmark_ids[good], estimate.landmarks[good])
         self._mountings, self._time_offset_s = estimate.T_imu_camera, estimate.time_offset_s
         self.seconds["writing"] += time.perf_counter() - began
 

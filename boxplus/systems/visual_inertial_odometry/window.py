@@ -89,8 +89,9 @@ class Window:
         self.covariance = np.zeros((15, 15))
         self.frames: list[Frame] = []
         self._imu: Preintegration | None = None
+        self._next: tuple[int, Preintegration] | None = None  # the step from the newest frame that `predict` took, and its end
         self._imu_group: Group | None = None
-        self._views: list[tuple[Group, NDArray[np.intp]]] = []
+        self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
         self._seen = Seen.none()
         self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
         self._anchor: Ints = np.zeros(0, np.int64)
@@ -110,6 +111,7 @@ class Window:
     def predict(self, time_ns: int, imu: ImuSamples) -> tuple[Floats, Floats]:
         """Pose (7,) and [v, b_a, b_g] (9,) at a time, from the newest frame and the IMU."""
         step = self._step(time_ns, imu)
+        self._next = time_ns, step
         pose, state = step.predict(self.bodies.values[-1], self.states.values[-1], self._gravity)
         return pose[0], state[0]
 
@@ -160,7 +162,9 @@ class Window:
 
     def _add(self, tracks: Tracks, pose: Floats, state: Floats, is_keyframe: bool, imu: ImuSamples) -> None:
         if self.frames:
-            step = self._step(tracks.time_ns, imu)
+            is_known = self._next is not None and self._next[0] == tracks.time_ns
+            step = self._next[1] if is_known and self._next is not None else self._step(tracks.time_ns, imu)
+            self._next = None
             self._imu = step if self._imu is None else self._imu.append(step)
             self.gap_s = float(step.longest_gap_s[0])
             if self.gap_s > self._config.max_imu_gap:  # such an interval is never made one with another
@@ -264,28 +268,25 @@ class Window:
         self.covariance = P[np.ix_(TO_STATE_ORDER, TO_STATE_ORDER)]
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
-        """Residuals of these observations, one group for each camera, and of the IMU's first intervals; of no others."""
-        old = [group for group, _ in self._views] + ([] if self._imu_group is None else [self._imu_group])
-        if old:
-            self.problem.remove(*old)
-        self._views, self._imu_group = [], None
+        """Residuals of these observations, and of the IMU's first intervals; of no others."""
+        self._disconnect()
         seen = self._seen
         anchor = self._anchor[np.searchsorted(self.points.ids, seen.landmark)]
-        for camera, mounted in enumerate(self._rig.cameras):
-            rows = observations[seen.camera[observations] == camera]
-            if not len(rows):
-                continue
+        if len(observations):
+            rows = observations
+            models = [mounted.model for mounted in self._rig.cameras]
+            camera, sigma = seen.camera[rows], self._config.pixel_sigma
             group = self.problem.add_residuals(
-                OnBody(InverseDepthReprojection(mounted.model, seen.pixel[rows], sigma=self._config.pixel_sigma)),
+                OnBody(InverseDepthReprojection(models, seen.pixel[rows], camera_of=camera, sigma=sigma)),
                 self.bodies[anchor[rows]],
                 self.mountings[[0]],
                 self.bodies[seen.frame[rows]],
-                self.mountings[[camera]],
+                self.mountings[camera],
                 self.points[seen.landmark[rows]],
                 loss=Huber(_HUBER),
-                name=f"camera {camera}",
+                name="corners",
             )
-            self._views.append((group, rows))
+            self._views = (group, rows)
         if self._imu is not None and intervals:
             state = self.states.values[:-1]
             stale = self._imu.is_stale(state[:, 3:6], state[:, 6:])
@@ -302,6 +303,12 @@ class Window:
             states = self.bodies[begin], self.states[begin], self.bodies[end], self.states[end]
             self._imu_group = self.problem.add_residuals(residual, *states, *([self.offset[:]] if follows else []), name="imu")
 
+    def _disconnect(self) -> None:
+        """Take out the residuals that `_connect` added."""
+        views = None if self._views is None else self._views[0]
+        self.problem.remove(*(group for group in (views, self._imu_group) if group is not None))
+        self._views = self._imu_group = None
+
     def reject(self, threshold: float) -> Fit:
         """Leave out observations whose residual is larger, and landmarks that too few agree on.
 
@@ -311,7 +318,8 @@ class Window:
         seen = self._seen
         values = [block.values for block in self.problem.blocks]
         squares = np.zeros(len(seen.frame))
-        for group, rows in self._views:
+        if self._views is not None:
+            group, rows = self._views
             squares[rows] = group.squares(values)
         bad = squares > threshold**2
         newest = seen.frame == self.frames[-1].number
@@ -339,7 +347,8 @@ class Window:
     def _inverse_depth_sigmas(self) -> Floats:
         """(m,) of ρ of every landmark, from the information that the residuals just evaluated have about it."""
         information = np.zeros(len(self.points))
-        for group, _ in self._views:
+        if self._views is not None:
+            group, _ = self._views
             np.add.at(information, group.connections[-1].rows, (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1))
         return 1.0 / np.sqrt(np.maximum(information, 1e-12))
 
@@ -348,17 +357,16 @@ class Window:
         if gone.any():
             ids = self.points.ids[gone]
             self._seen.keep(~np.isin(self._seen.landmark, ids))
-            self.problem.remove(self.points[ids], *[group for group, _ in self._views])
-            self._views = []
+            self._disconnect()
+            self.problem.remove(self.points[ids])
             self._track, self._anchor, self._rho_sigma = self._track[~gone], self._anchor[~gone], self._rho_sigma[~gone]
 
     def shrink(self) -> None:
         """Drop frames that are no keyframes and not recent any more; let the oldest keyframe go where there are too many."""
         for frame in [f for f in self.frames[1 : -self._config.recent_frames] if not f.is_keyframe]:
             k = self.frames.index(frame)
+            self._disconnect()
             self.problem.remove(self.bodies[frame.number], self.states[frame.number])
-            self._imu_group = None if self._imu_group not in self.problem.groups else self._imu_group
-            self._views = [(group, rows) for group, rows in self._views if group in self.problem.groups]
             self._seen.keep(self._seen.frame != frame.number)
             if self._imu is not None:
                 self._imu = self._imu.merge(k - 1)
@@ -384,7 +392,7 @@ class Window:
         self._connect(np.flatnonzero(absorbed), 1)
         variables = [self.bodies[oldest.number], self.states[oldest.number], self.points[ids]]
         self.leak = marginalize(self.problem, variables, at=None, gauge=self._gauge).leak
-        self._imu_group, self._views = None, []
+        self._imu_group = self._views = None
         seen.keep(~np.isin(seen.landmark, ids))
         self._track, self._anchor = self._track[~leaving], self._anchor[~leaving]
         if self._imu is not None:

@@ -234,3 +234,21 @@ class TestConsistency:
         average = float(nees(*self.errors(intrinsics)).mean())
         low, high = nees_band(6, self.RUNS, 0.99)
         assert low < average < high
+
+
+def test_several_cameras_in_one_group_are_those_of_a_group_each() -> None:
+    anchors, observers, rho, seen = views(21)
+    pixels, b = random_pixels(22), point(CAMERA, seen, rho)
+    of = np.random.default_rng(23).integers(0, 2, COUNT)
+    together = InverseDepthReprojection([CAMERA, LENS], pixels, camera_of=of).linearize(anchors, observers, b)
+    for number, camera in enumerate((CAMERA, LENS)):
+        n = of == number
+        alone = InverseDepthReprojection(camera, pixels[n]).linearize(anchors[n], observers[n], b[n])
+        assert np.array_equal(together.residuals[n], alone.residuals)
+        assert all(np.array_equal(J[n], own) for J, own in zip(together.jacobians, alone.jacobians, strict=True))
+
+
+@pytest.mark.parametrize("camera_of", [None, [0] * COUNT + [0], [2] * COUNT, [-1] * COUNT, [0.5] * COUNT])
+def test_a_camera_that_is_not_there_is_refused(camera_of: list[float] | None) -> None:
+    with pytest.raises(InputError, match=r"camera_of \(40,\), integers from 0 to 1"):
+        InverseDepthReprojection([CAMERA, LENS], random_pixels(1), camera_of=camera_of)

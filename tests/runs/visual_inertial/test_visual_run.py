@@ -31,7 +31,7 @@ from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras, write_camera_recording
-from boxplus.systems.visual_inertial_odometry import VioConfig
+from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
 SETTINGS = {"odometry": {"cell_size": 12, "features": 100}}
@@ -45,11 +45,33 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_camera_recording(simulation, tmp_path_factory.mktemp("recorded") / "room", "euroc")
 
 
+class Watcher:
+    """A view that keeps what it is shown."""
+
+    def __init__(self) -> None:
+        self.seen: list[VioEstimate] = []
+
+    def show(self, estimate: VioEstimate) -> None:
+        self.seen.append(estimate)
+
+
 @pytest.fixture(scope="module")
-def finished(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[VioFolder, VioSummary]:
+def watcher() -> Watcher:
+    return Watcher()
+
+
+@pytest.fixture(scope="module")
+def finished(recorded: Path, tmp_path_factory: pytest.TempPathFactory, watcher: Watcher) -> tuple[VioFolder, VioSummary]:
     folder = VioFolder(tmp_path_factory.mktemp("run") / "out")
     with open_camera_recording(recorded) as recording:
-        return folder, run_visual_odometry(recording, folder.path, CONFIG)
+        return folder, run_visual_odometry(recording, folder.path, CONFIG, view=watcher)
+
+
+def test_a_view_is_shown_every_frame_as_it_is_written(finished: tuple[VioFolder, VioSummary], watcher: Watcher) -> None:
+    folder, summary = finished
+    assert [e.status for e in watcher.seen].count("starting") == summary.frames_before_start
+    known = [e.time_ns for e in watcher.seen if e.status != "starting"]
+    assert known == read_trajectory(folder.trajectory).time_ns.tolist()
 
 
 def test_every_frame_with_a_state_has_a_row_everywhere(finished: tuple[VioFolder, VioSummary]) -> None:
