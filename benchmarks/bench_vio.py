@@ -35,9 +35,9 @@ from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
-from boxplus.simulation import manoeuvres
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 from boxplus.simulation.cameras.scenarios import ROOM_HIGH, ROOM_LOW, make_camera_scenario
+from boxplus.simulation.motions import manoeuvres
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate, VisualInertialOdometry
 
 HERE = Path(__file__).resolve().parent
