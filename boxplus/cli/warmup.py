@@ -27,6 +27,7 @@ def warmup() -> None:
             _adjust_bundle()
             _follow_camera()
             _follow_camera_and_imu()
+            _calibrate_cameras()
     what = f"{len(compiled)} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
     console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
 
@@ -126,3 +127,23 @@ def _follow_camera_and_imu() -> None:
         simulation = simulate_cameras(scenario, 1, duration_s=4.0, rig=make_rig("stereo", None, 0.3, 15.0))
         with tempfile.TemporaryDirectory() as folder:
             run_visual_odometry(as_camera_recording(simulation), Path(folder) / "run", config)
+
+
+def _calibrate_cameras() -> None:
+    """A small rig and its IMU before a target, with every lens."""
+    import numpy as np
+
+    from boxplus.manifolds import se3
+    from boxplus.residuals.inertial.imu_noise import ImuNoise
+    from boxplus.simulation.cameras.target_session import simulate_target_session
+    from boxplus.systems.camera_calibration.calibration import calibrate_cameras
+    from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
+    from boxplus.systems.camera_calibration.lens import lens
+    from boxplus.systems.camera_calibration.target import AprilGrid
+
+    target = AprilGrid(rows=3, columns=3, tag_size=0.1, spacing=0.3)
+    camera = lens("pinhole-radtan", np.array([458.0, 457.0, 372.0, 246.0, -0.283, 0.074, 0.0, 0.0]))
+    mounting = se3.exp(np.zeros((1, 6)))
+    seen = simulate_target_session([camera], mounting, (752, 480), target, frames=24, rate_hz=5.0)
+    noise = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3)
+    calibrate_cameras(seen.corners, target, CameraCalibrationConfig(max_views=8), imu=seen.imu, noise=noise)

@@ -27,7 +27,7 @@ from boxplus.systems.camera_calibration.structure import (
 )
 from boxplus.systems.camera_calibration.target import AprilGrid
 
-_APART, _LOST = 1.5, 0.2
+_APART, _LOST = 1.1, 0.2
 _PATTERN = 0.1
 _WORTH = 0.98
 """A lens of more parameters is taken where it leaves less than this share of the residuals."""
