@@ -20,7 +20,8 @@ _ENOUGH = 15  # landmarks that agree; fewer leave directions to the IMU
 _ANY = 6  # landmarks without which a frame counts as blind
 _CORNERS_HOLD = 5.0  # times as long as the IMU alone
 _DISAGREE = 0.35  # share of a frame's landmarks that is more than outliers
-_IMU_RATIO = 1.5  # residuals of the IMU over what its noise explains
+_UNKNOWN_M = 100.0  # standard deviation of a position that is none
+_IMU_RATIO = 1.0  # residuals of the IMU over what its noise explains
 _FIT_RATIO = 2.5  # residuals of the corners over what their noise explains
 _MEMORY = 0.9  # of the running means, per frame
 _LEAST_PARTNERS = 0.15  # share of the corners that a second camera finds where the calibration puts them
@@ -73,6 +74,9 @@ class Health:
                 f"no landmark was seen for {blind_s:.1f} s; the IMU holds the pose for {self.config.max_blind:g} s, its standard "
                 f"deviation is {position_sigma:.2f} m by now"
             )
+        if position_sigma > _UNKNOWN_M:
+            is_lost = True
+            reasons.append("what was seen and measured does not determine the pose")
         if imu_gap_s > self.config.max_imu_gap:
             reasons.append(
                 f"the IMU was silent for {imu_gap_s:.2f} s, of {self.config.max_imu_gap:g} s at most: only images tell the motion"

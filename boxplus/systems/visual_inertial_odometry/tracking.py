@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corner_centres import centred
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _WINDOW = (21, 21)
-_HALF = (10, 10)  # of the window
-_MOST_CREEP = 8.0  # px from a corner to the centre of its window
 _LEVELS = 3
 _STOP = (3, 30, 0.01)
 _QUALITY = 0.01  # of a corner against the best one of the image (Shi and Tomasi)
+_TEXTURED = 0.5  # share of the corners asked for; where fewer are found, noise decides where the centre of one is
 _BORDER = 8  # px within which no corner is kept
 _LEAST_SPREAD = 4.0  # grey values; an image with a smaller standard deviation shows nothing
 _FAR = 1e-3  # 1/m
@@ -139,7 +139,9 @@ class FeatureTracker:
         begin = time.perf_counter()
         cell = self._config.cell_size
         corners = self._cv2.goodFeaturesToTrack(grey, room, _QUALITY, 0.6 * cell, mask=self._empty(grey.shape, cell))
-        pixels = None if corners is None else self._centred(grey, corners)
+        pixels = None if corners is None else corners.reshape(-1, 2).astype(np.float64)
+        if pixels is not None and len(self._ids) + len(pixels) >= _TEXTURED * self._config.features:
+            pixels = centred(self._cv2, grey, pixels)
         self.opencv_s += time.perf_counter() - begin
         if pixels is None:
             return tracks
@@ -158,17 +160,6 @@ class FeatureTracker:
         rejected = Counter(tracks.rejected)
         self._search_others(fresh, rejected)
         return self._tracks(tracks.time_ns, fresh, rejected, tracks.motion_px)
-
-    def _centred(self, grey: Grey, corners: NDArray[np.float32]) -> Floats:
-        """Corners (n, 1, 2) drawn to where no change of size or turn of what is around them moves them, (n, 2).
-
-        Optical flow knows shifts only. Where ∇I ∇Iᵀ, summed over its window, has another centre than the window, a window that
-        grows is taken for one that shifts, and the corner creeps along with every image.
-        """
-        centred = self._cv2.cornerSubPix(grey, corners.copy(), _HALF, (-1, -1), _STOP)
-        far = np.linalg.norm(centred - corners, axis=2) > _MOST_CREEP
-        pixels: Floats = np.where(far[..., None], corners, centred).reshape(-1, 2).astype(np.float64)
-        return pixels
 
     def forget(self, ids: NDArray[np.int64]) -> None:
         """Follow these corners no longer: they move on their own, or were never corners."""

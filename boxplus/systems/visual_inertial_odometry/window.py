@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import SingularProblemError
 from boxplus.manifolds import se3
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
@@ -40,6 +41,8 @@ _COST_TOLERANCE = 1e-3
 # A tilt of the whole window against the accelerometer's bias is 1e-8 of what the IMU knows from frame to frame, and decides
 # where it goes: more damping than that would hold it where it is, while the covariance says it is known.
 _DAMPING = 1e-10
+
+_UNKNOWN = np.repeat([np.pi, 1e3, 1e2, 1.0, 1.0], 3)  # [θ, p, v, b_a, b_ω]: of a pose that nothing determines
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
@@ -264,7 +267,10 @@ class Window:
         )
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        P = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
+        try:
+            P = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
+        except SingularProblemError:  # little seen after a silent IMU: what is known spans more than numbers hold
+            P = np.diag(_UNKNOWN**2)
         self.covariance = P[np.ix_(TO_STATE_ORDER, TO_STATE_ORDER)]
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:

@@ -30,7 +30,7 @@ from boxplus.runs.visual_inertial.frame_log import read_frame_log
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
-from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras, write_camera_recording
+from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
@@ -183,3 +183,14 @@ def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Pat
     assert refused.exit_code == 2
     unknown = CliRunner().invoke(app, [*arguments, "--overwrite", "--set", "featurs=3"])
     assert unknown.exit_code == 2
+
+
+def test_cameras_that_are_swapped_end_with_exit_code_3(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room", 2, duration_s=5.5, rig=make_rig("stereo", None, 0.3, 10.0))
+    swapped = write_camera_recording(simulation, tmp_path / "swapped", "euroc", make_camera_fault("swapped_cameras"))
+    out = tmp_path / "out"
+    arguments = ["vio", str(swapped), "-o", str(out), "--no-report", "--set", "cell_size=12"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 3, done.output
+    contradiction = read_vio_summary(out / "run.json").contradiction
+    assert contradiction is not None and "which camera is which" in contradiction

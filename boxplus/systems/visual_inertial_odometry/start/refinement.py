@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ _LOSS = 2.0  # standard deviations
 _MISTAKE = 4.0  # standard deviations, of a sighting that is left out
 _FARTHEST = 100.0  # m, of a point to begin with
 _ROUNDS = (40, 30)
+_COST_TOLERANCE, _DAMPING = 1e-4, 1e-9
 _WRONG_SHARE = 0.34
 _FEWEST_SIGHTINGS, _FEWEST_TRACKS = 3, 15
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
@@ -63,6 +64,20 @@ class Refined:
     chi2_imu: float
     imu_share: float
     converged: bool
+
+    def as_motion(self, motion: LinearMotion, tracks: RayTracks) -> LinearMotion:
+        """Where another search may begin; `motion` and `tracks` are those that this one began with."""
+        ahead = self.inverse_depth > 1.0 / _FARTHEST
+        length = np.sqrt(1.0 + (tracks.rays[motion.anchors] ** 2).sum(axis=1))
+        return replace(
+            motion,
+            R=quaternion.to_matrix(self.poses[:, :4]),
+            p=self.poses[:, 4:],
+            v=self.velocity_bias[:, :3],
+            gravity=self.gravity_direction,
+            accel_bias=self.velocity_bias[0, 3:6],
+            depth=length / np.where(ahead, self.inverse_depth, 1.0 / _FARTHEST),
+        )
 
 
 @dataclass(frozen=True)
@@ -111,7 +126,7 @@ def refine(
         parts = _build(
             tracks, track_of, motion.anchors, used, poses, states, gravity, points, between, magnitude, sigma, bias_sigma
         )
-        solution = parts.problem.solve(max_iterations=iterations, cost_tolerance=1e-5)
+        solution = parts.problem.solve(max_iterations=iterations, cost_tolerance=_COST_TOLERANCE, initial_damping=_DAMPING)
         poses, states, gravity, points = (
             np.array(solution[block]) for block in (parts.bodies, parts.states, parts.gravity, parts.points)
         )

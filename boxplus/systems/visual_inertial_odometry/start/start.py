@@ -45,7 +45,7 @@ _FEWEST_SIGHTINGS = 3  # of a track
 _MISTAKEN, _NOISE, _CHI2, _BEHIND = 40.0, 5.0, 3.0, 10.0
 _BIAS_SIGMAS = 2.5
 _CAUTION = 2.0  # how many times as noisy as it was seen to be the IMU is taken for
-_TILT_DEG, _SCALE = 0.45, 5.0  # deg beside what the accelerometer's bias does, %
+_TILT_DEG, _TILT_MONO_DEG, _SCALE = 0.8, 0.45, 5.0  # deg beside what the accelerometer's bias does, %
 _JUMPS = 0.3, 5.0  # rad/s, m/s²: standard deviations
 _EXCITATION = 0.3  # m/s²
 _NO_EXCITATION = "the acceleration varies by {:.2f} m/s² ({:g} are needed to see the scale)"
@@ -207,11 +207,11 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
     bias_sigma = _GYRO_BIAS, config.accel_bias_sigma
     found = refine(tracks, motion, between, config.gravity, pixel, config.pixel_sigma, bias_sigma)
     share = 1.0 if found is None else _CAUTION * found.imu_share
-    if share < 1.0:
+    if found is not None and share < 1.0:
         # Motors shake an IMU from sample to sample, but hardly from keyframe to keyframe, which is what counts.
         calm = replace(noise, gyro=max(stated.gyro, share * noise.gyro), accel=max(stated.accel, share * noise.accel))
         between = _between(times, imu, calm, turn.bias, motion.accel_bias)
-        found = refine(tracks, motion, between, config.gravity, pixel, config.pixel_sigma, bias_sigma)
+        found = refine(tracks, found.as_motion(motion, tracks), between, config.gravity, pixel, config.pixel_sigma, bias_sigma)
     if found is None:
         return "too few corners agree with any one motion"
     if not found.converged:
@@ -311,7 +311,7 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
         ),
         (
             "gravity, deviation beside the bias [deg]",
-            _TILT_DEG,
+            _TILT_MONO_DEG if is_mono else _TILT_DEG,
             "gravity is known to {:.2f} deg beside what the accelerometer's bias does ({:g} are needed)",
         ),
     ]
