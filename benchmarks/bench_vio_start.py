@@ -21,9 +21,11 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from metrics import Metric, to_json
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
@@ -244,11 +246,7 @@ def report(lines: Sequence[dict[str, Any]]) -> str:
                 if rows:
                     text.append(_row(motion, cameras, rows))
         for cameras in (2, 1):
-            rows = [
-                line
-                for line in mine
-                if line["cameras"] == cameras and line["excitation"] > _EXCITED and line["motion"] not in ("rest", "shaken rest")
-            ]
+            rows = [line for line in mine if line["cameras"] == cameras and _is_excited(line)]
             if rows:
                 text.append(_row(f"above {_EXCITED:g} m/s²", cameras, rows) + f"   {100 * _share(rows):.1f} % right")
         tried = sum(line["tried"] for line in mine)
@@ -259,6 +257,20 @@ def report(lines: Sequence[dict[str, Any]]) -> str:
             if line["verdict"] == "wrong"
         ]
     return "\n".join(text)
+
+
+def figures(lines: Sequence[dict[str, Any]]) -> list[Metric]:
+    """What a baseline holds: wrong starts, and the share of right ones where the acceleration varies."""
+    wrong = sum(line["verdict"] == "wrong" for line in lines)
+    excited = [line for line in lines if _is_excited(line)]
+    return [
+        Metric("vio_start/wrong", wrong, "starts", "lower", 0.0, tolerance=0.0),
+        Metric("vio_start/right where the acceleration varies", 100.0 * _share(excited), "%", "higher", 95.0, tolerance=0.03),
+    ]
+
+
+def _is_excited(line: dict[str, Any]) -> bool:
+    return line["excitation"] > _EXCITED and line["motion"] not in ("rest", "shaken rest")
 
 
 def _share(rows: Sequence[dict[str, Any]]) -> float:
@@ -280,6 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--half", choices=("even", "odd", "both"), default="both")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", help="write a line of JSON for every seed")
+    parser.add_argument("--json", type=Path, help="write the figures that a baseline holds")
     parser.add_argument("-v", action="store_true", help="print these lines")
     options = parser.parse_args(arguments)
     begin, end = (int(part) for part in options.seeds.split(":"))
@@ -292,6 +305,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.out:
         with open(options.out, "w", encoding="utf-8") as file:
             file.writelines(json.dumps(line) + "\n" for line in lines)
+    if options.json:
+        options.json.write_text(json.dumps(to_json(figures(lines))), encoding="utf-8")
     if options.v:
         for line in lines:
             print(json.dumps(line, indent=1))

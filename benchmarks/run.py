@@ -94,6 +94,7 @@ BENCHMARKS = {
     "direct": Benchmark(("--rounds", "1")),
     "direct_runs": Benchmark(()),
     "vio": Benchmark(("--only", "mh01")),
+    "vio_start": Benchmark(("--seeds", "2001:2021"), arguments=("--half", "odd", "--seeds", "2001:2201")),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
 

@@ -1,12 +1,16 @@
-"""What a window knows of its first pose and state."""
+"""What a window knows of a pose and state: of the first one beforehand, and of any once it is solved."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.variables import VariableRows
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 
@@ -14,6 +18,7 @@ TO_STATE_ORDER = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 13, 14, 9, 10, 11]
 """From [θ, p, v, b_ω, b_a], as estimates have it, to [θ, p, v, b_a, b_ω], as the variables do, and back."""
 
 _KNOWN = 1e-4  # rad, m: of the first yaw and position, which are known by definition
+_UNKNOWN = np.repeat([np.pi, 1e3, 1e2, 1.0, 1.0], 3)  # rad, m, m/s, rad/s, m/s²: of a pose that nothing determines
 _LEAST_VARIANCE = 1e-10  # of what a start takes for certain
 
 
@@ -36,3 +41,12 @@ def beginning(start: Start) -> MarginalPrior:
     return MarginalPrior(
         manifolds, x0, J, J @ off, roles=("first pose", "first state"), fixes_gauge=True, keeps_first_estimates=False
     )
+
+
+def covariance_of(solution: Solution, body: VariableRows, state: VariableRows) -> NDArray[np.float64]:
+    """(15, 15) of a pose and state at a solution, in the order of `VioEstimate`; very large where nothing determines them."""
+    try:
+        P = solution.joint_covariance(body, state, is_determined=True)
+    except SingularProblemError:  # little seen after a silent IMU: what is known spans more than numbers hold
+        return np.diag(_UNKNOWN**2)
+    return P[np.ix_(TO_STATE_ORDER, TO_STATE_ORDER)]

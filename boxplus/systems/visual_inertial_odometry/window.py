@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import SingularProblemError
 from boxplus.manifolds import se3
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
@@ -27,7 +26,7 @@ from boxplus.residuals.inertial.imu import ImuPreintegration
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
-from boxplus.systems.visual_inertial_odometry.beginning import TO_STATE_ORDER, beginning
+from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
@@ -42,7 +41,6 @@ _COST_TOLERANCE = 1e-3
 # where it goes: more damping than that would hold it where it is, while the covariance says it is known.
 _DAMPING = 1e-10
 
-_UNKNOWN = np.repeat([np.pi, 1e3, 1e2, 1.0, 1.0], 3)  # [θ, p, v, b_a, b_ω]: of a pose that nothing determines
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
@@ -267,11 +265,7 @@ class Window:
         )
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        try:
-            P = solution.joint_covariance(self.bodies[number], self.states[number], is_determined=True)
-        except SingularProblemError:  # little seen after a silent IMU: what is known spans more than numbers hold
-            P = np.diag(_UNKNOWN**2)
-        self.covariance = P[np.ix_(TO_STATE_ORDER, TO_STATE_ORDER)]
+        self.covariance = covariance_of(solution, self.bodies[number], self.states[number])
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""

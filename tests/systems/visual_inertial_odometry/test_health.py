@@ -1,0 +1,59 @@
+"""The judge of a frame, without images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from boxplus.errors import SingularProblemError
+from boxplus.systems.visual_inertial_odometry import VioConfig
+from boxplus.systems.visual_inertial_odometry.beginning import covariance_of
+from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
+from boxplus.systems.visual_inertial_odometry.observations import Fit
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+
+
+def frame(k: int, corners: int = 40) -> Tracks:
+    grey = np.array([100.0])
+    pixels = np.zeros((corners, 1, 2))
+    return Tracks(
+        k * 50_000_000,
+        np.arange(corners),
+        pixels,
+        np.ones((corners, 1, 3)),
+        np.zeros(corners, np.bool_),
+        {},
+        3.0,
+        grey,
+        0.4 * grey,
+    )
+
+
+def fit(imu_ratio: float = 0.3) -> Fit:
+    return Fit(40, 0, np.zeros(0, np.int64), 0.2, imu_ratio)
+
+
+def judged(health: Health, imu_ratio: float, frames: int, position_sigma: float = 0.01) -> list[str]:
+    return [health.judge(frame(k), fit(imu_ratio), False, 0.005, position_sigma)[0] for k in range(1, frames + 1)]
+
+
+def test_an_imu_within_its_noise_is_ok_and_one_that_goes_on_beyond_it_a_contradiction() -> None:
+    sound, off = Health(VioConfig()), Health(VioConfig())
+    for health in (sound, off):
+        health.begin(0)
+    assert set(judged(sound, 0.7, 80)) == {"ok"} and sound.contradiction is None
+    statuses = judged(off, 1.6, 80)
+    assert statuses[0] == "ok" and statuses[-1] == "weak"
+    assert off.contradiction is not None and "the IMU disagrees with the cameras" in off.contradiction
+
+
+def test_a_pose_that_nothing_determines_is_lost() -> None:
+    class Open:
+        def joint_covariance(self, *_: object, is_determined: bool) -> np.ndarray:
+            raise SingularProblemError("pivot")
+
+    covariance = covariance_of(Open(), None, None)  # type: ignore[arg-type]
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    health = Health(VioConfig())
+    health.begin(0)
+    status, reasons = health.judge(frame(1), fit(), False, 0.005, position_sigma(covariance))
+    assert status == "lost" and "does not determine the pose" in reasons[0]
