@@ -240,3 +240,17 @@ def test_whole_groups_leave_without_the_others():
     with pytest.raises(InputError, match="a group of this problem"):
         problem.remove(gone)
     problem.solve()
+
+
+@given(st.integers(0, 10**6), st.integers(1, 60), st.integers(1, 400))
+def test_rows_are_found_whether_few_are_asked_for_or_many(seed, left, asked):
+    rng = np.random.default_rng(seed)
+    problem = Problem()
+    block = problem.add_variables(Euclidean(1), np.arange(500.0)[:, None], name="numbers")
+    alive = np.sort(rng.choice(500, left, replace=False))
+    problem.remove(block[np.setdiff1d(np.arange(500), alive)])
+    ids = rng.choice(alive, asked)
+    assert np.array_equal(block.values[block[ids].rows, 0], ids)
+    gone = int(rng.choice(np.setdiff1d(np.arange(500), alive)))
+    with pytest.raises(InputError, match=rf"numbers\[{gone}\], which was removed"):
+        block[np.append(ids, gone)]

@@ -271,7 +271,7 @@ class Window:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""
         self._disconnect()
         seen = self._seen
-        anchor = self._anchor[np.searchsorted(self.points.ids, seen.landmark)]
+        anchor = self._anchor[self.points.rows_of(seen.landmark)]
         if len(observations):
             rows = observations
             models = [mounted.model for mounted in self._rig.cameras]
@@ -325,7 +325,7 @@ class Window:
         newest = seen.frame == self.frames[-1].number
         first = newest & (seen.camera == 0)
         # A landmark without what its anchor saw, with nothing but that, or behind the camera, is none.
-        row = np.searchsorted(self.points.ids, seen.landmark)
+        row = self.points.rows_of(seen.landmark)
         left = np.bincount(row[~bad], minlength=len(self.points))
         own = (seen.frame == self._anchor[row]) & (seen.camera == 0)
         anchored = np.bincount(row[own & ~bad], minlength=len(self.points))
