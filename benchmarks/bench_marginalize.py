@@ -5,8 +5,8 @@
 Ten frames of pose, velocity and biases (15 degrees of freedom), landmarks of 3 degrees of freedom with 19 observations each
 under a Huber loss, a preintegration-like residual between neighbouring frames, a prior on the oldest. What leaves is the oldest
 frame and every landmark. Timed is the whole call, by processor time, its linearisation and the changes to the problem included;
-the problem is built anew before each. The dense QR is given the same rows ready: NumPy's, on as many threads as BLAS takes, by
-wall-clock time. It is left out beyond `--dense` landmarks, where it takes seconds and gigabytes.
+the problem is built anew before each. The dense QR, NumPy's, is given the same rows ready and timed alike; its threads count all,
+so that OPENBLAS_NUM_THREADS=1 is fair to it. It is left out beyond `--dense` landmarks, where it takes seconds and gigabytes.
 """
 
 from __future__ import annotations
@@ -94,12 +94,13 @@ def measure(options: argparse.Namespace) -> list[Metric]:
         dense = None
         if count <= options.dense:
             rows = dense_rows(count)
-            began = time.perf_counter()
+            began = time.process_time()
             np.linalg.qr(rows, mode="r")
-            dense = 1e3 * (time.perf_counter() - began)
+            dense = 1e3 * (time.process_time() - began)
         opponent = "" if dense is None else "dense QR"
         title = f"marginalize/{count} landmarks"
-        metrics.append(Metric(title, best[count], "ms", opponent=opponent, opponent_value=dense, tolerance=1.0))
+        gated = dense is not None
+        metrics.append(Metric(title, best[count], "ms", opponent=opponent, opponent_value=dense, tolerance=1.0, gated=gated))
     if 150 in best:
         metrics.append(Metric("marginalize/bar of 150 landmarks", best[150], "ms", bar=BAR_MS, gated=False))
     few, many = min(best), max(best)
@@ -111,7 +112,7 @@ def measure(options: argparse.Namespace) -> list[Metric]:
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--landmarks", type=int, nargs="+", default=[50, 100, 150, 200, 400, 1500])
-    parser.add_argument("--dense", type=int, default=400, help="largest number of landmarks that the dense QR gets")
+    parser.add_argument("--dense", type=int, default=200, help="largest number of landmarks that the dense QR gets")
     parser.add_argument("--rounds", type=int, default=7)
 
 

@@ -81,7 +81,8 @@ class Variables:
         first = self.ids[0]
         table = np.zeros(int(self.ids[-1] - first) + 1, dtype=np.int64)
         table[self.ids - first] = np.arange(len(self.ids))
-        return table.take(ids - first, mode="clip")
+        rows: NDArray[np.int64] = table.take(ids - first, mode="clip")
+        return rows
 
     def extend(self, values: NDArray[np.float64]) -> VariableRows:
         """Append variables, for `Problem.extend`."""
