@@ -212,7 +212,7 @@ class LidarInertialOdometry:
             frame = self._see_motion(frame)
         p_lidar = self._propagate(frame)
         if self._standstill is not None and self._standstill.active:
-            self._standstill.update(frame.imu, self._x, self._cov)
+            self._standstill.update(frame.imu, frame.duration_s, self._x, self._cov)
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
