@@ -31,8 +31,12 @@ class LioConfig(RegistrationConfig):
         3000, ge=100, description="about how many points of a scan the update takes; the voxels grow until it is so"
     )
     max_iterations: int = Field(4, ge=1, le=50, description="most Gauss-Newton steps after the first, per scan")
-    gyro_noise: float = Field(2e-3, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included")
-    accel_noise: float = Field(2e-2, gt=0, description="accelerometer noise [m/s²/√Hz], vibration included")
+    gyro_noise: float | None = Field(
+        None, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included; None is told from its samples, 0.0005 to 0.002"
+    )
+    accel_noise: float | None = Field(
+        None, gt=0, description="accelerometer noise [m/s²/√Hz], likewise; None is told from its samples, 0.005 to 0.02"
+    )
     gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
     accel_bias_walk: float = Field(1e-3, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]")
     max_imu_gap: float = Field(0.15, gt=0, description="longest interval between IMU samples that is integrated over [s]")

@@ -29,6 +29,7 @@ from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.imu_noise import ImuNoise
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
@@ -42,7 +43,7 @@ _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # sha
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
-_NOT_IN_SNAPSHOT = ("config", "map", "_voxel_filter", "_density")
+_NOT_IN_SNAPSHOT = ("config", "map", "_voxel_filter")
 
 
 class LidarInertialOdometry:
@@ -80,8 +81,7 @@ class LidarInertialOdometry:
         self._mounting = UnknownMounting(NavState.identity().pack(), self.config)
         self._gap: str | None = None
         self._time_ns = 0
-        c = self.config
-        self._density = np.array([c.gyro_noise, c.accel_noise, c.gyro_bias_walk, c.accel_bias_walk]) ** 2
+        self._noise = ImuNoise(self.config)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -128,7 +128,7 @@ class LidarInertialOdometry:
         x, cov = self._x.copy(), self._cov.copy()
         newest = max(int(imu.time_ns[-1]), self._time_ns) if len(imu) else self._time_ns
         if newest > self._time_ns:
-            self._carry(x, cov, imu, newest, self._density)
+            self._carry(x, cov, imu, newest, self._noise.density)
         return Prediction(newest, NavState.unpack(x), self._unshown.widened(cov, newest))
 
     def _declared(self) -> NDArray[np.float64] | None:
@@ -246,7 +246,7 @@ class LidarInertialOdometry:
         x, cov = self._x.copy(), self._cov.copy()
         seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
         for _ in range(_BLIND_PASSES):
-            points = self._voxel_filter(self._deskew(frame, self._density)[0])[0][::_BLIND_STRIDE].copy()
+            points = self._voxel_filter(self._deskew(frame, self._noise.density)[0])[0][::_BLIND_STRIDE].copy()
             measurement = PlaneMeasurement(points, self.map, self.config, with_extrinsic=False)
             fits = align(self._x, measurement, self.config, steps=_BLIND_STEPS) is not None
             # Half of it from the scan before: without this damping an error of a pose comes back with the opposite sign.
@@ -262,7 +262,9 @@ class LidarInertialOdometry:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
         self._x_before = self._x.copy()
         self._warnings = self._saturation.update(frame.imu)
-        density = np.maximum(self._density, _SATURATED_DENSITY) if self._warnings else self._density
+        density = self._noise.update(frame.imu)
+        if self._warnings:
+            density = np.maximum(density, _SATURATED_DENSITY)
         p_lidar, nodes = self._deskew(frame, density)
         self._time_ns = frame.scan.end_ns
         self._excitation.add(nodes)

@@ -13,7 +13,8 @@ _MAX_DEVIATIONS = 5.0  # standard deviations of what the IMU's noise sums up to
 _LEAST_SPEED, _LEAST_TURN = 0.015, 0.002  # m/s, rad: smaller changes are no motion
 _MAX_DISPLACEMENT = 0.05  # m
 _LENGTHS = (1, 2, 4, 8, 16)  # scans over which changes of velocity and attitude are summed up
-_LONGEST_MEMORY_S = 10.0  # of the means at rest, which follow the biases
+_LONGEST_MEMORY_S = 5.0  # of the means at rest, which follow the biases
+_BIAS_WALK = np.repeat([1e-4, 2e-3], 3)  # of cheap sensors [rad/s²/√Hz, m/s³/√Hz]: how far they are behind
 
 
 class Standstill:
@@ -57,10 +58,11 @@ class Standstill:
         delta = np.zeros(TANGENT)
         delta[:] = -gain @ x[V : V + 3]
         boxplus_into(x, delta, x)
-        # Joseph's form stays positive definite.
+        # Joseph's form stays positive definite; the products round one triangle otherwise than the other.
         reduce = np.eye(TANGENT)
         reduce[:, T_V : T_V + 3] -= gain
-        cov[:] = reduce @ cov @ reduce.T + _ZERO_VELOCITY_SIGMA**2 * gain @ gain.T
+        reduced = reduce @ cov @ reduce.T + _ZERO_VELOCITY_SIGMA**2 * gain @ gain.T
+        cov[:] = 0.5 * (reduced + reduced.T)
 
     def _sets_off(self, imu: ImuSamples, seconds: float) -> bool:
         """Whether the turns and changes of velocity of the last scans are more than noise, over any of the lengths."""
@@ -71,8 +73,9 @@ class Standstill:
         for count, (duration, mean) in enumerate(reversed(self._recent), start=1):
             total += duration
             summed += duration * (mean - self._mean)
-            # The noise of these scans, and that of the means at rest, which counts over all of them.
-            noise = self._density * np.sqrt(total + total**2 / self._memory_s)
+            # The noise of these scans, that of the means at rest, which counts over all of them, and of the biases since.
+            white = self._density**2 * (total + total**2 / self._memory_s)
+            noise = np.sqrt(white + _BIAS_WALK**2 * (total + self._memory_s / 2.0) * total**2)
             if count in _LENGTHS and np.any(np.abs(summed) > np.maximum(_MAX_DEVIATIONS * noise, least)):
                 return True
         if len(self._recent) > _LENGTHS[-1]:

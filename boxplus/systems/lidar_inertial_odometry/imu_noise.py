@@ -1,0 +1,54 @@
+"""How noisy the IMU is as it is mounted and moved, told from its samples: what vibrates differs from sample to sample."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+# Densities of gyroscope [rad/s/√Hz] and accelerometer [m/s²/√Hz]: of one that a motor or a gait shakes, and of one that moves
+# smoothly, which is believed more, though its scale, its axes and its clock are never exact.
+_SHAKEN = np.array([2e-3, 2e-2])
+_SMOOTH = np.array([5e-4, 5e-3])
+_MARGIN = 5.0  # the filter's density over that of the samples: what they do not show, and what has been filtered out of them
+_MEMORY_S = 1.0
+_FEWEST_SAMPLES = 5
+# White noise of variance σ² makes second differences of variance (1 + 4 + 1) σ²; a smooth motion, almost none.
+_SECOND_DIFFERENCE = 6.0
+
+
+class ImuNoise:
+    """Follows the densities of gyroscope and accelerometer from scan to scan; settings that are given stay as they are.
+
+    Args:
+        config: its noises and walks of biases.
+    """
+
+    def __init__(self, config: LioConfig) -> None:
+        given = (config.gyro_noise, config.accel_noise)
+        self._most = np.array([most if value is None else value for most, value in zip(_SHAKEN, given, strict=True)])
+        self._least = np.array([least if value is None else value for least, value in zip(_SMOOTH, given, strict=True)])
+        self._walks = np.array([config.gyro_bias_walk, config.accel_bias_walk])
+        self._seen: NDArray[np.float64] | None = None
+
+    def update(self, imu: ImuSamples) -> NDArray[np.float64]:
+        """Look at the samples of a scan; returns the squared densities (4,) to carry the state over it with."""
+        if len(imu) < _FEWEST_SAMPLES:
+            self._seen = None
+        else:
+            steps = np.diff(imu.time_ns) * 1e-9
+            jumps = [np.diff(values, n=2, axis=0) for values in (imu.gyro, imu.accel)]
+            now = np.array([np.mean(jump**2) for jump in jumps]) / _SECOND_DIFFERENCE * np.median(steps)
+            before = now if self._seen is None else self._seen
+            # What begins to shake is believed at once, what seems to have ended only after a while.
+            self._seen = np.maximum(now, before + min(float(steps.sum()) / _MEMORY_S, 1.0) * (now - before))
+        return self.density
+
+    @property
+    def density(self) -> NDArray[np.float64]:
+        """(4,) squared, as of the last scan: gyroscope, accelerometer, walks of their biases; the most where nothing is known."""
+        noise = self._most if self._seen is None else np.clip(_MARGIN * np.sqrt(self._seen), self._least, self._most)
+        density: NDArray[np.float64] = np.concatenate([noise, self._walks]) ** 2
+        return density
