@@ -16,12 +16,12 @@ FRAME_COLUMNS = Columns(
         *xyz("velocity", "bias_gyro", "bias_accel", "sigma_velocity", "sigma_bias_gyro", "sigma_bias_accel"),
         *("tracked", "new", "landmarks", "is_keyframe", "time_offset_s", "total_ms"),
     ),
-    texts=("rejected", "timing_ms", "weak_directions", "reasons"),
+    texts=("rejected", "timing_ms", "reasons"),
     statuses=get_args(Status),
     program="boxplus vio",
 )
 """Columns of `frames.csv`. SI units (m, s, rad) but for milliseconds where the name says so; `rejected` and `timing_ms` hold
-`name=value` pairs, `weak_directions` and `reasons` sentences, all separated by `; `."""
+`name=value` pairs, `reasons` sentences, all separated by `; `."""
 
 
 class FrameLogWriter(RowLogWriter):
@@ -59,7 +59,6 @@ class FrameLogWriter(RowLogWriter):
             [
                 "; ".join(f"{reason}={count}" for reason, count in estimate.rejected.items()),
                 "; ".join(f"{stage}={1e3 * seconds:.4f}" for stage, seconds in timing_s.items()),
-                "; ".join(estimate.weak_directions),
                 "; ".join(estimate.reasons),
             ],
         )

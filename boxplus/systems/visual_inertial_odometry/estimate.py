@@ -31,7 +31,6 @@ class VioEstimate:
         new: corners found in this frame.
         rejected: corners and observations that were not used, by reason.
         is_keyframe: whether the frame became a keyframe.
-        weak_directions: directions of the motion that this frame does not determine, a sentence each.
         landmark_ids: (m,) int64 of the landmarks in the window; a landmark's last position is its best.
         landmarks: (m, 3) their positions in the world [m].
         landmark_sigmas: (m,) standard deviation of the distance from the camera that found them [m].
@@ -52,7 +51,6 @@ class VioEstimate:
     new: int
     rejected: Mapping[str, int]
     is_keyframe: bool
-    weak_directions: tuple[str, ...]
     landmark_ids: NDArray[np.int64]
     landmarks: NDArray[np.float64]
     landmark_sigmas: NDArray[np.float64]

@@ -166,10 +166,14 @@ class VisualInertialOdometry:
         self._tracker.forget(fit.given_up)
         estimate = self._estimate(tracks, is_keyframe, fit, rests)
         self.window.shrink()
-        oldest = int(np.searchsorted(self._imu.time_ns, self.window.frames[0].time_ns + self.window.cut_ns - 2 * SPARE_NS)) - 2
+        self._forget_imu(self.window.frames[0].time_ns)
+        return estimate
+
+    def _forget_imu(self, oldest_ns: int) -> None:
+        """Samples from before the oldest frame that is still needed are not; some are kept for an offset of the clocks."""
+        oldest = int(np.searchsorted(self._imu.time_ns, oldest_ns + self.window.cut_ns - 2 * SPARE_NS)) - 2
         if oldest > 0:
             self._imu = ImuSamples(self._imu.time_ns[oldest:], self._imu.gyro[oldest:], self._imu.accel[oldest:])
-        return estimate
 
     def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         turn = np.eye(3)
@@ -182,6 +186,7 @@ class VisualInertialOdometry:
         self._waiting.append(tracks)
         while time_ns - self._waiting[0].time_ns > _LONGEST_START * self.config.start_duration * 1e9:
             self._waiting.popleft()
+        self._forget_imu(self._waiting[0].time_ns)
         seen = list(self._waiting)
         if time_ns < self._next_try_ns:
             return self._nothing(tracks, self.start_problem or "the next frames are waited for")
@@ -214,7 +219,6 @@ class VisualInertialOdometry:
             new=int(tracks.is_new.sum()),
             rejected=tracks.rejected,
             is_keyframe=False,
-            weak_directions=(),
             landmark_ids=np.zeros(0, np.int64),
             landmarks=np.zeros((0, 3)),
             landmark_sigmas=np.zeros(0),
@@ -241,7 +245,6 @@ class VisualInertialOdometry:
             new=int(tracks.is_new.sum()),
             rejected={**tracks.rejected, "does not fit the window": fit.not_agreed},
             is_keyframe=is_keyframe,
-            weak_directions=(),
             landmark_ids=ids,
             landmarks=landmarks,
             landmark_sigmas=sigmas,

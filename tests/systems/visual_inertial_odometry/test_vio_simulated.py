@@ -176,3 +176,18 @@ def test_what_cannot_be_used_is_refused_or_counted() -> None:
         flight.time_ns[[0, 2, 1, 3]], flight.gyro[:4], np.array([[0, 0, 9.8], [np.nan, 0, 9.8], [0, 0, 9.8], [0, 0, 9.8]])
     )
     assert vio.counters == {"IMU samples not finite or out of order": 2}
+
+
+def test_what_waits_for_a_start_is_bounded_and_no_older_sample_is_weighed() -> None:
+    flight, one = Flight(4, 9.0), rig(1)
+    vio = VisualInertialOdometry(VioConfig(pixel_sigma=PIXEL_SIGMA, start_duration=0.5), one)
+    blank = np.full((one.cameras[0].height, one.cameras[0].width), 90, np.uint8)
+    kept = []
+    for k in range(0, len(flight.time_ns), 40):  # nothing to see: it never starts
+        vio.push_imu(flight.time_ns[k : k + 40], flight.gyro[k : k + 40], flight.accel[k : k + 40])
+        estimates = vio.push_image(CameraImage(0, "cam0", int(flight.time_ns[k]), blank))
+        assert all(e.status == "starting" for e in estimates)
+        kept.append(len(vio._imu))
+    rate_hz = 1e9 / np.diff(flight.time_ns).mean()
+    assert vio.start is None and len(flight.time_ns) > 6.0 * rate_hz
+    assert max(kept) < 3.0 * rate_hz  # four times the half second that a start takes, and what is spare
