@@ -29,8 +29,8 @@ from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
-from boxplus.systems.lidar_inertial_odometry.imu_noise import ImuNoise
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
+from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
@@ -81,7 +81,7 @@ class LidarInertialOdometry:
         self._mounting = UnknownMounting(NavState.identity().pack(), self.config)
         self._gap: str | None = None
         self._time_ns = 0
-        self._noise = ImuNoise(self.config)
+        self._noise = ObservedNoise(self.config)
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -27,6 +27,7 @@ from boxplus.manifolds import quaternion, so3, sphere
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_noise import sample_noise
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.gyro_bias import estimate_gyro_bias, stereo_points
@@ -142,14 +143,8 @@ def imu_noise(rig: Rig, config: VioConfig) -> ImuNoise:
 
 
 def shaken(noise: ImuNoise, imu: ImuSamples) -> ImuNoise:
-    """The noise stated, or what the samples show from one to the next where that is more: motors shake an IMU.
-
-    Of white noise of deviation σ, second differences have √6 σ; a body in motion hardly has any at the rate of an IMU.
-    """
-    step = float(np.median(np.diff(imu.time_ns))) * 1e-9
-    gyro, accel = (
-        float(np.sqrt((np.diff(values, n=2, axis=0) ** 2).mean(axis=0).max() / 6.0 * step)) for values in (imu.gyro, imu.accel)
-    )
+    """The noise stated, or what the samples show from one to the next where that is more: motors shake an IMU."""
+    gyro, accel = sample_noise(imu).max(axis=1).tolist()
     return replace(noise, gyro=max(noise.gyro, gyro), accel=max(noise.accel, accel))
 
 

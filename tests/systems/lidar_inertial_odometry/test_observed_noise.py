@@ -7,7 +7,7 @@ import pytest
 
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.imu_noise import ImuNoise
+from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 
 
 def _scan(begin_s: float, rate_hz: float, gyro: float, accel: float, rng: np.random.Generator, motion: float = 1.0) -> ImuSamples:
@@ -18,8 +18,8 @@ def _scan(begin_s: float, rate_hz: float, gyro: float, accel: float, rng: np.ran
     return ImuSamples(np.round(time * 1e9).astype(np.int64), 0.5 * swing + gyro * noise[0], 9.8 + swing + accel * noise[1])
 
 
-def _after(scans: int, config: LioConfig, rate_hz: float, gyro: float, accel: float, seed: int = 0) -> ImuNoise:
-    rng, noise = np.random.default_rng(seed), ImuNoise(config)
+def _after(scans: int, config: LioConfig, rate_hz: float, gyro: float, accel: float, seed: int = 0) -> ObservedNoise:
+    rng, noise = np.random.default_rng(seed), ObservedNoise(config)
     for k in range(scans):
         noise.update(_scan(0.1 * k, rate_hz, gyro, accel, rng))
     return noise

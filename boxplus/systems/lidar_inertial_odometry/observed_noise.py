@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_noise import sample_noise
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 # Densities of gyroscope [rad/s/√Hz] and accelerometer [m/s²/√Hz]: of one that a motor or a gait shakes, and of one that moves
@@ -15,11 +16,9 @@ _SMOOTH = np.array([5e-4, 5e-3])
 _MARGIN = 5.0  # the filter's density over that of the samples: what they do not show, and what has been filtered out of them
 _MEMORY_S = 1.0
 _FEWEST_SAMPLES = 5
-# White noise of variance σ² makes second differences of variance (1 + 4 + 1) σ²; a smooth motion, almost none.
-_SECOND_DIFFERENCE = 6.0
 
 
-class ImuNoise:
+class ObservedNoise:
     """Follows the densities of gyroscope and accelerometer from scan to scan; settings that are given stay as they are.
 
     Args:
@@ -38,12 +37,11 @@ class ImuNoise:
         if len(imu) < _FEWEST_SAMPLES:
             self._seen = None
         else:
-            steps = np.diff(imu.time_ns) * 1e-9
-            jumps = [np.diff(values, n=2, axis=0) for values in (imu.gyro, imu.accel)]
-            now = np.array([np.mean(jump**2) for jump in jumps]) / _SECOND_DIFFERENCE * np.median(steps)
+            now = (sample_noise(imu) ** 2).mean(axis=1)
+            seconds = float(imu.time_ns[-1] - imu.time_ns[0]) * 1e-9
             before = now if self._seen is None else self._seen
             # What begins to shake is believed at once, what seems to have ended only after a while.
-            self._seen = np.maximum(now, before + min(float(steps.sum()) / _MEMORY_S, 1.0) * (now - before))
+            self._seen = np.maximum(now, before + min(seconds / _MEMORY_S, 1.0) * (now - before))
         return self.density
 
     @property
