@@ -33,7 +33,7 @@ from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth_of_two
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
-from boxplus.systems.direct_odometry.estimate import Estimate, Status
+from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.image_motion import image_motion
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
@@ -94,8 +94,6 @@ class DirectOdometry:
         self.config = config or DirectOdometryConfig()
         self.stereo = stereo
         self.window = Window(self.camera, self.config.window)
-        self.keyframes = 0
-        """Keyframes so far."""
         self.gaps = 0
         """How often the view was lost for so long that the poses since are a guess."""
         self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
@@ -107,6 +105,11 @@ class DirectOdometry:
         self._seen_ns: int | None = None
         self._watch, self._calibration, self._registration = Watch(self.config), CalibrationWatch(), RegistrationWatch()
         self._start: TwoViewStart | None = None
+
+    @property
+    def keyframes(self) -> int:
+        """Keyframes so far."""
+        return self.window.taken
 
     @property
     def contradiction(self) -> str:
@@ -186,10 +189,10 @@ class DirectOdometry:
             return self._begin(time_ns, image, depth_of, watch)
         elapsed_s = (time_ns - (self._time_ns or time_ns)) * 1e-9
         self._time_ns = time_ns
-        keyframe, alignment, verdict = self._track(image, self._predicted(elapsed_s))
+        keyframe, alignment, verdict = tracked = self._track(image, self._predicted(elapsed_s))
         watch.lap("tracking")
         if verdict.status == "lost":
-            return self._lost(time_ns, image, depth_of, keyframe, alignment, verdict, watch)
+            return self._lost(time_ns, image, depth_of, tracked, watch)
         T_camera_keyframe = alignment.T_21
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
@@ -228,7 +231,7 @@ class DirectOdometry:
     def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
         """Where a sensor measures little, with depths by the motion."""
         missing = sensed.z == 0.0
-        if missing.mean() < _SCARCE or not self.window.keyframes:
+        if missing.mean() < _SCARCE or self._reference is None:  # without one, nothing says where the window is from here
             return sensed
         return sensed.filled(depth_from(self.window.keyframes, image, self.camera, T_world_camera, log_gain, missing))
 
@@ -246,15 +249,18 @@ class DirectOdometry:
         if verdict.status == "lost":
             start.problem = f"grey values do not confirm how corners moved: {'; '.join(verdict.reasons)}"
             return None
+        self._resume(first_ns)
         self.window.begin(first, self._covariance)
+        Ad = se3.adjoint(alignment.T_21)
+        covariance = Ad @ self._covariance @ Ad.T + alignment.covariance
         T = se3.compose(self._T, se3.inverse(alignment.T_21))
         depth = depth_from(self.window.keyframes, views.second, self.camera, T, -alignment.brightness[0])
         second = self._keyframe(time_ns, views.second, depth, T, -alignment.brightness[0])
         self._time_ns = self._seen_ns = time_ns
-        self._T, self._covariance, self._reference, self._velocity_s = T, alignment.covariance, first, 0.0
+        self._T, self._covariance, self._reference, self._velocity_s = T, covariance, first, 0.0
         self._log_gain, self._offset = -alignment.brightness[0], alignment.brightness[1]
         if second is not None:
-            self.window.add(second, alignment.covariance, holds_scale=True)
+            self.window.add(second, covariance, holds_scale=True)
             if self.config.adjustments:
                 self.window.adjust(2 * self.config.adjustments)
             self._T, self._covariance = second.T_world_camera, self.window.covariance(second)
@@ -268,17 +274,17 @@ class DirectOdometry:
         """The first frame, or the first after the view was lost for good."""
         keyframe = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0)
         self._time_ns = time_ns
-        reasons = list(self._watch.past_reasons)
-        status: Status = "weak" if reasons else "ok"
         if keyframe is None:
-            status, reasons = "lost", ["fewer than 100 pixels have a gradient and a depth: there is nothing to track"]
+            verdict = Verdict("lost", ("fewer than 100 pixels have a gradient and a depth: there is nothing to track",), np.nan)
         else:
+            self._resume(time_ns)
+            verdict = Verdict("weak" if self._watch.past_reasons else "ok", tuple(self._watch.past_reasons), np.nan)
             self.window.begin(keyframe, self._covariance)
             self._reference, self._seen_ns = keyframe, time_ns
             self._velocity_s = self._log_gain = self._offset = 0.0
         watch.lap("keyframe")
         number = -1 if keyframe is None else keyframe.number
-        return self._estimate(time_ns, number, keyframe is not None, None, Verdict(status, tuple(reasons), np.nan), watch)
+        return self._estimate(time_ns, number, keyframe is not None, None, verdict, watch)
 
     def _predicted(self, elapsed_s: float) -> Matrix:
         """Where the camera is if its motion goes on."""
@@ -338,8 +344,7 @@ class DirectOdometry:
         except InputError:
             return None
         patches = choose_patches(image.grey, depth, self.camera, self.config.patches)
-        self.keyframes += 1
-        return WindowKeyframe(self.keyframes - 1, time_ns, image.grey, T, log_gain, tracker, patches)
+        return WindowKeyframe(self.window.taken, time_ns, image.grey, T, log_gain, tracker, patches)
 
     def _unseen_s(self, time_ns: int) -> float:
         """Time since the last frame with a pose [s]."""
@@ -352,28 +357,22 @@ class DirectOdometry:
         covariance: Matrix = self._covariance + np.diag([turned**2] * 3 + [moved**2] * 3)
         return covariance
 
-    def _lost(
-        self,
-        time_ns: int,
-        image: Image,
-        depth_of: DepthOf,
-        keyframe: WindowKeyframe,
-        alignment: Alignment,
-        verdict: Verdict,
-        watch: Stopwatch,
-    ) -> Estimate:
+    def _resume(self, time_ns: int) -> None:
+        """The first view since the last pose that can be followed: its pose is the last one, with all that may have happened."""
+        if self._seen_ns is not None:
+            self._covariance = self._unseen_covariance(time_ns)
+            self._watch.begin_anew(self._unseen_s(time_ns))
+
+    def _lost(self, time_ns: int, image: Image, depth_of: DepthOf, tracked: Tracked, watch: Stopwatch) -> Estimate:
         """No pose: the last one stays; after a while, begin anew from it."""
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
-        gone_s = self._unseen_s(time_ns)
-        if gone_s > self.config.lost_s:
+        if self._unseen_s(time_ns) > self.config.lost_s:
             self.gaps += 1
-            self._watch.begin_anew(gone_s)
-            self._covariance = self._unseen_covariance(time_ns)
             self._reference = None
             if self._start is None:
                 return self._begin(time_ns, image, depth_of, watch)
             self._start = TwoViewStart(self.camera)
-        return self._estimate(time_ns, keyframe.number, False, alignment, verdict, watch)
+        return self._estimate(time_ns, tracked.keyframe.number, False, tracked.alignment, tracked.verdict, watch)
 
     def _estimate(
         self, time_ns: int, keyframe: int, is_keyframe: bool, alignment: Alignment | None, verdict: Verdict, watch: Stopwatch

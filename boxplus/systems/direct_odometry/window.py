@@ -70,12 +70,14 @@ class Window:
 
     Attributes:
         keyframes: oldest first.
+        taken: how many keyframes there were so far.
         H_prior, g_prior: (7n, 7n), (7n,) of what left, at the first estimates.
     """
 
     def __init__(self, camera: Pinhole, size: int) -> None:
         self.camera, self.size = camera, size
         self.keyframes: list[WindowKeyframe] = []
+        self.taken = 0
         self.sigma, self.spread = 0.0, _FIRST_SPREAD
         self.H_prior: Matrix = np.zeros((0, 0))
         self.g_prior: Matrix = np.zeros(0)
@@ -102,6 +104,7 @@ class Window:
         keyframe.freeze()
         self._finished += [each.points() for each in self.keyframes]
         self.keyframes = [keyframe]
+        self.taken += 1
         self._covariance = np.zeros((DOF, DOF))
         self._covariance[:6, :6], self._covariance[6, 6] = covariance, _SIGMA_GAIN**2
         self.H_prior = np.asarray(np.linalg.inv(self._covariance), dtype=np.float64)
@@ -117,15 +120,18 @@ class Window:
         if len(self.keyframes) >= self.size:
             self._marginalize(self._leaving(keyframe))
         self.keyframes.append(keyframe)
+        self.taken += 1
         size = DOF * len(self.keyframes)
         H, g, C = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
         H[:-DOF, :-DOF], g[:-DOF], C[:-DOF, :-DOF] = self.H_prior, self.g_prior, self._covariance
         H[-1, -1] = _ANY_GAIN**-2.0
         if holds_scale:
             keyframe.freeze()
-            way = keyframe.T_world_camera[4:] - self.keyframes[-2].T_world_camera[4:]
-            along = quaternion.to_matrix(keyframe.T_world_camera[:4]).T @ way  # of |way|, as a share is held
-            H[-4:-1, -4:-1] += np.outer(along, along) / (_SIGMA_SCALE * float(way @ way)) ** 2
+            way, row = keyframe.T_world_camera[4:] - self.keyframes[-2].T_world_camera[4:], np.zeros(size)
+            for index, sign in ((-2, -1.0), (-1, 1.0)):  # of the distance alone: where both are is another matter
+                first = size + index * DOF
+                row[first + 3 : first + 6] = sign * quaternion.to_matrix(self.keyframes[index].T_world_camera[:4]).T @ way
+            H += np.outer(row, row) / (_SIGMA_SCALE * float(way @ way)) ** 2
         C[-DOF:-1, -DOF:-1], C[-1, -1] = covariance, _ANY_GAIN**2.0
         self.H_prior, self.g_prior, self._covariance = H, g, C
 

@@ -109,6 +109,43 @@ def test_a_view_that_never_comes_back_begins_anew_and_says_so(drives: list[Drive
     assert np.sqrt(estimates[-1].pose_covariance[3, 3]) > 0.2
 
 
+def test_the_longer_no_keyframe_is_found_the_less_is_known_of_the_pose(drives: list[Drive]) -> None:
+    """Without depth nothing can begin: the loss ends where a frame has depth again, not where it was given up."""
+    seen = drives[3]
+    odometry = DirectOdometry(CAMERA, DirectOdometryConfig(lost_s=0.2))
+    times = [k * 100_000_000 for k in range(40)]
+    estimates = []
+    for k, time_ns in enumerate(times):
+        blind = 5 <= k < 35
+        grey = np.full(SHAPE, 20.0) if blind else seen.grey[k % 5]
+        estimates.append(odometry.push_rgbd(time_ns, grey, np.zeros(SHAPE) if blind else seen.depth[k % 5]))
+    assert [e.status for e in estimates] == ["ok"] * 5 + ["lost"] * 30 + ["weak"] * 5
+    metres = np.array([np.sqrt(e.pose_covariance[3, 3]) for e in estimates[5:]])
+    np.testing.assert_allclose(metres[:31], 0.1 * np.arange(1, 32), rtol=1e-3)  # at 1 m/s, and without a step at the return
+    assert np.all(metres[31:] > 3.0)
+    assert "for 3.1 s no pose" in estimates[-1].reasons[0]
+    assert odometry.gaps == 1
+    assert odometry.keyframes == sum(e.is_keyframe for e in estimates)
+
+
+def test_a_keyframe_after_a_gap_has_depths_of_the_sensor_alone(drives: list[Drive]) -> None:
+    """Where the old keyframes are from here is a guess, and depths by it would be too."""
+    seen = drives[3]
+    odometry = DirectOdometry(CAMERA, DirectOdometryConfig(lost_s=0.2))
+    for k in range(6):
+        odometry.push_rgbd(seen.time_ns[k], seen.grey[k], seen.depth[k])
+    half = seen.depth[8].copy()
+    half[:, 80:] = 0.0
+    dark = seen.time_ns[5] + 300_000_000
+    assert odometry.push_rgbd(dark, np.full(SHAPE, 20.0), np.zeros(SHAPE)).status == "lost"
+    assert odometry.gaps == 1
+    assert odometry.push_rgbd(dark + 33_000_000, seen.grey[8], half).is_keyframe
+    newest = odometry.window.keyframes[-1]
+    assert len(newest.patches) > 50
+    assert newest.patches.pixels[:, 0].max() < 80
+    assert all(level.pixels[:, 0].max() * 2**level.octave < 80 for level in newest.tracker.levels)
+
+
 def test_a_wall_without_texture_gives_no_pose() -> None:
     seen = drive(30, 8, texture=0.5, noise=1.0)
     _, estimates = run(seen)

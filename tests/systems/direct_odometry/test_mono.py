@@ -11,6 +11,8 @@ from boxplus.evaluation.alignment import align
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
 from boxplus.simulation.cameras import make_rig, simulate_cameras
+from boxplus.systems.direct_odometry import direct_odometry
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
@@ -127,6 +129,28 @@ def test_after_a_view_that_was_lost_for_good_nothing_is_trusted() -> None:
     assert any("no two views tell depths again" in reason for e in estimates[25:60] if e is not None for reason in e.reasons)
     again = [e for e in estimates[60:] if e is not None]
     assert {e.status for e in again} <= {"lost", "weak"}
+
+
+@pytest.mark.parametrize("adjustments", [0, 5])
+def test_a_new_start_knows_its_pose_no_better_than_the_loss_allows(adjustments: int) -> None:
+    """35 frames of 1/30 s without light, at 1 m/s and 1 rad/s; both keyframes rest on the first."""
+    greys = images(Room(7), sideways(7, 75), 7)
+    greys[25:60] = [np.full(SHAPE, 20.0)] * 35
+    odometry = DirectOdometry(CAMERA, DirectOdometryConfig(adjustments=adjustments))
+    estimates = [odometry.push_mono(round(k * 1e9 / 30.0), grey) for k, grey in enumerate(greys)]
+    weak = [e for e in estimates[60:] if e is not None and e.status == "weak"]
+    assert weak and "for 1.2 s no pose" in weak[0].reasons[0]
+    for estimate in weak:
+        assert np.sqrt(np.linalg.eigvalsh(estimate.pose_covariance[3:, 3:])[0]) > 1.1
+    assert odometry.gaps == 1
+
+
+def test_views_that_are_rejected_are_no_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(direct_odometry, "_LEAST_FOUND", 10.0)
+    odometry, estimates = run(images(Room(7), sideways(7, 18), 7))
+    assert "patches are found where corners say" in odometry.start_problem
+    assert estimates == [None] * 18
+    assert odometry.keyframes == 0
 
 
 def test_little_depth_of_a_sensor_is_filled_by_the_motion() -> None:
