@@ -271,12 +271,17 @@ def _imu(summary: CalibrationSummary) -> str:
         ("bias of the gyroscope", f"({_numbers_of(imu.bias_gyro, 5)}) rad/s"),
         ("bias of the accelerometer", f"({_numbers_of(imu.bias_accel, 4)}) m/s²"),
         ("free fall in the target's frame", f"({_numbers_of(imu.gravity_target, 4)})"),
-        ("size of the target by the IMU", f"{imu.target_scale:.4f} ± {imu.target_scale_sigma:.4f} of the stated one"),
+        (
+            "size of the target by the IMU",
+            "not measured"
+            if imu.target_scale is None
+            else f"{imu.target_scale:.4f} ± {imu.target_scale_sigma:.4f} of the stated one",
+        ),
         (
             "mean squares of whitened residuals",
             f"{imu.corner_chi2:.2f} of the corners, {imu.imu_chi2:.2f} of the IMU (about 1, or less)",
         ),
-        ("frames", f"{imu.frames}"),
+        ("frames", f"{imu.frames}, from {imu.used_s[0]:.1f} to {imu.used_s[1]:.1f} s of {imu.session_s:.1f} s of images"),
     ]
     what = "<p>T_cam_imu of cam0, which maps IMU coordinates to the camera's:</p>"
     return f"<section><h2>IMU</h2>{what}<pre>{T}</pre>{html_table(rows)}</section>"

@@ -57,9 +57,11 @@ class ImuFacts(_Part):
     bias_gyro: list[float]
     bias_accel: list[float]
     gravity_target: list[float] = Field(description="direction of free fall in the target's frame")
-    target_scale: float = Field(description="size of the target as the IMU measures it, by the stated one")
-    target_scale_sigma: float
+    target_scale: float | None = Field(description="size of the target as the IMU measures it, by the stated one; null: none")
+    target_scale_sigma: float | None
     frames: int
+    used_s: tuple[float, float] = Field(description="first and last of these frames, after the first image that could be used")
+    session_s: float = Field(description="until the last image that could be used")
     imu_chi2: float
     corner_chi2: float
 
@@ -179,9 +181,11 @@ def imu_facts(found: CameraCalibration) -> ImuFacts | None:
         bias_gyro=imu.bias_gyro.tolist(),
         bias_accel=imu.bias_accel.tolist(),
         gravity_target=imu.gravity_target.tolist(),
-        target_scale=imu.scale,
-        target_scale_sigma=imu.scale_sigma,
+        target_scale=imu.scale if math.isfinite(imu.scale) else None,
+        target_scale_sigma=imu.scale_sigma if math.isfinite(imu.scale_sigma) else None,
         frames=imu.frames,
+        used_s=imu.used_s,
+        session_s=imu.session_s,
         imu_chi2=imu.imu_chi2,
         corner_chi2=imu.corner_chi2,
     )

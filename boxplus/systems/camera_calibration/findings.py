@@ -30,7 +30,9 @@ _TARGET_SHARE, _TARGET_SHIFT = 0.3, 0.01
 _LEFT_OUT = 0.05
 _IMU_DEG, _IMU_M, _IMU_S = 0.3, 0.01, 2e-3
 _SCALE, _SIGMAS = 0.005, 4.0
+_SCALE_OPEN = 0.05
 _CHI2 = 2.0
+_MOST_OF_SESSION = 0.95
 _TWIN_CHI2 = 25.0
 
 
@@ -267,7 +269,20 @@ def _inertial(found: CameraCalibration) -> list[Finding]:
             f"{imu.imu_chi2:.1f} times what their noise allows; check units and noise of the IMU, its clock, the target's size"
         )
         result.append(Finding("imu_contradicts", "doubt", text))
-    if abs(imu.scale - 1.0) > max(_SIGMAS * imu.scale_sigma, _SCALE):
+    if imu.used_s[1] - imu.used_s[0] < _MOST_OF_SESSION * imu.session_s:
+        text = (
+            f"cameras and IMU are compared from {imu.used_s[0]:.0f} to {imu.used_s[1]:.0f} s of {imu.session_s:.0f} s of images: "
+            f"{imu.frames} frames are the most that are used; nothing is known of the rest"
+        )
+        result.append(Finding("imu_part", "remark", text))
+    if not imu.scale_sigma <= _SCALE_OPEN:
+        how_far = f"± {imu.scale_sigma:.0%}" if math.isfinite(imu.scale) else "no size near the stated one fits best"
+        text = (
+            f"the IMU does not say how large the target is ({how_far}), and cameras alone cannot: measure the target, and shake "
+            "faster, with the target in view all the time"
+        )
+        result.append(Finding("size_open", "remark" if math.isfinite(imu.scale) else "doubt", text))
+    elif abs(imu.scale - 1.0) > max(_SIGMAS * imu.scale_sigma, _SCALE):
         size = imu.scale * found.target.tag_size
         text = (
             f"the IMU measures the target as {imu.scale:.4f} ± {imu.scale_sigma:.4f} of its stated size: a tag would have "

@@ -40,6 +40,7 @@ from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.camera_calibration.adjustment import OUTLIER_SIGMAS
 from boxplus.systems.camera_calibration.corners import TargetCorners
 from boxplus.systems.camera_calibration.start import target_pose
 
@@ -49,6 +50,8 @@ GRAVITY = 9.81
 _LARGEST_OFFSET_S, _OFFSET_STEP_S = 0.5, 0.002
 _LONGEST_GAP_S = 0.6
 _FEWEST_FRAMES, _MOST_FRAMES, _MOST_CORNERS = 20, 400, 36
+_NEARLY_ALL = 0.95
+"""Of the frames at a spacing; rather than thinning more for the last few, these are left out."""
 _LEAST_TURN = math.radians(3.0)
 _MARGIN_S = 0.03
 _ROUNDS = 3
@@ -66,8 +69,11 @@ class CameraImuCalibration:
         gravity_target: (3,) direction of free fall in the target's frame.
         bias_gyro, bias_accel: (3,) medians over the session [rad/s], [m/s²].
         covariance: (7, 7) of the tangent [θ, p] of T_imu_camera [rad, m] and of the offset [s].
-        scale, scale_sigma: size of the target as the IMU measures it, as a share of what was stated.
+        scale, scale_sigma: size of the target as the IMU measures it, as a share of what was stated; NaN and infinite where it
+            measures none.
         frames: used.
+        used_s: (first, last) of them [s] after the first image that could be used.
+        session_s: until the last image that could be used [s]; `used_s` ends before where more than 400 frames would be needed.
         imu_chi2: mean square of the whitened IMU residuals: about 1 or less where its noise is as stated.
         corner_chi2: that of the corners, by the standard deviation that the cameras alone have.
     """
@@ -81,19 +87,22 @@ class CameraImuCalibration:
     scale: float
     scale_sigma: float
     frames: int
+    used_s: tuple[float, float]
+    session_s: float
     imu_chi2: float
     corner_chi2: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Session:
-    """The frames used, oldest first: their times, T_target_camera, and the corners seen in them."""
+    """The frames used, oldest first: their times, T_target_camera, and the corners seen in them; times of all that could be."""
 
     time_ns: NDArray[np.int64]
     T_target_camera: Floats
     frame_of: NDArray[np.intp]
     places: Floats
     pixels: Floats
+    span_ns: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +149,8 @@ def calibrate_imu(
         scale=scale,
         scale_sigma=scale_sigma,
         frames=len(session.time_ns),
+        used_s=(1e-9 * int(session.time_ns[0] - session.span_ns[0]), 1e-9 * int(session.time_ns[-1] - session.span_ns[0])),
+        session_s=1e-9 * (session.span_ns[1] - session.span_ns[0]),
         imu_chi2=2.0 * costs[1] / (15 * links),
         corner_chi2=2.0 * costs[0] / (2 * len(session.pixels)),
     )
@@ -164,7 +175,8 @@ def _session(corners: TargetCorners, places: Floats, model: CameraModel, imu: Im
             f"samples from {imu.time_ns[0]} to {imu.time_ns[-1]} ns",
             "check that both are of one recording and one clock",
         )
-    frames = frames[:: -(-len(frames) // _MOST_FRAMES)]
+    usable_ns = corners.time_ns[frames]
+    frames = frames[_thinned(usable_ns)]
     kept: list[int] = []
     poses, of, at, pixels = [], [], [], []
     for frame in frames:
@@ -178,9 +190,47 @@ def _session(corners: TargetCorners, places: Floats, model: CameraModel, imu: Im
         poses.append(se3.inverse(T))
         at.append(places[corners.corner_of[rows]])
         pixels.append(corners.pixels[rows])
+    if len(kept) < _FEWEST_FRAMES:
+        raise InputError(
+            f"at least {_FEWEST_FRAMES} images in which the corners give the pose of the target",
+            f"{len(kept)} of {len(frames)}",
+            "check the target, the numbering of its corners and the resolution",
+        )
     return _Session(
-        corners.time_ns[np.array(kept)], np.array(poses), np.concatenate(of), np.concatenate(at), np.concatenate(pixels)
-    )
+        corners.time_ns[np.array(kept)], np.array(poses), np.concatenate(of), np.concatenate(at), np.concatenate(pixels),
+        (int(usable_ns[0]), int(usable_ns[-1])),
+    )  # fmt: skip
+
+
+def _thinned(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """At most `_MOST_FRAMES` of frames at these times, no link between two lost by what is left out.
+
+    The whole session is thinned as far as links allow. Where that is still too much, it is the run of frames with the most links.
+    """
+    count = len(time_ns)
+    if count <= _MOST_FRAMES:
+        return np.arange(count)
+    longest = round(_LONGEST_GAP_S * 1e9)
+    steps = np.diff(time_ns)
+    spacing = min(int(steps[steps <= longest].sum()) // (_MOST_FRAMES - 1), longest)
+    kept = _at_spacing(time_ns, spacing)
+    while _NEARLY_ALL * len(kept) > _MOST_FRAMES and spacing < longest:
+        spacing = min(spacing + max(spacing // 20, 1), longest)
+        kept = _at_spacing(time_ns, spacing)
+    if len(kept) <= _MOST_FRAMES:
+        return kept
+    links = np.concatenate([[0], np.cumsum(np.diff(time_ns[kept]) <= longest)])
+    begin = int(np.argmax(links[_MOST_FRAMES - 1 :] - links[: len(links) - _MOST_FRAMES + 1]))
+    return kept[begin : begin + _MOST_FRAMES]
+
+
+def _at_spacing(time_ns: NDArray[np.int64], spacing: int) -> NDArray[np.intp]:
+    """Frames as far apart as they can be within `spacing` [ns]; the next one where none is within it."""
+    last = np.searchsorted(time_ns, time_ns + spacing, side="right") - 1
+    kept = [0]
+    while kept[-1] < len(time_ns) - 1:
+        kept.append(max(int(last[kept[-1]]), kept[-1] + 1))
+    return np.array(kept, dtype=np.intp)
 
 
 def _links(session: _Session) -> NDArray[np.intp]:
@@ -269,7 +319,7 @@ def _solve(
     seen = OnBody(Reprojection(model, session.pixels, sigma=sigma_px))
     every = np.zeros(len(session.pixels), dtype=np.intp)
     problem.add_residuals(
-        seen, bodies[session.frame_of], mounting[every], points, loss=losses.Huber(OUTLIER), name="corners"
+        seen, bodies[session.frame_of], mounting[every], points, loss=losses.Huber(OUTLIER_SIGMAS), name="corners"
     )  # fmt: skip
     i, j = links.T
     shift = round(start.offset_s * 1e9)
@@ -282,10 +332,10 @@ def _solve(
     )
     once = np.zeros(len(links), dtype=np.intp)
     problem.add_residuals(between, bodies[i], states[i], bodies[j], states[j], gravity[once], offset[once], name="imu")
-    # A frame without a link has no IMU: its velocity and bias are held by the prior alone.
+    # Two frames between gaps do not determine their velocities and biases, a frame without a link has no IMU at all: a prior
+    # holds the first frame of every chain.
     wide = np.repeat([10.0, *_BIAS_SIGMA], 3)
-    alone = np.setdiff1d(np.arange(len(bodies)), links.ravel())
-    held = np.concatenate([[0], alone[alone > 0]])
+    held = np.setdiff1d(np.arange(len(bodies)), j)
     problem.add_residuals(Prior(Euclidean(9), np.zeros((len(held), 9)), sigma=wide), states[held], name="biases")
     solution = problem.solve(examine=False, max_iterations=40)
     for _ in range(rounds - 1):
@@ -298,14 +348,10 @@ def _solve(
     return solved, solution, problem
 
 
-OUTLIER = 5.0
-"""Standard deviations beyond which a corner pulls with constant force."""
-
-
 def _scale(
     session: _Session, solved: _State, cost: float, rest: tuple[CameraModel, float, ImuSamples, ImuNoise]
 ) -> tuple[float, float]:
-    """Size of the target by the IMU, and its standard deviation, both as a share of what was stated."""
+    """Size of the target by the IMU and its standard deviation, as shares of what was stated; NaN and ∞ without a minimum."""
     costs = []
     for scale in (1.0 - _SCALE_STEP, 1.0 + _SCALE_STEP):
         bodies = solved.bodies.copy()
