@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -65,6 +66,7 @@ def cameras(
     from boxplus.cli.optimization_terminal import versions
     from boxplus.errors import InputError
     from boxplus.formats.output import atomic_file
+    from boxplus.recordings.cameras.calibration import read_camchain
     from boxplus.runs.camera_calibration.camchain import camchain_text
     from boxplus.runs.camera_calibration.camchain import compare as compare_with
     from boxplus.runs.camera_calibration.corner_file import read_corner_file
@@ -81,23 +83,26 @@ def cameras(
     from boxplus.runs.output_folder import output_folder
     from boxplus.systems.camera_calibration.calibration import calibrate_cameras
     from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
-    from boxplus.systems.camera_calibration.findings import judge
+    from boxplus.systems.camera_calibration.findings import Finding, judge
 
     started, console = datetime.now(UTC), Console(highlight=False)
     if (imu is None) != (imu_noise is None):
         raise InputError("both --imu and --imu-noise, or none", "one of them", "give samples and noise densities together")
     seen, board = read_corner_file(corners, _size(resolution)), read_target(target)
-    samples, noise = (None, None) if imu is None or imu_noise is None else read_imu(imu, imu_noise)
+    inertial = None if imu is None or imu_noise is None else read_imu(imu, imu_noise)
+    other = None if compare is None else (read_camchain(compare), compare.name)
     folder = output or Path(f"{corners.resolve().name.split('.')[0]}_calibration")
     own = [folder / name for name in FILES]
     ctx.with_resource(output_folder(folder, "boxplus calibrate cameras", lambda: own, list, overwrite=overwrite))
+    samples, noise = (None, None) if inertial is None else (inertial.samples, inertial.noise)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"calibrating {seen.cameras} cameras from {len(seen.pixels):,} corners", total=1.0)
         config = CameraCalibrationConfig(lens=lens.value, max_views=max_views)
         found = calibrate_cameras(
             seen, board, config, imu=samples, noise=noise, on_progress=lambda done: progress.update(task, completed=done)
         )
-    findings = judge(found)
+    left_out = () if inertial is None else inertial.left_out
+    findings = [*judge(found), *(Finding("imu_samples", "remark", text) for text in left_out)]
     summary = CalibrationSummary(
         program="boxplus calibrate cameras",
         versions=versions(),
@@ -109,10 +114,11 @@ def cameras(
         sigma_by_lens=found.sigma_by_lens,
         sigma_px=found.of_camera(0)[0].sigma_px,
         cameras=camera_facts(found),
+        imu_input=[] if inertial is None else [*inertial.notes, *inertial.left_out],
         imu=imu_facts(found),
         outliers=outliers(found),
-        compared=[] if compare is None else compare_with(found, compare),
-        findings=[FindingFacts(code=f.code, severity=f.severity, text=f.text) for f in findings],
+        compared=[] if other is None else compare_with(found, *other),
+        findings=[FindingFacts.model_validate(asdict(finding)) for finding in findings],
     )
     _print(console, summary)
     if summary.state != "refused":
@@ -147,6 +153,8 @@ def _print(console: object, summary: CalibrationSummary) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from boxplus.runs.camera_calibration.camchain import IMU_MOUNTING_DOUBTS
+
     terminal = console if isinstance(console, Console) else Console()
     table = Table(show_lines=False, pad_edge=False)
     for heading in ("camera", "parameter", "value", "standard deviation"):
@@ -162,7 +170,8 @@ def _print(console: object, summary: CalibrationSummary) -> None:
         shift = f"{summary.imu.timeshift_cam_imu_s * 1e3:+.3f} ms"
         table.add_row("imu", "timeshift_cam_imu", shift, f"{summary.imu.sigma_s * 1e3:.2g} ms")
         sigma = f"{1e3 * max(summary.imu.sigma_m):.2g} mm, {max(summary.imu.sigma_deg):.2g} deg"
-        table.add_row("imu", "T_imu_cam0", "in camchain.yaml", sigma)
+        is_open = any(finding.code in IMU_MOUNTING_DOUBTS for finding in summary.findings)
+        table.add_row("imu", "T_imu_cam0", "not written: see below" if is_open else "in camchain.yaml", sigma)
     terminal.print(table)
     rms = ", ".join(f"{facts.name} {facts.rms_px:.3f} px in {facts.views} views" for facts in summary.cameras)
     terminal.print(f"{summary.lens}, rms {rms}; {len(summary.outliers)} corners left out")

@@ -10,10 +10,13 @@ import yaml
 from numpy.typing import NDArray
 
 from boxplus.cameras import CameraModel, DoubleSphere, Equidistant
-from boxplus.recordings.cameras.calibration import inverse, read_camchain
+from boxplus.recordings.cameras.calibration import StatedRig, inverse
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.runs.camera_calibration.summary import CalibrationSummary, mountings
 from boxplus.systems.camera_calibration.calibration import CameraCalibration
+
+IMU_MOUNTING_DOUBTS = ("imu_open", "imu_contradicts")
+"""Findings after which the mounting on the IMU is not written."""
 
 _DIFFERENT = 4.0
 
@@ -28,14 +31,15 @@ def camchain_text(found: CameraCalibration, summary: CalibrationSummary, noise: 
         f"# boxplus calibrate cameras, from {Path(summary.input).name}; target: {summary.target} (all lengths scale with it)"
     ]
     lines += [f"# NOT TO BE TRUSTED: {text}" for text in doubts]
-    imu_open = any(finding.code in ("imu_open", "imu_contradicts") for finding in summary.findings)
+    imu_open = any(finding.code in IMU_MOUNTING_DOUBTS for finding in summary.findings)
+    doubted = {camera for finding in summary.findings for camera in finding.mounting_of}
     for camera, facts in enumerate(summary.cameras):
         adjustment, number = found.of_camera(camera)
         block = _lens_block(adjustment.rig.models[number])
         block["resolution"] = list(facts.resolution)
-        if facts.T_cn_cnm1 is not None:
+        if facts.T_cn_cnm1 is not None and not doubted & {camera - 1, camera}:
             block["T_cn_cnm1"] = facts.T_cn_cnm1
-        if facts.T_cam_imu is not None and summary.imu is not None and not imu_open:
+        if facts.T_cam_imu is not None and summary.imu is not None and not imu_open and camera not in doubted:
             block["T_cam_imu"] = facts.T_cam_imu
             block["timeshift_cam_imu"] = summary.imu.timeshift_cam_imu_s
         lines.append(_yaml({facts.name: block}))
@@ -81,16 +85,16 @@ def _yaml(content: dict[str, Any]) -> str:
     return text
 
 
-def compare(found: CameraCalibration, file: Path) -> list[str]:
+def compare(found: CameraCalibration, other: StatedRig, name: str) -> list[str]:
     """How a calibration differs from a camchain, a line each: lenses by what they do to the image, mountings.
 
     Lenses of different kinds have no numbers in common, so that rays are compared: how far apart both see the same directions,
     over the corners of this calibration, where the other lens may turn freely.
 
-    Raises:
-        RecordingError: the file is no camchain.
+    Args:
+        other: the camchain.
+        name: of its file.
     """
-    other = read_camchain(file)
     lines = []
     distances: dict[tuple[int, int], float] = {}
     stated = list(other.cameras.values())
@@ -102,12 +106,12 @@ def compare(found: CameraCalibration, file: Path) -> list[str]:
                 distances[camera, k] = _apart(adjustment.rig.models[number], there.model, pixels)
         if (camera, camera) in distances:
             lines.append(
-                f"cam{camera}: the lens of {file.name} sees the same directions {distances[camera, camera]:.2f} px (rms) apart"
+                f"cam{camera}: the lens of {name} sees the same directions {distances[camera, camera]:.2f} px (rms) apart"
             )
     crossed = [distances.get((a, b), np.nan) for a, b in ((0, 1), (1, 0))]
     straight = [distances.get((a, a), np.nan) for a in (0, 1)]
     if np.isfinite([*crossed, *straight]).all() and max(crossed) * _DIFFERENT < min(straight):
-        lines.append(f"the cameras are swapped: cam0 is cam1 of {file.name}, {crossed[0]:.2f} px apart, and the other way round")
+        lines.append(f"the cameras are swapped: cam0 is cam1 of {name}, {crossed[0]:.2f} px apart, and the other way round")
     T = mountings(found)
     first = stated[0].T_body_camera
     for camera in range(1, min(len(T), len(stated))):
@@ -118,7 +122,7 @@ def compare(found: CameraCalibration, file: Path) -> list[str]:
             baselines = [float(np.linalg.norm(pose[:3, 3])) for pose in (mine, inverse(first) @ theirs)]
             apart_m = float(np.linalg.norm(step[:3, 3]))
             lines.append(
-                f"cam{camera} to cam0: {angle:.3f} deg and {apart_m * 1e3:.2f} mm from {file.name}; baselines "
+                f"cam{camera} to cam0: {angle:.3f} deg and {apart_m * 1e3:.2f} mm from {name}; baselines "
                 f"{baselines[0] * 1e3:.2f} and {baselines[1] * 1e3:.2f} mm"
             )
     return lines

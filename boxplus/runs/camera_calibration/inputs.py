@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,24 @@ def read_target(path: str | Path) -> AprilGrid:
         ) from None
 
 
-def read_imu(samples: str | Path, noise: str | Path) -> tuple[ImuSamples, ImuNoise]:
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuInput:
+    """An IMU as its files have it.
+
+    Attributes:
+        samples: in order, each time once.
+        noise: its densities.
+        notes: how the table was read: units, noise.
+        left_out: what of it was not used as it stands, with counts.
+    """
+
+    samples: ImuSamples
+    noise: ImuNoise
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def read_imu(samples: str | Path, noise: str | Path) -> ImuInput:
     """An IMU: a table as EuRoC's `data.csv`, and Kalibr's file with its noise densities.
 
     Raises:
@@ -57,9 +75,20 @@ def read_imu(samples: str | Path, noise: str | Path) -> tuple[ImuSamples, ImuNoi
             f"not all of them, or not positive, in {Path(noise).name}",
             "give Kalibr's imu.yaml",
         )
-    stream, _ = imu_stream(table, densities, Path(noise).name, CameraRecordingOptions())
+    stream, evidence = imu_stream(table, densities, Path(noise).name, CameraRecordingOptions())
     order = np.argsort(table.time_ns, kind="stable")
+    late = int(np.count_nonzero(table.time_ns < np.maximum.accumulate(table.time_ns)))
+    left_out = [fact.text for fact in evidence if fact.verdict != "ok"]
+    if late:
+        left_out.append(f"{late} samples of {table.source} stand after later ones: put in order")
     order = order[np.concatenate([[True], np.diff(table.time_ns[order]) > 0])]
+    if len(order) < len(table.time_ns):
+        left_out.append(f"{len(table.time_ns) - len(order)} samples of {table.source} repeat a time: the first of each is used")
     gyro = table.values[order, :3] * GYRO_SCALE[stream.gyro_unit]
     accel = table.values[order, 3:] * ACCEL_SCALE[stream.accel_unit]
-    return ImuSamples.from_arrays(table.time_ns[order], gyro, accel), densities
+    return ImuInput(
+        ImuSamples.from_arrays(table.time_ns[order], gyro, accel),
+        densities,
+        tuple(f"{fact.value}: {fact.text}" for fact in evidence if fact.verdict == "ok"),
+        tuple(left_out),
+    )

@@ -72,6 +72,7 @@ class FindingFacts(_Part):
     code: str
     severity: Literal["refused", "doubt", "remark"]
     text: str
+    mounting_of: tuple[int, ...] = Field((), description="cameras whose mounting it doubts: not in camchain.yaml")
 
 
 class CalibrationSummary(_Part):
@@ -87,6 +88,7 @@ class CalibrationSummary(_Part):
     sigma_by_lens: dict[str, float] = Field(description="what each lens leaves [px], standard deviation of a coordinate")
     sigma_px: float
     cameras: list[CameraFacts]
+    imu_input: list[str] = Field([], description="how the table of the IMU was read: units, noise, lines and times not used")
     imu: ImuFacts | None = None
     outliers: list[str] = Field(description="corners left out, the worst first: frame, camera, corner, error")
     compared: list[str] = Field(description="differences to another calibration, where one was given")

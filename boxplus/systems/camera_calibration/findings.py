@@ -44,11 +44,13 @@ class Finding:
         code: a word for programs.
         severity: `refused`: the calibration is not written; `doubt`: it is not to be trusted; `remark`: good to know.
         text: a sentence with numbers, and what to do.
+        mounting_of: cameras whose mounting to the first one it doubts.
     """
 
     code: str
     severity: Severity
     text: str
+    mounting_of: tuple[int, ...] = ()
 
 
 def axis_focal(kind: LensKind, parameters: Floats, covariance: Floats) -> tuple[Floats, Floats]:
@@ -192,7 +194,7 @@ def _together(found: CameraCalibration) -> list[Finding]:
         if pair.swapped:
             frames = ", ".join(found.singles[0].corners.names[frame] for frame in pair.swapped[:6])
             text = f"{names} are swapped in {len(pair.swapped)} frames ({frames}): name their images anew"
-            result.append(Finding("swapped", "doubt", text))
+            result.append(Finding("swapped", "doubt", text, _mounted_by(found, pair.second)))
         if pair.late_frames:
             count = abs(pair.late_frames)
             where = f"{count} frame{'s' * (count > 1)} {'behind' if pair.late_frames > 0 else 'ahead of'}"
@@ -200,7 +202,7 @@ def _together(found: CameraCalibration) -> list[Finding]:
                 f"cam{pair.second} is {where} cam{pair.first}: their mounting scatters by {pair.scatter_m * 1e3:.1f} mm, and "
                 "least with that shift"
             )
-            result.append(Finding("late", "doubt", text))
+            result.append(Finding("late", "doubt", text, _mounted_by(found, pair.second)))
     if len(found.singles) == 1:
         return result
     if not found.rig_holds:
@@ -212,10 +214,19 @@ def _together(found: CameraCalibration) -> list[Finding]:
             "together, or the cameras moved against each other; no mounting is written. Trigger them together, or hold the "
             "target still for every image"
         )
-        return [*result, Finding("not_rigid", "doubt", text)]
+        return [*result, Finding("not_rigid", "doubt", text, tuple(range(1, len(found.singles))))]
     for camera in range(1, len(found.singles)):
         result += _mounting(found, camera)
     return result
+
+
+def _mounted_by(found: CameraCalibration, camera: int) -> tuple[int, ...]:
+    """A camera, and those that are mounted to the first one through it."""
+    cameras = [camera]
+    for pair in found.pairs:
+        if pair.first in cameras and pair.second not in cameras:
+            cameras.append(pair.second)
+    return tuple(cameras)
 
 
 def _mounting(found: CameraCalibration, camera: int) -> list[Finding]:
@@ -231,7 +242,7 @@ def _mounting(found: CameraCalibration, camera: int) -> list[Finding]:
             f"the mounting of cam{camera} is open: ± {np.degrees(sigma[:3].max()):.2f} deg, ± {sigma[3:].max() * 1e3:.1f} mm; "
             "show the target to both cameras at once, in more places"
         )
-        result.append(Finding("mounting_open", "doubt", text))
+        result.append(Finding("mounting_open", "doubt", text, _mounted_by(found, camera)))
     across = float(T[4])
     if across < -0.5 * baseline and quaternion.to_matrix(np.ascontiguousarray(T[None, :4]))[0, 2, 2] > 0.9:
         text = (

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,15 @@ from typer.testing import CliRunner, Result
 from boxplus.cli import app
 from boxplus.errors import InputError, RecordingError
 from boxplus.recordings.cameras.calibration import inverse, read_camchain
+from boxplus.runs.camera_calibration.camchain import camchain_text
 from boxplus.runs.camera_calibration.corner_file import read_corner_file, write_corner_file
 from boxplus.runs.camera_calibration.inputs import read_imu, read_target
-from boxplus.runs.camera_calibration.summary import as_matrix
+from boxplus.runs.camera_calibration.summary import CalibrationSummary, FindingFacts, as_matrix, camera_facts
 from boxplus.simulation.cameras.target_session import TargetSession
 from boxplus.simulation.imu import ImuModel
+from boxplus.systems.camera_calibration.calibration import CameraCalibration, calibrate_cameras
+from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
+from boxplus.systems.camera_calibration.findings import judge
 from tests.systems.camera_calibration.sessions import GRID, RADTAN, SIZE, T_CAM0_CAM1, T_IMU_CAM0, session
 
 TARGET = f"""target_type: 'aprilgrid'
@@ -89,6 +94,64 @@ def test_a_doubtful_rig_ends_with_exit_code_3_and_lenses_without_mounting(tmp_pa
     assert done.exit_code == 3
     text = (tmp_path / "out" / "camchain.yaml").read_text()
     assert "# NOT TO BE TRUSTED: the cameras together" in text and "T_cn_cnm1" not in text
+
+
+@pytest.fixture(scope="module")
+def rig() -> CameraCalibration:
+    """Two cameras, sound."""
+    return calibrate_cameras(
+        session(RADTAN, RADTAN, frames=10).corners, GRID, CameraCalibrationConfig(lens="pinhole-radtan", max_views=10)
+    )
+
+
+def chain_of(found: CameraCalibration, file: Path) -> str:
+    findings = [FindingFacts.model_validate(asdict(finding)) for finding in judge(found)]
+    summary = CalibrationSummary(
+        program="boxplus calibrate cameras", versions={}, started=datetime.now(UTC), state="doubtful", input="corners.csv",
+        target=GRID.describe(), lens=found.lens, sigma_by_lens={}, sigma_px=0.2, cameras=camera_facts(found), outliers=[],
+        compared=[], findings=findings,
+    )  # fmt: skip
+    file.write_text(camchain_text(found, summary, None))
+    assert len(read_camchain(file).cameras) == 2
+    return file.read_text()
+
+
+def test_mountings_that_a_finding_doubts_are_left_out(rig: CameraCalibration, tmp_path: Path) -> None:
+    file = tmp_path / "camchain.yaml"
+    assert "T_cn_cnm1" in chain_of(rig, file) and rig.rig is not None
+    wide = rig.rig.covariance.copy()
+    wide[rig.rig.mounting(1), rig.rig.mounting(1)] *= 1e6
+    pair = rig.pairs[0]
+    for doubted, words in (
+        (replace(rig, rig=replace(rig.rig, covariance=wide)), "the mounting of cam1 is open"),
+        (replace(rig, pairs=(replace(pair, late_frames=1),)), "cam1 is 1 frame behind cam0"),
+        (replace(rig, pairs=(replace(pair, swapped=(3,)),)), "cam0 and cam1 are swapped"),
+    ):
+        text = chain_of(doubted, file)
+        assert f"# NOT TO BE TRUSTED: {words}" in text and "T_cn_cnm1" not in text
+
+
+def test_a_comparison_that_cannot_be_read_is_refused_before_anything_is_cleared(tmp_path: Path) -> None:
+    given = write(tmp_path, session(RADTAN, frames=10))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.json").write_text("{}")
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    done = call(*given, "-o", tmp_path / "out", "--overwrite", "--compare", tmp_path / "other.yaml")
+    assert done.exit_code == 2 and "a Kalibr camchain" in " ".join(done.output.split())
+    assert (tmp_path / "out" / "run.json").read_text() == "{}"
+
+
+def test_what_of_an_imu_table_is_not_used_is_counted(tmp_path: Path) -> None:
+    write(tmp_path, session(RADTAN, frames=10))
+    lines = (tmp_path / "imu.csv").read_text().splitlines()
+    plain = read_imu(tmp_path / "imu.csv", tmp_path / "imu.yaml")
+    assert plain.left_out == () and any(note.startswith("rad/s: ") for note in plain.notes)
+    lines[5:7] = [lines[6], lines[5]]
+    (tmp_path / "imu.csv").write_text("\n".join([*lines[:20], lines[19], "lost", *lines[20:]]))
+    found = read_imu(tmp_path / "imu.csv", tmp_path / "imu.yaml")
+    np.testing.assert_array_equal(found.samples.time_ns, plain.samples.time_ns)
+    np.testing.assert_array_equal(found.samples.gyro, plain.samples.gyro)
+    assert [text.split(" of imu.csv ")[0] for text in found.left_out] == ["1 lines", "1 samples", "1 samples"]
 
 
 def test_the_corners_of_euroc_give_the_published_rig(shared_data: Path, tmp_path: Path) -> None:
