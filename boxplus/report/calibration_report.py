@@ -18,7 +18,7 @@ from boxplus.systems.camera_calibration.one_camera import tilts_deg
 from boxplus.systems.camera_calibration.structure import CELLS
 
 _MOST_POINTS = 6000
-_LISTED = 40
+_LISTED = 10
 
 
 def write_calibration_report(path: Path, summary: CalibrationSummary, found: CameraCalibration) -> Path:
@@ -291,8 +291,8 @@ def _outliers(summary: CalibrationSummary) -> str:
     if not summary.outliers:
         return "<section><h2>Corners left out</h2><p>None.</p></section>"
     listed = "".join(f"<li>{escape(text)}</li>" for text in summary.outliers[:_LISTED])
-    more = f"<p>And {len(summary.outliers) - _LISTED:,} more, in run.json.</p>" if len(summary.outliers) > _LISTED else ""
-    return f"<section><h2>Corners left out: {len(summary.outliers):,}</h2><ul>{listed}</ul>{more}</section>"
+    more = f"<p>The worst {_LISTED}; all are in run.json.</p>" if len(summary.outliers) > _LISTED else ""
+    return f"<section><h2>Corners left out: {len(summary.outliers):,}</h2>{more}<ul>{listed}</ul></section>"
 
 
 def _facts(summary: CalibrationSummary) -> str:

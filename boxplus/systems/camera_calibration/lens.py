@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -41,9 +40,3 @@ def plain_lens(kind: LensKind, focal: float, size: tuple[int, int]) -> CameraMod
         return lens(kind, np.array([focal, focal, cx, cy, 0.0, 0.0, 0.0, 0.0]))
     # ξ = 0 and α = ½ is the unified model of a stereographic lens, between pinhole and fisheye.
     return lens(kind, np.array([focal, focal, cx, cy, 0.0, 0.5]))
-
-
-def field_of_view_deg(model: CameraModel, pixels: NDArray[np.float64]) -> float:
-    """Largest angle from the axis at which these pixels (N, 2) look [deg]; NaN where none has a ray."""
-    bearings, found = model.bearings(pixels)
-    return math.degrees(math.acos(float(np.clip(bearings[found, 2].min(), -1.0, 1.0)))) if found.any() else math.nan

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -133,11 +132,3 @@ def tilts_deg(rig: Rig) -> Floats:
     R_target_body = quaternion.to_matrix(np.ascontiguousarray(rig.T_target_body[known, :4]))
     normal[known] = np.degrees(np.arccos(np.clip(np.abs(R_target_body[:, 2, 2]), 0.0, 1.0)))
     return normal
-
-
-def focal_sigma_share(found: Adjustment, camera: int = 0) -> float:
-    """The larger standard deviation of both focal lengths, as a share of the focal length."""
-    own = found.intrinsics(camera)
-    sigma = np.sqrt(np.diag(found.covariance)[own][:2])
-    model: CameraModel = found.rig.models[camera]
-    return float(max(sigma[0] / model.parameters[0], sigma[1] / model.parameters[1])) if np.isfinite(sigma).all() else math.inf

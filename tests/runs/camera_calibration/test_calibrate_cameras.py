@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 from boxplus.cli import app
 from boxplus.errors import InputError, RecordingError
 from boxplus.recordings.cameras.calibration import inverse, read_camchain
+from boxplus.report.calibration_report import write_calibration_report
 from boxplus.runs.camera_calibration.camchain import camchain_text
 from boxplus.runs.camera_calibration.corner_file import read_corner_file, write_corner_file
 from boxplus.runs.camera_calibration.inputs import read_imu, read_target
@@ -104,14 +105,17 @@ def rig() -> CameraCalibration:
     )
 
 
-def chain_of(found: CameraCalibration, file: Path) -> str:
+def summary_of(found: CameraCalibration, left_out: list[str]) -> CalibrationSummary:
     findings = [FindingFacts.model_validate(asdict(finding)) for finding in judge(found)]
-    summary = CalibrationSummary(
+    return CalibrationSummary(
         program="boxplus calibrate cameras", versions={}, started=datetime.now(UTC), state="doubtful", input="corners.csv",
-        target=GRID.describe(), lens=found.lens, sigma_by_lens={}, sigma_px=0.2, cameras=camera_facts(found), outliers=[],
+        target=GRID.describe(), lens=found.lens, sigma_by_lens={}, sigma_px=0.2, cameras=camera_facts(found), outliers=left_out,
         compared=[], findings=findings,
     )  # fmt: skip
-    file.write_text(camchain_text(found, summary, None))
+
+
+def chain_of(found: CameraCalibration, file: Path) -> str:
+    file.write_text(camchain_text(found, summary_of(found, []), None))
     assert len(read_camchain(file).cameras) == 2
     return file.read_text()
 
@@ -129,6 +133,14 @@ def test_mountings_that_a_finding_doubts_are_left_out(rig: CameraCalibration, tm
     ):
         text = chain_of(doubted, file)
         assert f"# NOT TO BE TRUSTED: {words}" in text and "T_cn_cnm1" not in text
+
+
+def test_the_report_lists_the_worst_corners_and_counts_all(rig: CameraCalibration, tmp_path: Path) -> None:
+    left_out = [f"frame 1, cam0, corner {k}: {90 - k}.00 px" for k in range(78)]
+    summary = summary_of(rig, left_out).model_copy(update={"versions": {"boxplus": "0"}})
+    page = write_calibration_report(tmp_path / "report.html", summary, rig).read_text()
+    assert "Corners left out: 78" in page and "The worst 10; all are in run.json" in page
+    assert page.count("frame 1, cam0, corner ") == 10 and left_out[9] in page and left_out[10] not in page
 
 
 def test_a_comparison_that_cannot_be_read_is_refused_before_anything_is_cleared(tmp_path: Path) -> None:
