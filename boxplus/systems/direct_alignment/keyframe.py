@@ -29,6 +29,7 @@ from boxplus.systems.direct_alignment.keyframe_kernel import half_depth, pixel_j
 
 FEWEST_PIXELS = 100
 _NOISE_STEP = 4  # rows of the image from one that its noise is measured in to the next
+_OF_NOISE = 10  # pixels of an image of noise alone whose gradient is taken for texture, on average
 _QUARTER_OF_NORMAL = 0.31864  # |x| below which a quarter of a normal distribution lies
 _STEPS_ABOVE = 2  # octaves; pixels at steps of the depth stay, as on coarse levels nearly all of them are at one
 
@@ -43,6 +44,7 @@ class Level:
         J: (n, 6) of the keyframe's grey values by ξ = [w, v] [grey values/rad, grey values/m].
         intrinsics: (9,) of the camera at this level.
         gradient_noise: variance that noise of the image gives to a component of the gradients, chosen as they are [1/px²].
+        above_noise: how many pixels have a gradient that noise and steps of the grey values hardly make.
     """
 
     octave: int
@@ -53,6 +55,7 @@ class Level:
     J: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
     gradient_noise: float
+    above_noise: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,13 +115,13 @@ class Keyframe:
         z = _checked_depth(depth, first)
         median_depth = float(np.median(z[z > 0.0]))
         found: list[Level] = []
-        scaled = camera
+        scaled, step = camera, _step(first.grey)
         for octave, grey in enumerate(first.pyramid(levels)):
             if octave > 0:
                 finer, z = z, np.empty(grey.shape, dtype=np.float32)
                 half_depth(finer, z)
                 scaled = half_camera(scaled)
-            level = _level(octave, grey.grey, z, scaled, points)
+            level = _level(octave, grey.grey, z, scaled, points, step)
             if len(level.grey) >= FEWEST_PIXELS:
                 found.append(level)
         if not found:
@@ -131,7 +134,9 @@ class Keyframe:
         return cls(camera, first.shape, tuple(found[::-1]), levels - 1, median_depth, contrast)
 
 
-def _level(octave: int, grey: NDArray[np.float32], depth: NDArray[np.float32], camera: Pinhole, points: int | None) -> Level:
+def _level(
+    octave: int, grey: NDArray[np.float32], depth: NDArray[np.float32], camera: Pinhole, points: int | None, step: float
+) -> Level:
     with_depth = int(np.count_nonzero(depth))
     cell = 1 if points is None else max(int(np.ceil(np.sqrt(with_depth / points))), 1)
     most = with_depth if cell == 1 else -(-grey.shape[0] // cell) * -(-grey.shape[1] // cell)
@@ -143,9 +148,20 @@ def _level(octave: int, grey: NDArray[np.float32], depth: NDArray[np.float32], c
     J, c = np.empty((len(rays), 6)), camera.padded_parameters
     pixel_jacobians(rays, inverse_depth, gradients[:count][seen], c, J)
     # Half the variance of grey values; the steepest of m gradients of noise is longer by the m-th harmonic number (exponential).
-    gradient_noise = 0.5 * image_noise(grey) ** 2 * float(np.sum(1.0 / np.arange(1.0, cell * cell + 1.0)))
+    variance = image_noise(grey) ** 2
+    gradient_noise = 0.5 * variance * float(np.sum(1.0 / np.arange(1.0, cell * cell + 1.0)))
+    # Squares of gradients of noise have an exponential distribution with mean σ², but for those at the border.
+    limit = max(np.log(count * cell * cell / _OF_NOISE), 1.0) * max(variance, (step / 2**octave) ** 2) if count else 0.0
+    inner = np.all((pixels[:count] > 0) & (pixels[:count] < np.array(grey.shape[::-1]) - 1), axis=1) & seen
+    above_noise = int(np.count_nonzero(np.sum(gradients[:count][inner] ** 2, axis=1) > limit))
     grey_1 = np.ascontiguousarray(values[:count][seen, 0])
-    return Level(octave, pixels[:count][seen], rays, inverse_depth, grey_1, J, c, gradient_noise)
+    return Level(octave, pixels[:count][seen], rays, inverse_depth, grey_1, J, c, gradient_noise, above_noise)
+
+
+def _step(grey: NDArray[np.float32]) -> float:
+    """Smallest difference of neighbours that differ: what they are rounded to. Noise below it is not measured well."""
+    steps = np.abs(np.diff(grey[::_NOISE_STEP], axis=1))
+    return float(np.min(steps, initial=np.inf, where=steps > 0.0)) if steps.any() else 0.0
 
 
 def image_noise(grey: NDArray[np.float32]) -> float:

@@ -16,7 +16,6 @@ Cameras, IROS 2013; docs/direct_odometry.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +26,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.sensors.image import Image, as_image
-from boxplus.systems.direct_alignment.keyframe import Keyframe
+from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
@@ -39,7 +38,7 @@ from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
 from boxplus.systems.direct_odometry.search_starts import starts_around
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
-from boxplus.systems.direct_odometry.verdict import Verdict, Watch
+from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
@@ -53,14 +52,6 @@ _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer
 _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find again in its second view
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
-
-
-class Tracked(NamedTuple):
-    """A frame aligned to a keyframe."""
-
-    keyframe: WindowKeyframe
-    alignment: Alignment
-    verdict: Verdict
 
 
 class DirectOdometry:
@@ -101,6 +92,7 @@ class DirectOdometry:
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
         self._log_gain, self._offset = 0.0, 0.0
         self._reference: WindowKeyframe | None = None
+        self._shape: tuple[int, int] | None = None
         self._time_ns: int | None = None
         self._seen_ns: int | None = None
         self._watch, self._calibration, self._registration = Watch(self.config), CalibrationWatch(), RegistrationWatch()
@@ -167,7 +159,7 @@ class DirectOdometry:
         grey = as_image(image)
         if self._reference is not None:
             return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
-        self._check_time(time_ns)
+        self._check(time_ns, grey)
         watch, self._start = Stopwatch(), self._start or TwoViewStart(self.camera)
         views, self._time_ns = self._start.push(time_ns, grey), time_ns
         begun = None if views is None else self._begin_alone(self._start, views, watch)
@@ -176,14 +168,19 @@ class DirectOdometry:
         lost = Verdict("lost", (f"the view was lost, and no two views tell depths again: {self._start.problem}",), np.nan)
         return self._estimate(time_ns, -1, False, None, lost, watch)
 
-    def _check_time(self, time_ns: int) -> None:
+    def _check(self, time_ns: int, image: Image) -> None:
+        shape, self._shape = self._shape or image.shape, self._shape or image.shape
+        if image.shape != shape:
+            raise InputError(
+                f"images of shape {shape}, as the first", f"{image.shape}", "resize it, or begin anew with its camera"
+            )
         if self._time_ns is not None and time_ns <= self._time_ns:
             raise InputError(
                 "frames in the order of time", f"{time_ns} ns after {self._time_ns} ns", "sort them, or drop this one"
             )
 
     def _push(self, time_ns: int, image: Image, depth_of: DepthOf) -> Estimate:
-        self._check_time(time_ns)
+        self._check(time_ns, image)
         watch = Stopwatch()
         if self._reference is None:
             return self._begin(time_ns, image, depth_of, watch)
@@ -275,7 +272,9 @@ class DirectOdometry:
         keyframe = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0)
         self._time_ns = time_ns
         if keyframe is None:
-            verdict = Verdict("lost", ("fewer than 100 pixels have a gradient and a depth: there is nothing to track",), np.nan)
+            verdict = Verdict(
+                "lost", ("fewer than 100 pixels have a depth and a gradient above noise: there is nothing to track",), np.nan
+            )
         else:
             self._resume(time_ns)
             verdict = Verdict("weak" if self._watch.past_reasons else "ok", tuple(self._watch.past_reasons), np.nan)
@@ -342,6 +341,8 @@ class DirectOdometry:
         try:
             tracker = Keyframe.prepare(image, depth.z, self.camera, levels=self.config.levels, points=self.config.pixels)
         except InputError:
+            return None
+        if max(level.above_noise for level in tracker.levels) < FEWEST_PIXELS:
             return None
         patches = choose_patches(image.grey, depth, self.camera, self.config.patches)
         return WindowKeyframe(self.window.taken, time_ns, image.grey, T, log_gain, tracker, patches)

@@ -10,6 +10,7 @@ import numpy as np
 from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.estimate import Status
+from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 _MEMORY = 50  # frames
 _FEWEST = 5
@@ -22,6 +23,14 @@ class Verdict(NamedTuple):
     status: Status
     reasons: tuple[str, ...]
     residual_ratio: float
+
+
+class Tracked(NamedTuple):
+    """A frame aligned to a keyframe."""
+
+    keyframe: WindowKeyframe
+    alignment: Alignment
+    verdict: Verdict
 
 
 class Watch:

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 _HALF = 10  # of the window of the optical flow
 _STOP = (3, 30, 0.01)
 _FARTHEST = 8.0  # px
+_SHARE = 0.25  # of a cell: corners are 0.6 of it apart, and two that meet are one
 _WEAKER = 0.5  # of the smallest eigenvalue, below which a new place is worse to follow than the old one
 
 Floats = NDArray[np.float64]
 
 
-def centred(cv2: Any, grey: NDArray[np.uint8], corners: Floats) -> Floats:
+def centred(cv2: Any, grey: NDArray[np.uint8], corners: Floats, cell: float = _FARTHEST / _SHARE) -> Floats:
     """Corners (n, 2) [px] drawn to the centre of the gradients around them, where that is a good place to follow.
 
     Along an edge nothing holds the centre; a corner that would slide along one stays where it is.
@@ -34,13 +35,14 @@ def centred(cv2: Any, grey: NDArray[np.uint8], corners: Floats) -> Floats:
     Args:
         cv2: the module.
         grey: (H, W).
+        cell: corners are at least 0.6 of it apart [px]; a quarter of it, and 8 pixels, is how far one is drawn at most.
     """
     if not len(corners):
         return corners
     begin = np.array(corners, dtype=np.float32).reshape(-1, 1, 2)
     found = cv2.cornerSubPix(grey, begin, (_HALF, _HALF), (-1, -1), _STOP)
     tried = found.reshape(-1, 2).astype(np.float64)
-    good = np.isfinite(tried).all(axis=1) & (np.linalg.norm(tried - corners, axis=1) < _FARTHEST)
+    good = np.isfinite(tried).all(axis=1) & (np.linalg.norm(tried - corners, axis=1) < min(_FARTHEST, _SHARE * cell))
     tried = np.where(good[:, None], tried, corners)
     good &= _strength(grey, tried) >= _WEAKER * _strength(grey, corners)
     return np.where(good[:, None], tried, corners)

@@ -141,7 +141,7 @@ class FeatureTracker:
         corners = self._cv2.goodFeaturesToTrack(grey, room, _QUALITY, 0.6 * cell, mask=self._empty(grey.shape, cell))
         pixels = None if corners is None else corners.reshape(-1, 2).astype(np.float64)
         if pixels is not None and len(self._ids) + len(pixels) >= _TEXTURED * self._config.features:
-            pixels = centred(self._cv2, grey, pixels)
+            pixels = centred(self._cv2, grey, pixels, cell)
         self.opencv_s += time.perf_counter() - begin
         if pixels is None:
             return tracks

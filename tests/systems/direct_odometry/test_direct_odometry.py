@@ -186,11 +186,42 @@ def test_wrong_input_is_refused() -> None:
         odometry.push_stereo(20, seen.grey[1], seen.grey[1])
 
 
+def test_images_of_another_size_are_refused() -> None:
+    seen = drive(50, 1)
+    odometry = DirectOdometry(CAMERA)
+    odometry.push_rgbd(10, seen.grey[0], seen.depth[0])
+    with pytest.raises(InputError, match="images of shape"):
+        odometry.push_rgbd(20, seen.grey[0][:60], seen.depth[0][:60])
+
+
+@pytest.mark.parametrize(
+    ("mean", "sigma"),
+    [(0.0, 0.0), (20.0, 0.3), (8.0, 2.0), (0.5, 1.0), (100.0, 8.0)],
+    ids=["black", "flat", "dark", "cut", "rough"],
+)
+@pytest.mark.parametrize("shape", [SHAPE, (240, 320)], ids=["small", "large"])
+def test_a_covered_lens_is_no_keyframe_and_one_gap(mean: float, sigma: float, shape: tuple[int, int]) -> None:
+    """Noise has gradients too; what is covered from the first frame on is no start either."""
+    rng, scale = np.random.default_rng(3), shape[0] / SHAPE[0]
+    camera = Pinhole(150.0 * scale, 150.0 * scale, 80.0 * scale - 0.5, 60.0 * scale - 0.5)
+    v, u = np.mgrid[: shape[0], : shape[1]] / scale
+    texture = 120.0 + 40.0 * np.sin(0.3 * u + 0.05 * v) * np.cos(0.25 * v)
+    odometry, depth = DirectOdometry(camera, DirectOdometryConfig(lost_s=0.2)), np.full(shape, 2.0)
+    statuses = []
+    for k in range(12):
+        covered = np.clip(np.rint(rng.normal(mean, sigma, shape)), 0.0, 255.0)
+        is_seen = 2 <= k < 4 or k >= 10
+        grey = np.rint(texture + rng.normal(0.0, 2.0, shape)) if is_seen else covered
+        statuses.append(odometry.push_rgbd(k * 100_000_000, grey, depth).status)
+    assert statuses == ["lost"] * 2 + ["ok"] * 2 + ["lost"] * 6 + ["weak"] * 2
+    assert (odometry.gaps, odometry.keyframes) == (1, 2)
+
+
 def test_without_depth_there_is_nothing_to_track() -> None:
     odometry = DirectOdometry(CAMERA)
     estimate = odometry.push_rgbd(0, np.zeros(SHAPE), np.zeros(SHAPE))
     assert estimate.status == "lost"
-    assert "have a gradient and a depth" in estimate.reasons[0]
+    assert "have a depth and a gradient above noise" in estimate.reasons[0]
     seen = drive(51, 1)
     assert odometry.push_rgbd(1, seen.grey[0], seen.depth[0]).status == "ok"
 

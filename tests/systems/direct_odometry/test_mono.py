@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
 from boxplus.evaluation.alignment import align
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
@@ -167,3 +168,11 @@ def test_little_depth_of_a_sensor_is_filled_by_the_motion() -> None:
     assert newest.number > 0 and (u > 90).sum() > 20
     depth = room.render(T[round(newest.time_ns)])[1]
     assert np.median(np.abs(1.0 / newest.patches.rho / depth[v, u] - 1.0)[u > 90]) < 0.02
+
+
+def test_an_image_of_another_size_is_refused_before_the_start_too() -> None:
+    odometry, grey = DirectOdometry(CAMERA), Room(7).render(sideways(7, 1)[0])[0]
+    assert odometry.push_mono(0, grey) is None
+    with pytest.raises(InputError, match="images of shape"):
+        odometry.push_mono(1, grey[:100])
+    assert odometry.push_mono(1, grey) is None

@@ -33,6 +33,16 @@ def test_along_an_edge_a_corner_stays() -> None:
     assert found[1] == pytest.approx(30.0, abs=0.1)
 
 
+def test_corners_of_a_small_cell_do_not_meet() -> None:
+    """Two at the least distance on both sides of a crossing; in a large cell both are drawn onto it."""
+    cell, crossing = 13.0, np.array([40.3, 29.6])
+    beside = crossing + np.array([[-3.9, 0.5], [3.9, -0.5]])
+    apart = np.linalg.norm(beside[0] - beside[1])
+    found = centred(cv2, picture((40.3, 29.6)), beside, cell)
+    assert np.linalg.norm(found[0] - found[1]) >= apart - 0.5 * cell > 1.0
+    assert np.linalg.norm(np.diff(centred(cv2, picture((40.3, 29.6)), beside), axis=0)) < 1.0
+
+
 def test_none_and_those_at_the_border_are_no_trouble() -> None:
     grey = picture((40.0, 30.0))
     assert centred(cv2, grey, np.zeros((0, 2))).shape == (0, 2)

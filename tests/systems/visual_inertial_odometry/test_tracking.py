@@ -99,7 +99,7 @@ def test_corners_creep_less_while_the_wall_comes_nearer_where_they_are_centred(s
         return float(np.median(np.linalg.norm(truth - tracks.pixels[:, 0], axis=1)))
 
     centred = creep()
-    monkeypatch.setattr(tracking, "centred", lambda cv2, grey, corners: corners)
+    monkeypatch.setattr(tracking, "centred", lambda cv2, grey, corners, cell: corners)
     assert centred < 0.75 * creep()
 
 
