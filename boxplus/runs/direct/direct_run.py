@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, printable
-from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
-from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recording_facts
+from boxplus.runs.cameras.camera_run import CameraRun
 from boxplus.runs.cameras.folder import DirectFolder, claim_camera_folder
-from boxplus.runs.cameras.landmark_file import LandmarkFile
 from boxplus.runs.direct.config import DirectRunConfig, dump_direct_config
 from boxplus.runs.direct.frame_log import FrameLogWriter
 from boxplus.runs.direct.frame_pairs import Frame, FramePairs, choose_cameras
 from boxplus.runs.direct.summary import DirectSummary, StreamFacts
-from boxplus.runs.estimate_statistics import EstimateStatistics
 from boxplus.runs.run_facts import State, WarningFacts
-from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.run_loop import Progress
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
@@ -79,15 +74,14 @@ def run_direct_odometry(
         return _Run(recording, direct_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
 
 
-class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
+class _Run(CameraRun[Estimate, DirectSummary]):
     """One run of direct odometry: its writers and its landmarks."""
 
     def __init__(
         self, recording: CameraRecording, folder: DirectFolder, config: DirectRunConfig, progress: Callable[[Progress], None]
     ) -> None:
         text = dump_direct_config(config, recording.info)
-        super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
-        self._info, self._folder = recording.info, folder
+        super().__init__(recording, folder, text, progress, self._all_landmarks)
         self._cameras = choose_cameras(recording.info, mono=config.streams.mono)
         self._pairs = FramePairs(self._cameras)
         self._odometry = DirectOdometry(self._cameras.camera, config.odometry, stereo=self._cameras.stereo)
@@ -95,14 +89,13 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
         self._images = {stream.index: 0 for stream in self._streams}
         self._before_start, self._start_problem = 0, ""
         self._landmarks: list[NDArray[np.float32]] = []  # of keyframes that left the window
-        self._landmark_file = LandmarkFile(folder.landmarks, self._all_landmarks)
 
     def _all_landmarks(self) -> NDArray[np.float32]:
         return np.concatenate([*self._landmarks, self._odometry.window.points()])
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
-        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
+        super().open(stack)
         self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
 
     def push(self, event: CameraEvent) -> list[Estimate]:
@@ -146,14 +139,6 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
             self._landmarks.append(estimate.finished_points)
         self.seconds["writing"] += time.perf_counter() - began
 
-    def between_events(self) -> None:
-        """See `RunLoop.between_events`."""
-        self.seconds["writing"] += self._landmark_file.write_if_due()
-
-    def at_end(self, state: State) -> None:
-        """See `RunLoop.at_end`."""
-        self.seconds["writing"] += self._landmark_file.write()
-
     def nothing_found(self) -> InputError:
         """See `RunLoop.nothing_found`."""
         if self._before_start:
@@ -171,39 +156,20 @@ class _Run(RunLoop[CameraEvent, Estimate, DirectSummary]):
 
     def summarize(self, state: State, error: str | None) -> DirectSummary:
         """See `RunLoop.summarize`."""
-        counts, info = self.counts, self._info
+        facts = self.shared_facts(state, error, with_imu=False)
+        if self._cameras.kind == "mono":
+            facts["warnings"].insert(0, WarningFacts(text=_NO_SCALE, count=1))
         return DirectSummary(
-            versions=versions("rosbags", "opencv-python-headless"),
-            state=state,
-            error=error,
-            process=os.getpid(),
-            started=self.started,
-            updated=datetime.now(UTC),
-            recording=recording_facts(info, self.recording.progress, with_imu=False),
+            **facts,
             kind=self._cameras.kind,
             scale="unknown" if self._cameras.kind == "mono" else "metric",
             cameras=self._stream_facts(),
-            frames=counts.count,
             keyframes=self._odometry.keyframes,
             frames_before_start=self._before_start,
             start_problem=self._start_problem,
             landmarks=len(self._all_landmarks()),
-            status=dict(counts.status),
-            first_time_ns=counts.first_time_ns,
-            last_time_ns=counts.last_time_ns,
-            duration_s=counts.duration_s,
-            path_length_m=counts.path_length_m,
-            contradiction=self._contradiction() if counts.count else None,
+            contradiction=self._contradiction() if self.counts.count else None,
             rejected={"recording": self.recording.rejected, "frames": dict(self._pairs.rejected)},
-            weak_intervals=counts.weak_intervals(),
-            timing=frame_timing(self),
-            peak_memory_mb=peak_memory_mb(),
-            warnings=[
-                *([WarningFacts(text=_NO_SCALE, count=1)] if self._cameras.kind == "mono" else []),
-                *counts.status_warnings(),
-                *counts.warnings.facts(counts.first_time_ns),
-                *evidence_warnings(info),
-            ],
         )
 
     def _contradiction(self) -> str | None:

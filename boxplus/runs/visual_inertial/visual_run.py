@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from boxplus.errors import InputError, printable
-from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
-from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recording_facts
+from boxplus.runs.cameras.camera_run import CameraRun
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
-from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById
-from boxplus.runs.estimate_statistics import EstimateStatistics
+from boxplus.runs.cameras.landmark_file import LandmarksById
 from boxplus.runs.run_facts import StartFacts, State
-from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
@@ -95,7 +91,7 @@ def run_visual_odometry(
         return run_of_recording.execute(should_stop or (lambda: False))
 
 
-class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
+class _Run(CameraRun[VioEstimate, VioSummary]):
     """One run of visual-inertial odometry: its writers and its landmarks."""
 
     def __init__(
@@ -107,8 +103,8 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         view: View | None,
     ) -> None:
         text = dump_vio_config(config, recording.info)
-        super().__init__(recording, folder.summary, folder.config, text, EstimateStatistics("frames"), progress)
-        self._info, self._folder, self._config = recording.info, folder, config
+        self._landmarks = LandmarksById()
+        super().__init__(recording, folder, text, progress, self._landmarks.points)
         self._rig = rig_of_recording(recording.info, config.odometry)
         self._odometry = VisualInertialOdometry(config.odometry, self._rig)
         self._view = view
@@ -118,12 +114,10 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         self._push_s = 0.0  # since the frame before
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
         self._time_offset_s = 0.0
-        self._landmarks = LandmarksById()
-        self._landmark_file = LandmarkFile(folder.landmarks, self._landmarks.points)
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
-        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
+        super().open(stack)
         self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
@@ -166,14 +160,6 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
         self._mountings, self._time_offset_s = estimate.T_imu_camera, estimate.time_offset_s
         self.seconds["writing"] += time.perf_counter() - began
 
-    def between_events(self) -> None:
-        """See `RunLoop.between_events`."""
-        self.seconds["writing"] += self._landmark_file.write_if_due()
-
-    def at_end(self, state: State) -> None:
-        """See `RunLoop.at_end`."""
-        self.seconds["writing"] += self._landmark_file.write()
-
     def nothing_found(self) -> InputError:
         """See `RunLoop.nothing_found`."""
         reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
@@ -189,46 +175,25 @@ class _Run(RunLoop[CameraEvent, VioEstimate, VioSummary]):
 
     def summarize(self, state: State, error: str | None) -> VioSummary:
         """See `RunLoop.summarize`."""
-        counts, info, start = self.counts, self._info, self._odometry.start
-        contradiction = self._odometry.contradiction
+        counts, start = self.counts, self._odometry.start
         return VioSummary(
-            versions=versions("rosbags", "opencv-python-headless"),
-            state=state,
-            error=error,
-            process=os.getpid(),
-            started=self.started,
-            updated=datetime.now(UTC),
-            recording=recording_facts(info, self.recording.progress, with_imu=True),
+            **self.shared_facts(state, error, with_imu=True),
             cameras=self._cameras(),
             start=None if start is None else _start_facts(start),
             start_facts={} if start is None else {name: float(value) for name, value in start.facts.items()},
             start_problem=self._odometry.start_problem,
-            frames=counts.count,
             keyframes=self._keyframes,
             frames_before_start=self._before_start,
-            status=dict(counts.status),
-            first_time_ns=counts.first_time_ns,
-            last_time_ns=counts.last_time_ns,
-            duration_s=counts.duration_s,
-            path_length_m=counts.path_length_m,
-            contradiction=contradiction,
+            contradiction=self._odometry.contradiction,
             imu_samples_read=counts.imu_samples_read,
             rejected={
                 "recording": self.recording.rejected,
                 "odometry": dict(self._odometry.counters),
                 "corners": dict(self._rejected),
             },
-            weak_intervals=counts.weak_intervals(),
             imu_gaps=counts.imu_gaps(),
             time_offset_s=self._time_offset_s,
             landmarks=len(self._landmarks),
-            timing=frame_timing(self),
-            peak_memory_mb=peak_memory_mb(),
-            warnings=[
-                *counts.status_warnings(),
-                *counts.warnings.facts(counts.first_time_ns),
-                *evidence_warnings(info),
-            ],
         )
 
     def _cameras(self) -> list[CameraFacts]:
