@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from boxplus.cameras import CameraModel, DoubleSphere, Equidistant
+from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.recordings.cameras.calibration import StatedRig, inverse
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.runs.camera_calibration.summary import CalibrationSummary, mountings
@@ -135,7 +136,6 @@ def _apart(mine: CameraModel, theirs: CameraModel, pixels: NDArray[np.float64]) 
     both = found & seen
     if both.sum() < 3:
         return float("inf")
-    U, _, Vt = np.linalg.svd(also[both].T @ ours[both])
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(also[both].T @ ours[both])
     there, visible = theirs.project(ours[both] @ R.T)
     return float(np.sqrt(np.mean(np.sum((there - pixels[both])[visible] ** 2, axis=1)))) if visible.any() else float("inf")

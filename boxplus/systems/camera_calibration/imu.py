@@ -29,6 +29,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.manifolds.sphere import S2
 from boxplus.optimization import losses
 from boxplus.optimization.problem import Problem
@@ -281,8 +282,7 @@ def _rotation_start(session: _Session, imu: ImuSamples) -> tuple[float, Floats]:
 
 def _kabsch(camera: Floats, gyro: Floats) -> Floats:
     """R with gyro − mean ≈ R (camera − mean)."""
-    U, _, Vt = np.linalg.svd((gyro - gyro.mean(axis=0)).T @ (camera - camera.mean(axis=0)))
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return nearest_rotation((gyro - gyro.mean(axis=0)).T @ (camera - camera.mean(axis=0)))
 
 
 def _state_at_start(session: _Session, imu: ImuSamples, offset_s: float, R_imu_camera: Floats) -> _State:

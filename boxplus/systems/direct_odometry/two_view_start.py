@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, so3
+from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.sensors.image import Image
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.rig import Rig
@@ -144,8 +145,7 @@ def _turn(m1: Matrix, m2: Matrix) -> Matrix:
     a, b = (m / np.linalg.norm(m, axis=1, keepdims=True) for m in (m1, m2))
     weight, R = np.ones(len(a)), np.eye(3)
     for _ in range(5):
-        U, _, Vt = np.linalg.svd((weight[:, None] * b).T @ a)
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = nearest_rotation((weight[:, None] * b).T @ a)
         distance = _distance(R, m1, m2)
         weight = 1.0 / np.maximum(distance, 0.5 * float(np.median(distance)) + 1e-12)
     return R

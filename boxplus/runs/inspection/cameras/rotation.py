@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence, Verdict
 from boxplus.sensors.imu import ImuSamples
@@ -169,8 +170,7 @@ def _typical_misfit(gyro: NDArray[np.float64], camera: NDArray[np.float64]) -> f
 def _misfit(gyro: NDArray[np.float64], camera: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """R_imu_camera, and the sum of squares that it leaves."""
     a, b = gyro - gyro.mean(axis=0), camera - camera.mean(axis=0)
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(a.T @ b)
     return R, float(((a - b @ R.T) ** 2).sum())
 
 
