@@ -1,0 +1,157 @@
+"""Cut the stream of an odometry's scans into local maps, by way and by time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._numbers import as_floats
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.se3 import SE3
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.local_map import Floats, LocalMap, checked_covariance, drift_covariance, relative_covariance
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+
+_UP = np.array([0.0, 0.0, 1.0])
+_LEAST_AHEAD = 0.1  # of the body's x axis in the horizontal plane; below it its y axis gives the heading
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    time_ns: int
+    T_odo_body: Floats
+    covariance: Floats
+    up_odo: Floats
+    path_m: float
+    p_body: NDArray[np.float32]
+
+
+class LocalMapBuilder:
+    """Collects scans until a stretch is long enough, and makes a `LocalMap` of it.
+
+    Example:
+        >>> import numpy as np
+        >>> builder = LocalMapBuilder(LocalMapConfig(length=2.0))
+        >>> maps = []
+        >>> for k in range(6):
+        ...     pose = [1.0, 0.0, 0.0, 0.0, 0.5 * k, 0.0, 0.0]
+        ...     maps += builder.push(k * 100_000_000, pose, np.eye(6) * 1e-6, np.ones((1, 3), np.float32))
+        >>> [m.scans for m in maps]
+        [5]
+    """
+
+    def __init__(self, config: LocalMapConfig | None = None) -> None:
+        self.config = config if config is not None else LocalMapConfig()
+        self._seen: list[_Seen] = []
+        self._last: _Seen | None = None  # the scan that the frame of the last map stands at
+        self._T_odo_before: Floats | None = None
+        self._count = 0
+
+    def push(
+        self, time_ns: int, T_odo_body: ArrayLike, covariance: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike = _UP
+    ) -> list[LocalMap]:
+        """Take a scan; returns the map that it completes, if it does.
+
+        Args:
+            time_ns: absolute [ns], later than the one before.
+            T_odo_body: (7,) pose of the body in the odometry's world [qw, qx, qy, qz, x, y, z].
+            covariance: (6, 6) of [w, v] [rad, m] on the right of that pose, against the first pose.
+            p_body: (N, 3) its points in the body's frame [m]; none where nobody knows where they belong.
+            up_odo: (3,) against gravity, in the odometry's world.
+
+        Raises:
+            InputError: a time that is not later, arrays of another shape, not finite.
+        """
+        pose = SE3.check("T_odo_body", np.atleast_2d(as_floats(T_odo_body, "T_odo_body")))[0]
+        up = as_floats(up_odo, "up_odo")
+        if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0.0:
+            raise InputError("up_odo as a direction (3,)", f"{up.tolist()}", "give minus gravity, in the odometry's world")
+        points = np.asarray(p_body, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError("p_body of shape (N, 3)", f"shape {points.shape}", "give points in the body's frame [m]")
+        newest = self._seen[-1] if self._seen else None
+        if newest is not None and time_ns <= newest.time_ns:
+            raise InputError("scans in order of time", f"{time_ns} ns after {newest.time_ns} ns", "push each scan once")
+        step = 0.0 if newest is None else float(np.linalg.norm(pose[4:] - newest.T_odo_body[4:]))
+        path = 0.0 if newest is None else newest.path_m + step
+        kept = self._thinned(points)
+        own = checked_covariance("covariance", covariance)
+        self._seen.append(_Seen(int(time_ns), pose, own, up / np.linalg.norm(up), path, kept))
+        first = self._seen[0]
+        way, time_s = path - first.path_m, (time_ns - first.time_ns) * 1e-9
+        is_long = way >= self.config.length or (time_s >= self.config.duration and way >= self.config.least_length)
+        return [self._cut()] if is_long else []
+
+    def flush(self) -> list[LocalMap]:
+        """The map of what is left, however short; nothing where nothing is."""
+        return [self._cut()] if len(self._seen) > (1 if self._count else 0) else []
+
+    def _thinned(self, p_body: NDArray[np.float32]) -> NDArray[np.float32]:
+        sq = np.einsum("na,na->n", p_body, p_body)
+        near = p_body[np.isfinite(sq) & (sq <= self.config.max_range**2)]
+        return np.asarray(near[first_per_voxel(near, self.config.voxel)])
+
+    def _cut(self) -> LocalMap:
+        """The map of the collected scans; the last of them begins the next one."""
+        path = np.array([seen.path_m for seen in self._seen])
+        middle = self._seen[int(np.argmin(np.abs(path - 0.5 * (path[0] + path[-1]))))]
+        T_odo_map = _level_frame(middle)
+        points = np.concatenate([self._in_map(seen, T_odo_map) for seen in self._seen])
+        points = points[first_per_voxel(points, self.config.voxel)]
+        begin = self._seen[0].time_ns
+        made = LocalMap(
+            number=self._count,
+            time_ns=middle.time_ns,
+            begin_ns=begin,
+            end_ns=self._seen[-1].time_ns,
+            T_odo_map=T_odo_map,
+            covariance=self._covariance(middle, T_odo_map),
+            path_m=middle.path_m,
+            points=np.ascontiguousarray(points),
+            scans=len(self._seen),
+        )
+        self._count += 1
+        self._last, self._T_odo_before = middle, T_odo_map
+        newest = self._seen[-1]
+        # It stays for the way that the next stretch is measured from; its points are in the map already.
+        self._seen = [
+            _Seen(newest.time_ns, newest.T_odo_body, newest.covariance, newest.up_odo, newest.path_m, newest.p_body[:0])
+        ]
+        return made
+
+    @staticmethod
+    def _in_map(seen: _Seen, T_odo_map: Floats) -> NDArray[np.float32]:
+        T = se3.compose(se3.inverse(T_odo_map), seen.T_odo_body)
+        return np.asarray(seen.p_body @ quaternion.to_matrix(T[:4]).T.astype(np.float32) + T[4:].astype(np.float32))
+
+    def _covariance(self, middle: _Seen, T_odo_map: Floats) -> Floats:
+        if self._last is None or self._T_odo_before is None:
+            return np.zeros((6, 6))
+        before, after = (
+            _moved(seen.covariance, se3.compose(se3.inverse(frame), seen.T_odo_body))
+            for seen, frame in ((self._last, self._T_odo_before), (middle, T_odo_map))
+        )
+        own = relative_covariance(before, after, se3.compose(se3.inverse(self._T_odo_before), T_odo_map))
+        drift = drift_covariance(middle.path_m - self._last.path_m, self.config.drift_rotation, self.config.drift_position)
+        return own + drift
+
+
+def _level_frame(seen: _Seen) -> Floats:
+    """(7,) frame at a body's position with z up and x ahead of it."""
+    R_odo_body, z = quaternion.to_matrix(seen.T_odo_body[:4]), seen.up_odo
+    x = R_odo_body[:, 0] - z * (z @ R_odo_body[:, 0])
+    if np.linalg.norm(x) < _LEAST_AHEAD:
+        y = R_odo_body[:, 1] - z * (z @ R_odo_body[:, 1])
+        x = np.cross(y, z)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z], axis=1)
+    return np.concatenate([quaternion.from_matrix(R), seen.T_odo_body[4:]])
+
+
+def _moved(covariance: Floats, T_map_body: Floats) -> Floats:
+    """A covariance on the right of a body's pose, on the right of that of a frame fixed to it."""
+    Ad = se3.adjoint(T_map_body)
+    return np.asarray(Ad @ covariance @ Ad.T)
