@@ -15,6 +15,7 @@ from .chordal_pose import ChordalPose2D as ChordalPose2D
 from .chordal_pose import chordal_weights as chordal_weights
 from .gicp import Gicp as Gicp
 from .gicp import plane_covariances as plane_covariances
+from .gravity_direction import GravityDirection as GravityDirection
 from .inertial.imu import ImuPreintegration as ImuPreintegration
 from .inertial.imu_noise import ImuNoise as ImuNoise
 from .inertial.imu_preintegration import Preintegration as Preintegration

@@ -138,6 +138,10 @@ def _gicp(rng: np.random.Generator) -> Case:
     return residuals.Gicp(*_points(rng)[:2], covariance, covariance), [SE3.random(rng, 1)[0]]
 
 
+def _gravity(rng: np.random.Generator) -> Case:
+    return residuals.GravityDirection(_points(rng)[2], _points(rng)[2][0]), [SE3.random(rng, COUNT)]
+
+
 def _imu(rng: np.random.Generator) -> Case:
     time_ns = 10**18 + 5_000_000 * np.arange(200)
     begin = time_ns[0] + rng.integers(0, 300_000_000, COUNT)
@@ -164,6 +168,7 @@ CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "ChordalPose": _relative(residuals.ChordalPose, SE3),
     "ChordalPose2D": _relative(residuals.ChordalPose2D, SE2),
     "Gicp": _gicp,
+    "GravityDirection": _gravity,
     "ImuPreintegration": _imu,
     "InverseDepthIntrinsics": _inverse_depth_intrinsics,
     "InverseDepthReprojection": _inverse_depth,

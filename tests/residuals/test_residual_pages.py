@@ -19,6 +19,7 @@ ROWS = [line.split("|")[1:-1] for line in INDEX.splitlines() if line.startswith(
 WITH_PROGRAM = [
     "bal_reprojection",
     "chordal_pose",
+    "gravity_direction",
     "inverse_depth",
     "inverse_depth_intrinsics",
     "line_reprojection",

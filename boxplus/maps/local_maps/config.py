@@ -19,7 +19,7 @@ class LocalMapConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     length: float = Field(20.0, gt=0, description="way after which a local map is cut [m]")
-    duration: float = Field(10.0, gt=0, description="time after which it is cut, where `least_length` has been travelled [s]")
+    duration: float = Field(5.0, gt=0, description="time after which it is cut, where `least_length` has been travelled [s]")
     least_length: float = Field(2.0, ge=0, description="shortest way of a local map: standing still makes none [m]")
     voxel: float = Field(0.25, gt=0, description="side of the voxels that keep one point each [m]")
     max_range: float = Field(80.0, gt=0, description="farther points are left out: angles blur them [m]")

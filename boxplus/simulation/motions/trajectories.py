@@ -193,7 +193,7 @@ def along_route(
     corners = np.asarray(route_xy, dtype=np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2:
         raise InputError("a route of at least two corners (W, 2)", f"shape {corners.shape}", "give x, y of every corner")
-    path, curvature, heading = _rounded(corners, radius)
+    path, curvature, heading = rounded(corners, radius)
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     limit = np.minimum(speed, np.sqrt(lateral / np.maximum(curvature, 1e-9)))
     limit[0] = limit[-1] = 0.0
@@ -217,7 +217,7 @@ def along_route(
     return time, np.stack([x, y, np.zeros_like(x)], axis=1), yaw, moving
 
 
-def _rounded(corners: Floats, radius: float, spacing: float = 0.1) -> tuple[Floats, Floats, Floats]:
+def rounded(corners: Floats, radius: float, spacing: float = 0.1) -> tuple[Floats, Floats, Floats]:
     """Points about `spacing` apart on the polyline with arcs for corners, with their curvature and heading."""
     xy: list[Floats] = [corners[:1]]
     curvatures: list[Floats] = [np.zeros(1)]

@@ -1,0 +1,1 @@
+"""Loop closure on the local maps of an odometry."""

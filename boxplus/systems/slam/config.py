@@ -1,0 +1,53 @@
+"""The settings of loop closure. None has to be given."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus.maps.descriptors.config import DescriptorConfig
+
+
+class RegistrationConfig(BaseModel):
+    """How two local maps are laid over each other, and what their covariance is made of."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    thickness: float = Field(0.15, gt=0, description="a plane's points lie within this of it [m]")
+    near: float = Field(0.5, gt=0, description="a point overlaps with a map that has one within this [m]")
+    cluster: float = Field(4.0, gt=0, description="side of the cells within which residuals may be correlated fully [m]")
+    inflation: float = Field(2.0, gt=0, description="factor of the covariance, from simulated worlds")
+    floor_rotation: float = Field(5e-4, ge=0, description="smallest standard deviation of a rotation [rad]")
+    floor_position: float = Field(0.01, ge=0, description="smallest standard deviation of a position [m]")
+    weak_information: float = Field(0.01, ge=0, description="a direction with less information per point is not measured")
+    weak_sigma: float = Field(0.3, gt=0, description="nor one with a larger standard deviation [m at the points]")
+    open_sigma: float = Field(2.0, gt=0, description="standard deviation stated for what was not measured [m at the points]")
+    threads: int = Field(1, ge=1, description="the result does not depend on it")
+
+
+class SlamConfig(BaseModel):
+    """Which loops are looked for, and which are believed.
+
+    Raises:
+        pydantic.ValidationError: a setting is unknown or out of range.
+
+    Example:
+        >>> SlamConfig(least_overlap=0.6).least_overlap
+        0.6
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    descriptor: DescriptorConfig = Field(DescriptorConfig(), description="see DescriptorConfig")
+    registration: RegistrationConfig = Field(RegistrationConfig(), description="see RegistrationConfig")
+    appearance: bool = Field(True, description="look for places that look alike; needs the extra vision")
+    least_way: float = Field(30.0, ge=0, description="way between two visits of a loop, at least [m]")
+    nearby: float = Field(12.0, ge=0, description="places within this of where one should be are tried [m]; 0: none")
+    nearby_sigma: float = Field(3.0, gt=0, description="where the position against them is known to this [m]")
+    nearby_count: int = Field(3, ge=0, description="how many of them")
+    least_overlap: float = Field(0.5, ge=0, le=1, description="share of points of either map that the other one has too")
+    largest_rms: float = Field(1.5, gt=0, description="distances to planes against those of successive maps, at most")
+    least_measured: int = Field(3, ge=1, le=6, description="directions of the pose that the surfaces determine")
+    innovation: float = Field(0.999, gt=0, lt=1, description="probability of a true loop to agree with the odometry")
+    odometry_scale: float = Field(1.5, gt=0, description="factor of the odometry's standard deviations in that test")
+    rival_distance: float = Field(1.5, gt=0, description="as good a fit this far away makes a loop ambiguous [m]")
+    gravity_sigma: float = Field(0.005, gt=0, description="standard deviation of the vertical of a local map [rad]")

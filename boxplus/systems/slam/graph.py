@@ -1,0 +1,114 @@
+"""The pose graph of local maps: odometry that is never an outlier, loops that may be, and the vertical of each map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.graduated import graduate
+from boxplus.optimization.losses import Squared
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.residuals.gravity_direction import GravityDirection
+from boxplus.residuals.relative_pose import RelativePose
+from boxplus.systems.slam.loop import Floats, Loop
+
+_LOOPS = "loops"
+_INLIER = 0.999  # of true loops within the threshold
+_DAMPING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedGraph:
+    """Poses of the local maps in the map.
+
+    Attributes:
+        T_map: (n, 7).
+        is_kept: (loops,) which loops the result rests on.
+        errors: (loops,) what each of them is off by at the result, in standard deviations.
+        solution: with history and covariance of the block `poses`.
+    """
+
+    T_map: Floats
+    is_kept: NDArray[np.bool_]
+    errors: Floats
+    solution: Solution
+
+
+def close_graph(
+    T_odo: Sequence[Floats],
+    covariances: Sequence[Floats],
+    loops: Sequence[Loop],
+    gravity_sigma: float,
+    forced: Sequence[bool] = (),
+) -> ClosedGraph:
+    """Minimise over the poses of local maps, the first held where it is.
+
+    Truncated least squares by graduated non-convexity on the loops alone (Yang, Antonante, Tzoumas and Carlone, RA-L 2020); the
+    odometry, which holds everything together, is heard first.
+
+    Args:
+        T_odo: n poses (7,) along the odometry.
+        covariances: n of (6, 6), that of each pose in the one before; the first is not looked at.
+        loops: at least one; `forced` ones are believed whatever they say.
+    """
+    poses = np.stack(T_odo)
+    steps = np.arange(len(poses) - 1)
+    problem = Problem()
+    x = problem.add_variables(SE3, poses, name="poses")
+    measured = se3.compose(se3.inverse(poses[:-1]), poses[1:])
+    problem.add_residuals(RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry")
+    ups = quaternion.to_matrix(poses[:, :4])[:, :, 2]
+    up = ups.mean(axis=0)
+    # Every map's z axis is its own measurement of the vertical; their mean is that of the odometry's world.
+    vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), up / np.linalg.norm(up), sigma=gravity_sigma)
+    problem.add_residuals(vertical, x, name="gravity")
+    problem.fix(x[0:1])
+    is_forced = np.array(forced, dtype=np.bool_) if len(forced) else np.zeros(len(loops), dtype=np.bool_)
+    rows = {"forced": np.flatnonzero(is_forced), _LOOPS: np.flatnonzero(~is_forced)}
+    groups = {}
+    for name, own in rows.items():
+        if len(own):
+            chosen = [loops[k] for k in own.tolist()]
+            residual = RelativePose(
+                np.stack([loop.T_place_query for loop in chosen]), information=np.stack([loop.information for loop in chosen])
+            )
+            i, j = np.array([[loop.place, loop.query] for loop in chosen]).T
+            groups[name] = problem.add_residuals(residual, x[i], x[j], name=name)
+    options = SolverOptions(initial_damping=_DAMPING)
+    is_kept = np.ones(len(loops), dtype=np.bool_)
+    if _LOOPS in groups:
+        group = groups[_LOOPS]
+        dof = np.array([loops[k].measured for k in rows[_LOOPS].tolist()])
+        found = graduate(
+            problem,
+            group,
+            loss="truncated",
+            inlier_threshold=_threshold(int(dof.max())),
+            weights={_LOOPS: np.zeros(len(dof))},
+            options=options,
+        )
+        group.set_loss(Squared())
+        kept = found.inliers[_LOOPS]
+        problem.set_weights(group, kept.astype(np.float64))
+        is_kept[rows[_LOOPS]] = kept
+        solution = problem.solve(options, start=found.solution)
+    else:
+        solution = problem.solve(options)
+    errors = np.zeros(len(loops))
+    for name, group in groups.items():
+        errors[rows[name]] = np.sqrt(group.squares(solution.values))
+    return ClosedGraph(solution[x], is_kept, errors, solution)
+
+
+def _threshold(dof: int) -> float:
+    from scipy.stats import chi2
+
+    return math.sqrt(float(chi2.ppf(_INLIER, dof)))

@@ -1,0 +1,252 @@
+"""Two local maps laid over each other: points of one on the planes of the other, and a covariance that means something.
+
+Residuals are e = uᵀ(T p − q) with the plane (u, q) through the nearest points of the target. Their Gauss-Newton normal matrix H
+is
+no inverse covariance: a thousand points on one wall share the wall's error. With the gradients g_c = Σ J e w added up over cells
+of a few metres, within which residuals may be as correlated as they like, the covariance of the minimum is
+
+    Σ = κ H⁻¹ (Σ_c g_c g_cᵀ) H⁻¹ + D      (Liang and Zeger, Biometrika 1986),
+
+with κ from simulated worlds, and D for maps that the odometry bent while it made them (docs/slam.md). Directions without
+information of their own are told by the eigenvalues of H, per point and against what noise of the normals alone would give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._jit import kernel, run_chunks
+from boxplus.manifolds import quaternion, se3
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, IkdView, copy_found, knn
+from boxplus.maps.ikd_tree.tree import IkdTree
+from boxplus.maps.plane_fit import fit_plane_into
+from boxplus.systems.slam.config import RegistrationConfig
+
+Floats = NDArray[np.float64]
+
+_NEIGHBOURS = 8  # a plane is fitted to
+_CHUNK = 1024
+_STAGES = ((2.0, 4, 2000), (1.2, 6, 4000), (0.8, 20, 12_000))  # largest distance of a plane's points [m], steps, points
+_STEP = 2e-4  # m, at the points: shorter ones are the end
+_FEWEST = 60  # points on planes
+_SCALE = 1.4826  # from the median of |e| to a standard deviation
+_LEAST_SCALE = 0.01  # m, of the residuals
+_NOISE = 2.0  # times the information that noise of the normals alone gives
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """A source laid over a target.
+
+    Attributes:
+        T_target_source: (7,).
+        covariance: (6, 6) of [w, v] [rad, m] on the right of it; `open_sigma` along weak directions.
+        information: (6, 6), its inverse on the directions that were measured, zero along the others.
+        weak: (k, 6) unit directions in the source's frame, turns scaled by `lever_m`, that the surfaces leave open.
+        lever_m: mean distance of the points from their middle, which makes turns and shifts comparable.
+        overlap: shares of the source's points near the target, and of the target's near the source.
+        rms: robust standard deviation of the distances to the planes [m].
+        on_planes: how many points of the source were used.
+    """
+
+    T_target_source: Floats
+    covariance: Floats
+    information: Floats
+    weak: Floats
+    lever_m: float
+    overlap: tuple[float, float]
+    rms: float
+    on_planes: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """The points (N, 3) float32 of a local map [m], and a tree over them."""
+
+    points: NDArray[np.float32]
+    tree: IkdTree
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32]) -> Surface:
+        return cls(points, IkdTree(points, rebuild="inplace"))
+
+
+def register(
+    source: Surface,
+    target: Surface,
+    T_start: Floats,
+    config: RegistrationConfig | None = None,
+    deformation: Floats | None = None,
+) -> Registration | None:
+    """Lay a source over a target; None where too few points find a plane.
+
+    Args:
+        T_start: (7,) T_target_source to start from.
+        deformation: (6, 6) covariance D of what the maps themselves are bent by, on the right of it; none if left out.
+
+    Example: docs/slam.md.
+    """
+    config = config if config is not None else RegistrationConfig()
+    T = np.array(T_start, dtype=np.float64)
+    found = None
+    for distance, steps, count in _STAGES:
+        points = _spread(source.points, count)
+        for _ in range(steps):
+            found = _Matched.of(points, target, T, distance, config)
+            if found is None:
+                return None
+            step, length = found.step(config.weak_information)
+            T = se3.compose(T, se3.exp(step))
+            if length < _STEP:
+                break
+    if found is None:
+        return None
+    found = _Matched.of(points, target, T, distance, config)
+    if found is None:
+        return None
+    covariance, information, weak = found.covariance(config, np.zeros((6, 6)) if deformation is None else deformation)
+    overlap = (
+        _share_near(source.points, target, T, config.near),
+        _share_near(target.points, source, se3.inverse(T), config.near),
+    )
+    return Registration(T, covariance, information, weak, found.lever, overlap, found.scale, len(found.e))
+
+
+def surface_distance(source: Surface, target: Surface, T_target_source: Floats, config: RegistrationConfig) -> float | None:
+    """Robust standard deviation of the distances of a source's points to the target's planes [m], laid over it as given."""
+    distance, _, count = _STAGES[-1]
+    found = _Matched.of(_spread(source.points, count // 4), target, T_target_source, distance, config)
+    return None if found is None else found.scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matched:
+    """Points on planes, linearised about their middle: ξ' = [lever · w, v'] moves them there."""
+
+    e: Floats
+    J: Floats
+    weight: Floats
+    cell: NDArray[np.int64]
+    to_origin: Floats
+    lever: float
+    scale: float
+    of_noise: float
+
+    @classmethod
+    def of(
+        cls, points: NDArray[np.float32], target: Surface, T: Floats, distance: float, config: RegistrationConfig
+    ) -> _Matched | None:
+        count = len(points)
+        planes, valid = np.empty((count, 5)), np.zeros(count, dtype=np.bool_)
+        view, origin = target.tree.view(), target.tree.origin
+
+        def work(_: int, begin: int, end: int) -> None:
+            sq = np.empty(_NEIGHBOURS, dtype=np.float32)
+            near = np.empty((_NEIGHBOURS, 3), dtype=np.float32)
+            stack = np.empty(STACK_DEPTH + _NEIGHBOURS, dtype=STACK)
+            _match_planes(
+                view, origin, T, points, begin, end, distance * distance, config.thickness, planes, valid, sq, near, stack
+            )
+
+        run_chunks(work, count, _CHUNK, config.threads)
+        if np.count_nonzero(valid) < _FEWEST:
+            return None
+        p, plane = points[valid].astype(np.float64), planes[valid]
+        middle = p.mean(axis=0)
+        arm = p - middle
+        lever = max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1.0)
+        C = plane[:, :3] @ quaternion.to_matrix(T[:4])
+        J = np.hstack([np.cross(arm, C) / lever, C])
+        e = plane[:, 3]
+        scale = max(_SCALE * float(np.median(np.abs(e))), _LEAST_SCALE)
+        weight = 1.0 / (1.0 + (e / (2.0 * scale)) ** 2) ** 2
+        where = np.floor((quaternion.to_matrix(T[:4]) @ p.T).T / config.cluster).astype(np.int64)
+        _, cell = np.unique(where, axis=0, return_inverse=True)
+        # w about the middle moves the origin: v = v' + middle × w … on the right, T Exp(ξ) with ξ = A ξ'.
+        A = np.eye(6)
+        A[:3, :3] /= lever
+        x, y, z = middle
+        A[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / lever
+        return cls(e, J, weight, cell.ravel(), A, lever, scale, float(weight @ plane[:, 4]))
+
+    def _modes(self, weak_information: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        H = self.J.T @ (self.J * self.weight[:, None])
+        values, vectors = np.linalg.eigh(H)
+        # Normals that noise tilts seem to measure what they do not: in sum, that much of any direction.
+        return values, vectors, np.asarray(values > max(weak_information * self.weight.sum(), _NOISE * self.of_noise))
+
+    def step(self, weak_information: float) -> tuple[Floats, float]:
+        """The Gauss-Newton step [w, v] within the measured directions, and its length at the points [m]."""
+        values, vectors, good = self._modes(weak_information)
+        g = vectors[:, good].T @ (self.J.T @ (self.weight * self.e))
+        step = -vectors[:, good] @ (g / values[good])
+        return self.to_origin @ step, float(np.linalg.norm(step))
+
+    def covariance(self, config: RegistrationConfig, deformation: Floats) -> tuple[Floats, Floats, Floats]:
+        values, vectors, good = self._modes(config.weak_information)
+        gradients = np.zeros((int(self.cell.max()) + 1, 6))
+        np.add.at(gradients, self.cell, self.J * (self.weight * self.e)[:, None])
+        V = vectors[:, good]
+        G = gradients @ V / values[good]
+        own = config.inflation * (G.T @ G)
+        floor = np.diag(np.repeat([(config.floor_rotation * self.lever) ** 2, config.floor_position**2], 3))
+        back = np.linalg.inv(self.to_origin)
+        own += V.T @ (floor + back @ deformation @ back.T) @ V
+        sigma, axes = np.linalg.eigh(own)
+        measured = sigma < config.weak_sigma**2
+        strong = V @ axes[:, measured]
+        weak = np.vstack([vectors[:, ~good].T, (V @ axes[:, ~measured]).T])
+        information = back.T @ ((strong / sigma[measured]) @ strong.T) @ back
+        open_ = config.open_sigma**2 * weak.T @ weak
+        covariance = self.to_origin @ ((strong * sigma[measured]) @ strong.T + open_) @ self.to_origin.T
+        return 0.5 * (covariance + covariance.T), 0.5 * (information + information.T), weak
+
+
+def _spread(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """About `count` of the points, one in so many."""
+    return np.ascontiguousarray(points[:: max(len(points) // count, 1)])
+
+
+def _share_near(points: NDArray[np.float32], target: Surface, T: Floats, distance: float) -> float:
+    chosen = se3.act(T, _spread(points, 4000).astype(np.float64))
+    return float(np.mean(target.tree.nearest(chosen, 1, max_distance=distance).counts > 0))
+
+
+@kernel
+def _match_planes(
+    view: IkdView,
+    origin: Floats,
+    T: Floats,
+    points: NDArray[np.float32],
+    begin: int,
+    end: int,
+    max_sq: float,
+    thickness: float,
+    planes: Floats,
+    valid: NDArray[np.bool_],
+    sq: NDArray[np.float32],
+    near: NDArray[np.float32],
+    stack: NDArray[np.void],
+) -> None:
+    """Unit normal of, and signed distance to, the planes of the nearest neighbours; and the variance of the normal [rad²]."""
+    R = quaternion.rotation_entries(T[0], T[1], T[2], T[3])
+    fit = np.empty(9)
+    for n in range(np.uint64(begin), np.uint64(end)):
+        px, py, pz = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        x = R[0] * px + R[1] * py + R[2] * pz + T[4] - origin[0]
+        y = R[3] * px + R[4] * py + R[5] * pz + T[5] - origin[1]
+        z = R[6] * px + R[7] * py + R[8] * pz + T[6] - origin[2]
+        found = knn(view, np.float32(x), np.float32(y), np.float32(z), np.float32(max_sq), sq, stack)
+        valid[n] = False
+        if found < _NEIGHBOURS:
+            continue
+        copy_found(view, stack, _NEIGHBOURS, _NEIGHBOURS, near)
+        if not fit_plane_into(near, _NEIGHBOURS, thickness, fit):
+            continue
+        planes[n, 0], planes[n, 1], planes[n, 2] = fit[0], fit[1], fit[2]
+        planes[n, 3] = fit[0] * x + fit[1] * y + fit[2] * z - fit[3]
+        planes[n, 4] = fit[7] / fit[8]
+        valid[n] = True

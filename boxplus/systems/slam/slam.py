@@ -1,0 +1,201 @@
+"""Loop closure: local maps of an odometry in, the places seen again and the corrected poses out. Derivations: docs/slam.md.
+
+slam = Slam()
+for local_map in local_maps:
+    for loop in slam.add(local_map):
+        …                                  # every loop that was looked at, with what spoke for and against it
+corrected = slam.correction().apply(time_ns, T_odo_body)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds import se3
+from boxplus.maps.descriptors.features import Features, describe
+from boxplus.maps.descriptors.place_index import PlaceIndex
+from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.systems.slam.config import SlamConfig
+from boxplus.systems.slam.consistency import agree, largest_clique
+from boxplus.systems.slam.correction import Correction
+from boxplus.systems.slam.graph import close_graph
+from boxplus.systems.slam.loop import Floats, Loop
+from boxplus.systems.slam.odometry_chain import OdometryChain
+from boxplus.systems.slam.proposals import Proposal, propose
+from boxplus.systems.slam.registration import Surface, surface_distance
+from boxplus.systems.slam.verification import verify
+
+Pair = tuple[int, int]
+"""Numbers of two local maps, (query, place), the later one first."""
+
+_KEPT_SURFACES = 12  # trees over local maps are built again where they are older
+
+
+class Slam:
+    """Closes loops over the local maps of one odometry, which itself is never touched.
+
+    Args:
+        config: settings; each has a default.
+        forbidden: pairs of local maps that are no loop, whatever they look like.
+        forced: pairs that are one: no test refuses it, and it is registered from where the odometry has it.
+
+    Attributes:
+        loops: every loop that was looked at, the latest state of each.
+        T_map: (7,) of each local map, as estimated now.
+
+    Raises:
+        InputError: a pair that is forbidden and forced, or not of an earlier map; OpenCV, the extra `vision`, is not installed.
+
+    Example: docs/slam.md.
+    """
+
+    def __init__(self, config: SlamConfig | None = None, *, forbidden: Iterable[Pair] = (), forced: Iterable[Pair] = ()) -> None:
+        self.config = config if config is not None else SlamConfig()
+        self._forbidden, self._forced = _checked_pairs(forbidden, forced)
+        self._maps: list[LocalMap] = []
+        self._odometry = OdometryChain()
+        self._index = PlaceIndex(self.config.descriptor)
+        self._surfaces: dict[int, Surface] = {}
+        self._rms: list[float] = []
+        self.loops: list[Loop] = []
+        self.T_map: list[Floats] = []
+
+    def add(self, local_map: LocalMap) -> list[Loop]:
+        """Take the next local map; returns the loops that were looked at for it, most of them refused.
+
+        Raises:
+            InputError: a map whose number is not the next.
+        """
+        query = len(self._maps)
+        if local_map.number != query:
+            raise InputError(f"local map {query}", f"number {local_map.number}", "add the maps of one builder in their order")
+        self._maps.append(local_map)
+        self._odometry.add(local_map)
+        self.T_map.append(self._predicted(query))
+        self._rms.append(self._rms_of_odometry(query))
+        features = self._described(local_map)
+        proposals = self._proposals(query, features)
+        if features is not None:
+            self._index.add(features)
+        verified = [self._verified(query, proposal) for proposal in proposals]
+        looked_at = _without_contradictions(verified, self._odometry, self.config)
+        first = len(self.loops)
+        self.loops += _best_of_each_place(looked_at)
+        if any(loop.refusal is None for loop in self.loops[first:]):
+            self._close()
+        return self.loops[first:]
+
+    def correction(self) -> Correction:
+        """What closing the loops changed; the identity where there was none.
+
+        Raises:
+            InputError: no local map yet.
+        """
+        if not self._maps:
+            raise InputError("a local map at least", "none", "add one first")
+        return Correction(
+            np.array([m.time_ns for m in self._maps], dtype=np.int64), np.stack(self._odometry.poses), np.stack(self.T_map)
+        )
+
+    def _close(self) -> None:
+        """Believe the largest set of loops that agree with each other and with the odometry, and move the maps."""
+        standing = [k for k, loop in enumerate(self.loops) if loop.refusal is None]
+        forced = [k for k in standing if self.loops[k].source == "forced"]
+        free = [k for k in standing if self.loops[k].source != "forced"]
+        agree = free if len(free) < 2 else [free[k] for k in largest_clique(self._consistent(free))]
+        chosen = sorted(forced + agree)
+        graph = close_graph(
+            self._odometry.poses,
+            [m.covariance for m in self._maps],
+            [self.loops[k] for k in chosen],
+            self.config.gravity_sigma,
+            [k in forced for k in chosen],
+        )
+        self.T_map = list(graph.T_map)
+        kept = {k for k, is_kept in zip(chosen, graph.is_kept, strict=True) if is_kept}
+        for k in standing:
+            self.loops[k] = replace(self.loops[k], weight=float(k in kept))
+
+    def _consistent(self, numbers: list[int]) -> NDArray[np.bool_]:
+        adjacent = np.eye(len(numbers), dtype=np.bool_)
+        for a, first in enumerate(numbers):
+            for b in range(a):
+                adjacent[a, b] = adjacent[b, a] = agree(self.loops[first], self.loops[numbers[b]], self._odometry, self.config)
+        return adjacent
+
+    def _predicted(self, query: int) -> Floats:
+        """Where a new local map is, from the corrected pose of the one before."""
+        poses = self._odometry.poses
+        return poses[0] if query == 0 else se3.compose(self.T_map[-1], se3.compose(se3.inverse(poses[-2]), poses[-1]))
+
+    def _described(self, local_map: LocalMap) -> Features | None:
+        return describe(local_map.points, self.config.descriptor) if self.config.appearance else None
+
+    def _proposals(self, query: int, features: Features | None) -> list[Proposal]:
+        way = self._maps[query].path_m - np.array([m.path_m for m in self._maps])
+        before = int(np.count_nonzero(way >= self.config.least_way))
+        found = propose(query, features, self._index, self._odometry, before, self.T_map, self.config)
+        free = [p for p in found if (query, p.place) not in self._forbidden and (query, p.place) not in self._forced]
+        wanted = sorted(place for q, place in self._forced if q == query)
+        T = self.T_map
+        return [Proposal(place, se3.compose(se3.inverse(T[place]), T[query]), "forced") for place in wanted] + free
+
+    def _verified(self, query: int, proposal: Proposal) -> Loop:
+        rms = max(self._rms[query], self._rms[proposal.place])
+        maps = self._maps[query], self._maps[proposal.place]
+        surfaces = self._surface(query), self._surface(proposal.place)
+        loop = verify(proposal, maps, surfaces, rms, self._odometry, self.config)
+        return replace(loop, refusal=None) if proposal.source == "forced" and loop.information.any() else loop
+
+    def _rms_of_odometry(self, query: int) -> float:
+        """How well a map fits the one before it: what the odometry's own errors make of surfaces [m]."""
+        if query == 0:
+            return 0.0
+        start = se3.compose(se3.inverse(self._odometry.poses[query - 1]), self._odometry.poses[query])
+        found = surface_distance(self._surface(query), self._surface(query - 1), start, self.config.registration)
+        return self._rms[-1] if found is None else found
+
+    def _surface(self, number: int) -> Surface:
+        if number not in self._surfaces:
+            if len(self._surfaces) >= _KEPT_SURFACES:
+                del self._surfaces[next(iter(self._surfaces))]
+            self._surfaces[number] = Surface.of(self._maps[number].points)
+        return self._surfaces[number]
+
+
+def _checked_pairs(forbidden: Iterable[Pair], forced: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]:
+    sets = tuple({(int(a), int(b)) for a, b in pairs} for pairs in (forbidden, forced))
+    for query, place in sets[0] | sets[1]:
+        if not 0 <= place < query:
+            raise InputError("pairs (query, place) of local maps, the later one first", f"({query}, {place})", "see loops.csv")
+    if both := sets[0] & sets[1]:
+        raise InputError("loops that are forbidden or forced", f"both for {sorted(both)[0]}", "take it out of one of the lists")
+    return sets[0], sets[1]
+
+
+def _best_of_each_place(loops: list[Loop]) -> list[Loop]:
+    """One loop for each place: an accepted one before a refused one, then the larger overlap."""
+    best: dict[int, Loop] = {}
+    for loop in loops:
+        known = best.get(loop.place)
+        if known is None or (loop.refusal is None, min(loop.overlap)) > (known.refusal is None, min(known.overlap)):
+            best[loop.place] = loop
+    return list(best.values())
+
+
+def _without_contradictions(loops: list[Loop], odometry: OdometryChain, config: SlamConfig) -> list[Loop]:
+    """One cannot be at two places at once: where two loops of a query contradict each other, neither is believed."""
+    refused: dict[int, str] = {}
+    for a, first in enumerate(loops):
+        for b in range(a):
+            second = loops[b]
+            is_asked = first.refusal is None and second.refusal is None and "forced" not in (first.source, second.source)
+            if is_asked and not agree(first, second, odometry, config):
+                refused[a] = f"contradicts the loop with {second.place}, which fits as well"
+                refused[b] = f"contradicts the loop with {first.place}, which fits as well"
+    return [replace(loop, refusal=refused[k]) if k in refused else loop for k, loop in enumerate(loops)]
