@@ -23,6 +23,8 @@ _SHORTEST_SPAN, _LONGEST_SPAN = 0.05, 1.5
 _LIKELY_PERIODS_S = (0.02, 0.5)
 _FARTHEST_FROM_STAMP_NS = 10_000_000_000
 _SAME_CLOCK_NS = 1_000_000_000
+_STAMPED = 1e-3  # of a scan's duration: received with its stamp, as far as a recorder tells them apart
+_A_SCAN = (0.9, 1.9)  # scans' durations after the stamp at which a message arrives whose stamp is the start
 _EARLY_NS = 10_000_000  # that an IMU message may take longer than a scan to arrive
 
 
@@ -108,7 +110,8 @@ def read_point_time(
     period = scan_period_s(clouds)
     unit, unit_evidence = _read_unit(field, clouds, period, options)
     reference, anchor, text = _read_reference(field, clouds, unit, period, imu_delay_ns, options)
-    evidence = Evidence("point_time_reference", reference, "ok", text)
+    doubt = _doubt(clouds, UNIT_NS[unit], imu_delay_ns) if options.point_time_reference == "scan_end" and anchor == "last" else ""
+    evidence = Evidence("point_time_reference", reference, "warning" if doubt else "ok", text + doubt)
     return PointTimeReading(field, unit, reference, anchor), [unit_evidence, evidence]
 
 
@@ -200,10 +203,10 @@ def _read_reference(
 def _confirm_scan_start(clouds: list[CloudTimes], seconds: str, last_ns: float, imu_delay_ns: float | None) -> str:
     """Check positive times against reception: no message arrives before its last point was measured."""
     delay = float(np.median([cloud.received_ns - cloud.stamp_ns for cloud in clouds]))
-    if abs(delay) < 1e-3 * last_ns:
+    if abs(delay) < _STAMPED * last_ns:
         return f"the values run {seconds}, from the stamp; messages were recorded with their stamps, which confirms nothing"
     relative_delay = delay - (imu_delay_ns or 0.0)
-    if relative_delay >= 0.9 * last_ns:
+    if relative_delay >= _A_SCAN[0] * last_ns:
         arrived = f"the messages arrived {relative_delay * 1e-9:.3f} s after their stamps, when the scan was over"
         return f"the values run {seconds}, and {arrived}"
     when = "after"
@@ -219,6 +222,24 @@ def _confirm_scan_start(clouds: list[CloudTimes], seconds: str, last_ns: float, 
         f"messages received {abs(relative_delay) * 1e-9:.3f} s {when} their stamps{against}: {meaning}",
         "decide with --point-time-reference scan_start (the usual case) or scan_end; 'boxplus inspect' then measures the offset, "
         "which --lidar-time-offset corrects",
+    )
+
+
+def _doubt(clouds: list[CloudTimes], scale: int, imu_delay_ns: float | None) -> str:
+    """What speaks against stamps at the ends of scans: that messages arrive a whole scan after them, as if these were begins.
+
+    Read wrongly, everything the LiDAR sees is one scan early: a steady motion shows nothing of it, and every pose is where the
+    platform was a scan ago.
+    """
+    span = float(np.median([cloud.high - cloud.low for cloud in clouds])) * scale
+    received = float(np.median([cloud.received_ns - cloud.stamp_ns for cloud in clouds]))
+    delay = received - (imu_delay_ns or 0.0)
+    if abs(received) < _STAMPED * span or not _A_SCAN[0] * span <= delay <= _A_SCAN[1] * span:
+        return ""
+    return (
+        f", but the messages arrived {delay * 1e-9:.3f} s after their stamps, a scan of {span * 1e-9:.3f} s and a little, "
+        "as they do when the stamp is the start of the scan; check --point-time-reference, which otherwise shifts the whole "
+        "trajectory by that duration"
     )
 
 

@@ -97,6 +97,26 @@ def test_messages_recorded_with_their_stamps_are_read_from_the_start() -> None:
     assert reading.reference == "scan_start" and "confirms nothing" in evidence[1].text
 
 
+@pytest.mark.parametrize(
+    ("delay_ms", "imu_delay_ms", "doubted"),
+    [(105, 2, True), (150, None, True), (160, 120, False), (3, 0, False), (0, 0, False), (5000, 0, False)],
+)
+def test_a_reference_that_the_arrival_of_messages_contradicts_is_doubted(
+    delay_ms: int, imu_delay_ms: int | None, doubted: bool
+) -> None:
+    """Stamps at the ends of scans are fresh when they arrive; those at the begins are a scan old."""
+    given = RecordingOptions(point_time_reference="scan_end")
+    clouds = clouds_of(lambda _: np.linspace(0.0, 0.1, 50), 100_000_000, delay_ns=delay_ms * 1_000_000)
+    imu_delay_ns = None if imu_delay_ms is None else imu_delay_ms * 1e6
+    reading, evidence = read_point_time("time", clouds, imu_delay_ns, given)
+    assert reading == PointTimeReading("time", "s", "scan_end", "last")  # who gives it decides
+    assert (evidence[1].verdict == "warning") == doubted
+    assert ("as they do when the stamp is the start of the scan" in evidence[1].text) == doubted
+    # Values that count up to the stamp say themselves that it is the end.
+    clouds = clouds_of(lambda _: np.linspace(-0.1, 0.0, 50), 100_000_000, delay_ns=delay_ms * 1_000_000)
+    assert read_point_time("time", clouds, imu_delay_ns, given)[1][1].verdict == "ok"
+
+
 def test_a_span_that_is_no_scan_is_refused_or_warned_about() -> None:
     clouds = clouds_of(lambda _: np.linspace(0.0, 3.0, 50), 100_000_000, delay_ns=0)
     with pytest.raises(RecordingError, match=r"a span of 3 a scan, which is no scan in any of these units.*--point-time-unit"):
