@@ -116,6 +116,10 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     assert judge.judge(judge.Outcome(2, "IMU stamps 100 ms apart"), None, faulty).verdict == "right cause"
     refused = judge.judge(judge.Outcome(2, "no start was found"), None, sound)
     assert (refused.verdict, refused.false_alarm) == ("flagged", "flagged")
+    unseen = judge.Outcome(2, "no start: not at rest (…), and the surroundings do not show how fast the platform moves along x")
+    for featureless, alarm in ((True, ""), (False, "flagged")):
+        refused = judge.judge(unseen, None, replace(sound, featureless=featureless))
+        assert (refused.verdict, refused.false_alarm) == ("flagged", alarm)
 
 
 def test_an_error_lies_where_it_arose(campaign: SimpleNamespace, seed: int) -> None:

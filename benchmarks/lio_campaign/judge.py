@@ -14,7 +14,8 @@ right when at every scan
 That scans are `weak` or `lost` counts as a flag when at least half of the error arose in such scans, and not otherwise.
 
 Where a place is featureless, nothing tells rest from a constant speed. That a run says so is no false alarm as long as it says
-nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it.
+nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it. Nor is it one
+that a run refuses there because the surroundings do not show how the platform moves.
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ _OPTION_CAUSES = {
 _UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
 _WEAK = re.compile(r"scans are weak")
 _NOT_SHOWN = re.compile(r"^the surroundings do not show whether the platform moves along")
+_REFUSED_FOR_IT = re.compile(r"and the surroundings do not show how (fast )?the platform (moves|turns)")
 
 
 class Truth(Protocol):
@@ -239,7 +241,8 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
         reasons += ["error"] * bool(errors.too_far.any()) + ["covariance"] * bool(errors.too_sure.any())
     sound = draw.kinds.fault == "none"
     weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
-    nothing_shown = draw.featureless and all(_NOT_SHOWN.search(text) for text in flags) and (weak or "covariance" not in reasons)
+    said = _NOT_SHOWN if outcome.error is None else _REFUSED_FOR_IT
+    nothing_shown = draw.featureless and all(said.search(text) for text in flags) and (weak or "covariance" not in reasons)
     false_alarm = "" if not sound else "flagged" if flags and not nothing_shown else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)

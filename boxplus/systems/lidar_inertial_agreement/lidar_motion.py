@@ -25,6 +25,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.registration import (
+    FEWEST_USED,
     GOOD_MISFIT_M,
     align,
     honest_information,
@@ -41,7 +42,6 @@ _NODES = 21  # within a scan, of a known turning
 _WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
-_FEWEST_USED = 60
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
 _LEAST_SHARE = 0.1  # of the points lie on the map, or the scan is not registered; in an open field a fifth of them do at rest
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
@@ -357,7 +357,7 @@ class LidarMotion:
         share = (information.used + on_line) / max(len(points), 1)
         if (
             directions is None
-            or information.used < _FEWEST_USED
+            or information.used < FEWEST_USED
             or share < _LEAST_SHARE
             or max(np.abs(rate).max() / _FASTEST[0], np.abs(velocity).max() / _FASTEST[1]) > 1.0
         ):

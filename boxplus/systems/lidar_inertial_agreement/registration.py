@@ -10,12 +10,34 @@ from boxplus.filtering.nav_state import TANGENT, NavState, boxplus_into
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 
 GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
+FEWEST_USED = 60  # points on planes, or a scan is not registered
 _STEPS = 12
 _SETTLED = 2e-4  # rad and m
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
+
+_ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on planes
+_LEAST_CELL = 4.0  # range_sigma: of points closer together noise makes planes
+_LEAST_GAIN = 2.0  # surfaces fill cells of half the size with four times as many points, unless these are few
+
+
+def with_cells_for(scan: Scan, config: RegistrationConfig) -> RegistrationConfig:
+    """The settings with cells that leave enough of a scan, where everything is near.
+
+    A wall at arm's length fills a cone of view with sixty cells of 25 cm, which no registration can stand on.
+    """
+    cell, points = config.map_cell, len(VoxelFilter(config.map_cell)(scan.p_lidar)[0])
+    while points < _ENOUGH and 0.5 * cell >= _LEAST_CELL * config.range_sigma:
+        finer = len(VoxelFilter(0.5 * cell)(scan.p_lidar)[0])
+        if finer < _LEAST_GAIN * points:
+            break
+        cell, points = 0.5 * cell, finer
+    if cell == config.map_cell:
+        return config
+    return config.model_copy(update={"map_cell": cell, "scan_voxel": min(config.scan_voxel, cell)})
 
 
 def align(

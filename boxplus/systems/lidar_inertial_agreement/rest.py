@@ -20,6 +20,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.surfaces import surfaces_across
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
@@ -38,18 +39,23 @@ class Rest:
     """The hypothesis that all velocities are zero, against a path of the LiDAR alone.
 
     Attributes:
-        at_rest: whether it fits, along the axes that the scene determines.
-        determined: whether these are all axes.
+        at_rest: whether it fits, along and about the axes that the scene determines.
         open_axes: (K, 3) unit axes along which the scene does not show it, in the frame of the path's first pose.
+        open_turns: (L, 3) unit axes about which it does not show it, likewise.
         speed: along the determined axes [m/s].
-        turn_rate: [rad/s].
+        turn_rate: about the determined axes [rad/s].
     """
 
     at_rest: bool
-    determined: bool
     open_axes: NDArray[np.float64]
+    open_turns: NDArray[np.float64]
     speed: float
     turn_rate: float
+
+    @property
+    def determined(self) -> bool:
+        """Whether the scene shows all of it."""
+        return not len(self.open_axes) and not len(self.open_turns)
 
 
 def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> Rest:
@@ -57,7 +63,7 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     last = np.flatnonzero(path.segment == path.segment[-1])
     seconds = (path.time_ns[last] - path.time_ns[last[0]]) * 1e-9
     if len(last) < 2:
-        return Rest(False, False, np.eye(3), 0.0, 0.0)
+        return Rest(False, np.eye(3), np.eye(3), 0.0, 0.0)
     p = path.p_path_lidar[last]
     values, vectors = np.linalg.eigh(path.information[last, 3:, 3:])
     capped = np.where(values > 0.0, 1.0 / (1.0 / np.maximum(values, 1e-9) + _POSE_SIGMA_M**2), 0.0)
@@ -72,7 +78,8 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     speeds = (along.T @ b) / information[seen]
     ends = np.abs(along.T @ p[-min(3, len(p) - 1) :].mean(axis=0))
     turned = so3.log(path.R_path_lidar[last[0]].T @ path.R_path_lidar[last[-1]])
-    rate = float(np.linalg.norm(turned)) / float(seconds[-1])
+    shown, not_shown = shown_turns(path)
+    rate = float(np.linalg.norm(shown.T @ turned)) / float(seconds[-1])
     slow = (np.abs(speeds) < _SLOW_M_S + _DEVIATIONS * std[seen]).all() and (
         ends < _NEAR_M + _DEVIATIONS * std[seen] * seconds[-1]
     ).all()
@@ -82,7 +89,7 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     open_axes = axes[:, ~seen].T
     if at_rest and seen.all() and not _faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T
-    return Rest(at_rest, len(open_axes) == 0, open_axes, speed, rate)
+    return Rest(at_rest, open_axes, not_shown.T, speed, rate)
 
 
 def _faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from boxplus.errors import InputError
@@ -47,6 +48,13 @@ class LioConfig(RegistrationConfig):
     min_matched_share: float = Field(
         0.1, ge=0, lt=1, description="with less than this share of a scan's points on the map, three scans in a row, it is lost"
     )
+
+    @property
+    def T_declared(self) -> NDArray[np.float64] | None:
+        """T_imu_lidar (4, 4) that the sensors can contradict, the identity if nobody gave one; None where it is estimated."""
+        if self.extrinsic_estimation != "off":
+            return None
+        return np.eye(4) if self.T_imu_lidar is None else np.array(self.T_imu_lidar)
 
     @field_validator("T_imu_lidar")
     @classmethod

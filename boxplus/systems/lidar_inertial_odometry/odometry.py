@@ -33,7 +33,8 @@ from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, afte
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
-from boxplus.systems.lidar_inertial_odometry.start import Start, deskew_first, find_start, joined_imu
+from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
+from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.unknown_mounting import UnknownMounting
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
@@ -63,14 +64,14 @@ class LidarInertialOdometry:
         self.start_problem: str | None = None
         self._sequencer = Sequencer()
         self._waiting: list[Frame] = []
-        self._next_try = 0  # scans that wait
+        self._next_try, self._time_ns = 0, 0  # scans that wait, and the instant of the state
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
         self._weak_spell = WeakSpell()
-        self._consistency = Consistency(self.config, self._declared())
+        self._consistency = Consistency(self.config, self.config.T_declared)
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
@@ -80,7 +81,6 @@ class LidarInertialOdometry:
         self._datum = MapDatum(NavState.identity().pack(), self._cov, _SHARED_ERRORS)
         self._mounting = UnknownMounting(NavState.identity().pack(), self.config)
         self._gap: str | None = None
-        self._time_ns = 0
         self._noise = ObservedNoise(self.config)
 
     @property
@@ -131,12 +131,6 @@ class LidarInertialOdometry:
             self._carry(x, cov, imu, newest, self._noise.density)
         return Prediction(newest, NavState.unpack(x), self._unshown.widened(cov, newest))
 
-    def _declared(self) -> NDArray[np.float64] | None:
-        """T_imu_lidar (4, 4) that the sensors can contradict, the identity if nobody gave one; None where it is estimated."""
-        if self.config.extrinsic_estimation != "off":
-            return None
-        return np.eye(4) if self.config.T_imu_lidar is None else np.array(self.config.T_imu_lidar)
-
     def snapshot(self) -> dict[str, object]:
         """Everything the next estimates depend on, but for the settings: to be written at once, as it goes on changing."""
         state = {name: value for name, value in vars(self).items() if name not in _NOT_IN_SNAPSHOT}
@@ -170,7 +164,7 @@ class LidarInertialOdometry:
         self._next_try = 0
         self._consistency.finish()
         self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
-        self._consistency = Consistency(self.config, self._declared())
+        self._consistency = Consistency(self.config, self.config.T_declared)
         self.start, self._standstill = None, None
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
@@ -178,19 +172,17 @@ class LidarInertialOdometry:
         return after_gap(frame)
 
     def _try_start(self, *, final: bool = False) -> list[Estimate]:
-        """Find the first state, then process every scan that waited for it: no scan is lost to the start."""
-        found = find_start(self._waiting, self.config)
+        """Find the first state, then process every scan that waited for it, but for those before it."""
+        found = find_start(self._waiting, self.config, final=final)
         if isinstance(found, str):
             self.start_problem = found
             # The oldest scans make room, so that a start that takes long stays cheap.
-            keep = 0 if final else _LONGEST_START_SCANS
-            forgotten = max(len(self._waiting) - keep, 0)
-            self._sequencer.rejected["scan before a start could be found"] += forgotten
-            del self._waiting[:forgotten]
+            self._forget(len(self._waiting) - (0 if final else _LONGEST_START_SCANS))
             self._next_try = len(self._waiting) + 1 + int(_FEWEST_NEW * len(self._waiting))
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
+        self._forget(sum(frame.scan.end_ns < found.time_ns for frame in self._waiting))
         self.start, self.start_problem = found, None
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
@@ -204,6 +196,11 @@ class LidarInertialOdometry:
         self._insert(found.state.to_world(self._voxel_filter(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
+
+    def _forget(self, oldest: int) -> None:
+        """Scans that no start will begin with."""
+        self._sequencer.rejected["scan before a start could be found"] += max(oldest, 0)
+        del self._waiting[: max(oldest, 0)]
 
     def _process(self, frame: Frame) -> Estimate:
         """One scan, line by line as in SPEC.md 9.11."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.simulation import ImuModel, Scenario, Simulation
+from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, LIDAR, data
 
 ROOM = (24.0, 20.0, 5.0)
@@ -50,3 +51,17 @@ def test_a_single_scan_says_nothing() -> None:
     scans, _ = data(simulation)
     rest = judge_rest(lidar_path(scans[:1], CONFIG), scans[:1], CONFIG)
     assert not rest.at_rest and not rest.determined and len(rest.open_axes) == 3
+
+
+@pytest.mark.parametrize("reach_m", [2.0, 4.0])
+def test_one_wall_does_not_show_a_turn_about_its_normal(reach_m: float) -> None:
+    lidar = RosetteLidar(points_per_scan=4000, rate_hz=10.0, fov_deg=60.0)
+    scenario = Scenario(
+        "wall", worlds.room(ROOM), trajectories.at_rest(2.0, (12.0 - reach_m, 4.0, 2.5)), lidar, T_imu_lidar=np.eye(4)
+    )
+    scans, _ = data(Simulation(scenario, 0, 1.0))
+    path = lidar_path(scans, CONFIG)
+    shown, not_shown = shown_turns(path)
+    assert shown.shape == (3, 2) and abs(not_shown[0, 0]) > 0.99
+    rest = judge_rest(path, scans, CONFIG)
+    assert np.allclose(rest.open_turns, not_shown.T) and not rest.determined and rest.turn_rate < 0.02

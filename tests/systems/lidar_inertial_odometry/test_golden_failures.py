@@ -196,6 +196,8 @@ def test_a_bias_that_no_gyroscope_has_refuses_the_start() -> None:
     assert not odometry.flush()
     assert odometry.start is None
     assert "deg/s more than the LiDAR, which no bias explains: its unit, its sign" in str(odometry.start_problem)
+    # At the end of the recording the comparison of both sensors says which of them.
+    assert "times as far as the LiDAR: it reports deg/s" in str(odometry.start_problem)
 
 
 def test_inverted_extrinsic_is_named() -> None:

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
+from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.simulation import Scenario, SpinningLidar, simulate
+from boxplus.simulation import RosetteLidar, Scenario, SpinningLidar, simulate
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.worlds import sites
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
-from boxplus.systems.lidar_inertial_odometry.start import Start, find_start
+from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, frames, room_walk
 
 
@@ -75,6 +77,30 @@ def test_a_speed_that_the_surroundings_do_not_show_is_no_start(voxel: float) -> 
     named = np.array([float(value) for value in refusal.split("along (")[1].split(")")[0].split(",")])
     axis = simulation.T_imu_lidar[:3, :3].T @ simulation.ground_truth([simulation.start_ns]).R_world_imu[0].T[:, 0]
     assert abs(named @ axis) > 0.99
+
+
+def _before_a_wall(reach_m: float) -> tuple[list[Frame], LioConfig]:
+    """At rest, with a cone of view that is full of one wall: a few dozen cells of 25 cm, each with hundreds of points."""
+    lidar = RosetteLidar(points_per_scan=4000, rate_hz=10.0, fov_deg=80.0)
+    motion = trajectories.at_rest(2.0, (1.6 - reach_m, -2.2, 1.3))
+    simulation = simulate(Scenario("wall", sites.stairwell(), motion, lidar, T_imu_lidar=np.eye(4)), duration_s=1.6)
+    first = frames(simulation.events())
+    assert len(VoxelFilter(0.25)(first[0].scan.p_lidar)[0]) < 100
+    return first, config(simulation)
+
+
+@pytest.mark.parametrize("reach_m", [0.6, 0.9])
+def test_a_wall_at_arms_length_shows_rest(reach_m: float) -> None:
+    found = find_start(*_before_a_wall(reach_m))
+    assert isinstance(found, Start) and found.kind == "static"
+
+
+def test_a_turn_that_a_wall_does_not_show_is_no_rest() -> None:
+    """About the normal of the wall nothing but the gyroscope tells: at 4 deg/s it has no bias, it turns."""
+    first, settings = _before_a_wall(0.6)
+    turn = np.array([0.07, 0.0, 0.0])
+    turning = [replace(f, imu=ImuSamples(f.imu.time_ns, f.imu.gyro + turn, f.imu.accel)) for f in first]
+    assert isinstance(find_start(turning, settings), str)
 
 
 def _shaken(frame: Frame, seed: int) -> Frame:

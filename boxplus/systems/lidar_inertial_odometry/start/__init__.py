@@ -1,0 +1,1 @@
+"""Where LiDAR-inertial odometry begins: at rest, or moving."""

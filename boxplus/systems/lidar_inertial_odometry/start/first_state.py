@@ -1,0 +1,164 @@
+"""State and covariance of a platform that has been found at rest, or moving along a path (docs/agreement.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import (
+    STANDARD_GRAVITY,
+    T_BA,
+    T_BW,
+    T_G,
+    T_P_L,
+    T_THETA_L,
+    T_V,
+    TANGENT,
+    NavState,
+)
+from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.sequencer import Frame
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
+from boxplus.systems.lidar_inertial_agreement.translation import (
+    ARM,
+    BIAS,
+    GRAVITY,
+    SLOPE,
+    TURN,
+    BodyAttitude,
+    TranslationFit,
+    compare_accelerations,
+    wide_prior,
+)
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_SLOPE_STD = 0.01  # of the scale of an accelerometer in order
+_ACCEL_BIAS_STD = 0.15  # m/s²
+_MOUNTING_STD = 0.01  # rad
+_MEAN_ACCEL_STD = 2.0  # m/s²
+_GYRO_BIAS_STD = 5e-3  # rad/s, of the difference to the LiDAR over a second
+_ANY_GYRO_BIAS_STD = 0.02  # rad/s, of a gyroscope in order, about axes where the LiDAR does not show how it turns
+_TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
+
+
+def _gravity_rotation(up_imu: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shortest rotation that takes the measured `up_imu` (3,) to +z (SPEC.md 9.4)."""
+    up = up_imu / np.linalg.norm(up_imu)
+    if up[2] < -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    K = so3.hat(np.array([up[1], -up[0], 0.0]))
+    rotation: NDArray[np.float64] = np.eye(3) + K + K @ K / (1.0 + up[2])
+    return rotation
+
+
+def _first_covariance(
+    config: LioConfig, *, gyro_sigma: float, accel_sigma: float, velocity_sigma: float, gravity_sigma: float
+) -> NDArray[np.float64]:
+    """Prior at the start. Pose: the first scan makes the map, so the first pose is the datum and exact by definition.
+
+    What is not known is how gravity lies in that frame: the tilt from the accelerometer's bias goes into `g`.
+    """
+    sigma = np.full(TANGENT, 1e-5)
+    sigma[T_V : T_V + 3] = velocity_sigma
+    sigma[T_BW : T_BW + 3] = gyro_sigma
+    sigma[T_BA : T_BA + 3] = accel_sigma
+    sigma[T_G : T_G + 3] = gravity_sigma
+    sigma[T_THETA_L : T_THETA_L + 3] = np.deg2rad(config.extrinsic_rotation_sigma_deg)
+    sigma[T_P_L : T_P_L + 3] = config.extrinsic_translation_sigma
+    return np.diag(sigma**2)
+
+
+def static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tuple[NavState, NDArray[np.float64]]:
+    """State and (24, 24) covariance of a platform at rest: gravity and biases are what the IMU shows on average."""
+    up = imu.accel.mean(axis=0)
+    R = _gravity_rotation(up) if config.gravity_aligned else np.eye(3)
+    direction = R @ up / np.linalg.norm(up)
+    # The part of the bias along gravity is seen at once: whatever the norm exceeds 9.81 m/s² by.
+    bias_accel = up * (1.0 - STANDARD_GRAVITY / np.linalg.norm(up))
+    state = NavState(
+        R,
+        np.zeros(3),
+        np.zeros(3),
+        imu.gyro.mean(axis=0),
+        bias_accel,
+        -STANDARD_GRAVITY * direction,
+        extrinsic.R_imu_lidar,
+        extrinsic.p_imu_lidar,
+    )
+    gyro_sigma = max(float(imu.gyro.std(axis=0).max()) / np.sqrt(len(imu)), 1e-4)
+    # The mean of a shaken accelerometer is not better known than its samples are many.
+    gravity_sigma = float(np.hypot(0.1, 2.0 * imu.accel.std(axis=0).max() / np.sqrt(len(imu))))
+    covariance = _first_covariance(
+        config, gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=gravity_sigma
+    )
+    return state, covariance
+
+
+def moving_fit(frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> TranslationFit | None:
+    """Velocity, gravity and bias from the LiDAR's path and the accelerometer, with the mounting and metres as given."""
+    mean, std = wide_prior()
+    mean[ARM], std[ARM] = extrinsic.p_imu_lidar, 0.01
+    # Over a second the mean specific force is gravity but for the mean acceleration.
+    R_path_imu = path.R_path_lidar[len(path) // 2] @ extrinsic.R_imu_lidar.T
+    mean[GRAVITY], std[GRAVITY] = -R_path_imu @ imu.accel.mean(axis=0), _MEAN_ACCEL_STD
+    std[SLOPE], std[BIAS], std[TURN] = _SLOPE_STD, _ACCEL_BIAS_STD, _MOUNTING_STD
+    bias_gyro = gyro_bias(path, imu, extrinsic)
+    seconds = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
+    return compare_accelerations(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0.0, (mean, std), stretch_s=seconds + 1.0)
+
+
+def gyro_bias(path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> NDArray[np.float64]:
+    """(3,) mean difference between the gyroscope's and the LiDAR's turn rate [rad/s], IMU frame; zero where no scene shows it."""
+    steps = so3.log(np.swapaxes(path.R_path_lidar[:-1], 1, 2) @ path.R_path_lidar[1:])
+    span = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
+    inside = (imu.time_ns >= path.time_ns[0]) & (imu.time_ns <= path.time_ns[-1])
+    shown = extrinsic.R_imu_lidar @ shown_turns(path)[0]
+    bias: NDArray[np.float64] = imu.gyro[inside].mean(axis=0) - extrinsic.R_imu_lidar @ steps.sum(axis=0) / span
+    return shown @ (shown.T @ bias)
+
+
+def moving_state(
+    frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, fit: TranslationFit, extrinsic: NavState, config: LioConfig
+) -> tuple[NavState, NDArray[np.float64]]:
+    """State and covariance at the end of the first scan, carried there from the beginning of the batch."""
+    first = fit.stretches[0]
+    bias_gyro = gyro_bias(path, imu, extrinsic)
+    attitude = BodyAttitude(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0)
+    end_ns = frames[0].scan.end_ns
+    grid = np.unique(
+        np.concatenate([[first.time_ns, end_ns], imu.time_ns[(imu.time_ns > first.time_ns) & (imu.time_ns < end_ns)]])
+    )
+    R_grid = attitude.at(grid)
+    accel = np.stack([np.interp(grid, imu.time_ns, imu.accel[:, i]) for i in range(3)], axis=1) - fit.bias
+    force = np.einsum("nij,nj->ni", R_grid, accel)
+    dt = np.diff(grid)[:, None] * 1e-9
+    v_path = first.state[3:] + (0.5 * (force[1:] + force[:-1]) * dt).sum(axis=0) + fit.gravity * float(dt.sum())
+    gravity = fit.gravity * (STANDARD_GRAVITY / float(np.linalg.norm(fit.gravity)))
+    R_path_imu = R_grid[-1]
+    R_world_path = _gravity_rotation(-gravity) if config.gravity_aligned else R_path_imu.T
+    state = NavState(
+        R_world_path @ R_path_imu,
+        np.zeros(3),
+        R_world_path @ v_path,
+        bias_gyro,
+        fit.bias,
+        R_world_path @ gravity,
+        extrinsic.R_imu_lidar,
+        extrinsic.p_imu_lidar,
+    )
+    covariance = _first_covariance(config, gyro_sigma=_GYRO_BIAS_STD, accel_sigma=0.0, velocity_sigma=0.0, gravity_sigma=0.0)
+    open_turns = extrinsic.R_imu_lidar @ shown_turns(path)[1]
+    covariance[T_BW : T_BW + 3, T_BW : T_BW + 3] += _ANY_GYRO_BIAS_STD**2 * open_turns @ open_turns.T
+    # [velocity, gravity, bias] of the batch: velocity and gravity along the path's axes.
+    known = np.r_[3:6, 6 + GRAVITY.start : 6 + GRAVITY.stop, 6 + BIAS.start : 6 + BIAS.stop]
+    turn = np.zeros((9, 9))
+    turn[:3, :3] = turn[3:6, 3:6] = R_world_path
+    turn[6:, 6:] = np.eye(3)
+    into = np.r_[T_V : T_V + 3, T_G : T_G + 3, T_BA : T_BA + 3]
+    floor = np.diag(np.repeat([0.02, 0.05, 0.02], 3) ** 2)
+    covariance[np.ix_(into, into)] = _TWICE * turn @ first.covariance[np.ix_(known, known)] @ turn.T + floor
+    return state, covariance

@@ -1,0 +1,323 @@
+"""The first state: at rest, or moving, from the LiDAR's own motion compared with the IMU (docs/agreement.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.filtering.nav_state import T_V, NavState
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
+from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
+
+_REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
+_NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
+_IN_G = (0.8, 1.25)
+_STANDARD_G = 9.80665
+_QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
+_FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average: the bias of a gyroscope in order
+_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
+_MIN_MOVING_SCANS = 8
+_MUCH_SHORTER = 0.8
+_FEWEST_SAMPLES = 5
+_UPRIGHT = 0.9  # cosine
+_LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
+_LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
+_LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
+_UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
+_WAITING = "; waiting for more data"
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How the odometry began.
+
+    Attributes:
+        kind: "static" or "moving".
+        time_ns: the instant of `state`: the end of the first scan.
+        state, covariance: first state and its (24, 24) covariance, tangent as in `NavState`.
+        duration_s: how long the start was observed.
+        text: one sentence with the evidence.
+        warning: what could not be decided, a sentence; empty when all was.
+        unshown_axes: (K, 3) unit axes in the world along which rest was taken for granted.
+    """
+
+    kind: Literal["static", "moving"]
+    time_ns: int
+    state: NavState
+    covariance: NDArray[np.float64]
+    duration_s: float
+    text: str
+    warning: str = ""
+    unshown_axes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+def find_start(frames: Sequence[Frame], config: LioConfig, *, final: bool = False) -> Start | str:
+    """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet.
+
+    At rest means that the LiDAR does not move against what it sees, however much the IMU is shaken; only along what the scene
+    does not determine a quiet IMU has to do. Moving, velocity and gravity come from a batch over the LiDAR's path and the
+    accelerometer. A path that has once gone astray stays so: where there is no start over all scans, it is sought over the
+    newest of them, and `Start.time_ns` says with which scan it begins. Where it is `final` that there is none, what the
+    sensors contradict is named with it.
+
+    Raises:
+        InputError: the accelerometer reports in g, was taken for one that does, or shows no gravity.
+    """
+    seen = _Beginning(frames, config)
+    _check_accelerometer(seen.accel_norm)
+    try:
+        return _start(seen)
+    except _NotYet as reason:
+        refusal = str(reason)
+    newest = _newest(frames, config.start_duration)
+    if len(newest) < _MUCH_SHORTER * len(frames):
+        try:
+            return _start(_Beginning(newest, config))
+        except _NotYet:
+            pass
+    return ". ".join([refusal, *(_contradicted(seen) if final else [])])
+
+
+def _start(seen: _Beginning) -> Start:
+    """The start that fits all that has been seen."""
+    path = _first_path(seen)
+    rest = judge_rest(path, seen.scans, seen.registration)
+    seen.note(rest)
+    _check_gyroscope(seen, path, rest)
+    if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
+        return _static_start(seen, rest)
+    return _moving_start(seen, path)
+
+
+def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
+    """The last frames, just enough of them for a start."""
+    times = np.array([frame.scan.start_ns for frame in frames])
+    enough = int(np.searchsorted(times, frames[-1].scan.end_ns - round(seconds * 1e9), side="right")) - 1
+    return frames[max(min(enough, len(frames) - _MIN_MOVING_SCANS), 0) :]
+
+
+class _NotYet(Exception):
+    """Why there is no start yet; a sentence."""
+
+
+class _Beginning:
+    """What a start has to go by: some scans, the IMU samples around them, and what has been found of both."""
+
+    def __init__(self, frames: Sequence[Frame], config: LioConfig) -> None:
+        self.frames, self.config = frames, config
+        self.scans: list[Scan] = [frame.scan for frame in frames]
+        self.registration: RegistrationConfig = with_cells_for(self.scans[0], config)
+        self.imu = joined_imu(frames)
+        self.extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
+        self.duration_s = (self.scans[-1].end_ns - self.scans[0].start_ns) * 1e-9
+        self.accel_norm = float(np.linalg.norm(self.imu.accel.mean(axis=0)))
+        self.gyro_std, self.accel_std = float(self.imu.gyro.std(axis=0).max()), float(self.imu.accel.std(axis=0).max())
+        self.evidence = (
+            f"gyro std {self.gyro_std:.3f} rad/s, accelerometer std {self.accel_std:.2f} m/s² around {self.accel_norm:.2f} m/s²"
+        )
+
+    def note(self, rest: Rest) -> None:
+        self.evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
+
+    def imu_is_quiet(self, rest: Rest) -> bool:
+        """Whether the IMU shows nothing but vibration and biases, as it does at rest and at a constant speed."""
+        if self.gyro_std >= _QUIET_GYRO or len(self.imu) < _FEWEST_QUIET_SAMPLES:
+            return False
+        turning = rest.open_turns @ self.extrinsic.R_imu_lidar.T @ self.imu.gyro.mean(axis=0)
+        return bool(np.linalg.norm(turning) < _QUIET_TURN) and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
+
+    def not_moving(self, why: str) -> _NotYet:
+        return _NotYet(f"not at rest ({self.evidence}), and {why}{_WAITING}")
+
+
+def _contradicted(seen: _Beginning) -> list[str]:
+    """What the comparison of both sensors finds wrong, a sentence each."""
+    T_declared = seen.config.T_declared
+    agreement = compare_sensors(seen.scans, seen.imu, seen.config, T_declared=T_declared)
+    return [finding.text for finding in contradictions(agreement, T_declared)]
+
+
+def _check_accelerometer(norm: float) -> None:
+    """Whether the mean specific force (its norm, m/s²) can be one gravity in m/s²."""
+    if norm < _NO_GRAVITY:
+        raise InputError(
+            "accelerations with gravity, about 9.8 m/s² on average at the start",
+            f"{norm:.2f} m/s²",
+            "the accelerometer delivers nothing, or its driver takes gravity out: give what it measures",
+        )
+    if _IN_G[0] < norm < _IN_G[1]:
+        raise InputError(
+            "accelerations in m/s², about 9.8 on average at the start",
+            f"{norm:.2f}",
+            f"the accelerometer reports in g: multiply by {_STANDARD_G} (reading a recording: --accel-unit g)",
+        )
+    if _IN_G[0] < norm / _STANDARD_G**2 < _IN_G[1]:
+        raise InputError(
+            "accelerations in m/s², about 9.8 on average at the start",
+            f"{norm:.1f}",
+            "the accelerometer reports in m/s² and was taken for one in g (reading a recording: --accel-unit m/s2)",
+        )
+
+
+def _first_path(seen: _Beginning) -> LidarPath:
+    """How the LiDAR moved, from its scans, unbroken."""
+    path = lidar_path(seen.scans, seen.registration, gyro_guesses(seen.imu, seen.extrinsic.R_imu_lidar), unbroken=True)
+    if _broken(path) or len(path) < min(len(seen.frames), 3):
+        raise _NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){_WAITING}")
+    time_ns = seen.imu.time_ns
+    within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
+    if len(path) < 2 or within < _FEWEST_SAMPLES:
+        raise _NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{_WAITING}")
+    return path
+
+
+def _broken(path: LidarPath) -> bool:
+    return bool(path.failed or path.segment[-1] != path.segment[0])
+
+
+def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
+    """Whether the gyroscope turns as the LiDAR does, but for a bias.
+
+    At rest it is to show nothing; a LiDAR that sees little may turn on its own.
+    """
+    off = seen.imu.gyro.mean(axis=0) if rest.at_rest else gyro_bias(path, seen.imu, seen.extrinsic)
+    bias = float(np.linalg.norm(off))
+    if bias > _LARGEST_BIAS:
+        raise _NotYet(
+            f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: its unit, its "
+            f"sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little{_WAITING}"
+        )
+
+
+def _static_start(seen: _Beginning, rest: Rest) -> Start:
+    low, high = _REST_ACCEL_NORM
+    if not low <= seen.accel_norm <= high:
+        raise _NotYet(
+            f"at rest, but the accelerometer shows {seen.accel_norm:.2f} m/s², not one gravity: check its unit and scale"
+        )
+    state, covariance = static_state(seen.imu, seen.extrinsic, seen.config)
+    R_imu_lidar = seen.extrinsic.R_imu_lidar
+    axes = _unshown(rest, R_imu_lidar.T @ seen.imu.accel.mean(axis=0) / seen.accel_norm)
+    return Start(
+        "static",
+        seen.scans[0].end_ns,
+        state,
+        covariance,
+        seen.duration_s,
+        f"at rest: {seen.evidence}",
+        _undecided(axes),
+        axes @ (state.R_world_imu @ R_imu_lidar).T,
+    )
+
+
+def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
+    if len(seen.frames) < _MIN_MOVING_SCANS:
+        raise seen.not_moving(f"{len(seen.frames)} scans are not enough for a moving start")
+    # Once more, each scan undistorted with the gyroscope instead of a constant rate.
+    imu, scans = seen.imu, seen.scans
+    steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
+    guesses = gyro_guesses(steady, seen.extrinsic.R_imu_lidar)
+    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(path), unbroken=True)
+    if _broken(path):
+        raise seen.not_moving("the first scans do not overlap enough for a moving start")
+    fit = _checked_fit(seen, path)
+    state, covariance = moving_state(seen.frames, path, imu, fit, seen.extrinsic, seen.config)
+    sigma = _checked_speed(seen, state, covariance)
+    speed = float(np.linalg.norm(state.v_world_imu))
+    other = other_speed(path, scans, seen.registration, guesses)
+    if other is not None:
+        raise seen.not_moving(
+            "the surroundings do not show how fast the platform moves: the scans fit about as "
+            f"well at {np.linalg.norm(other):.1f} m/s as at {speed:.1f} m/s"
+        )
+    misfit = f"batch over {len(scans)} scans fits to {fit.sigma * 100:.1f} cm"
+    text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {seen.evidence}; {misfit}"
+    return Start("moving", scans[0].end_ns, state, covariance, seen.duration_s, text)
+
+
+def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
+    """Velocity, gravity and bias from path and accelerometer, where both fit each other."""
+    fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic)
+    if fit is None:
+        raise seen.not_moving("the surroundings do not show how the platform turns")
+    if fit.sigma > _LARGEST_MISFIT_M:
+        raise seen.not_moving(f"LiDAR and IMU do not fit better than {fit.sigma * 100:.1f} cm")
+    bias = float(np.linalg.norm(fit.bias))
+    if bias > _LARGEST_ACCEL_BIAS:
+        raise seen.not_moving(
+            f"the path of the LiDAR asks for a bias of the accelerometer of {bias:.2f} m/s²: it sees too little, or the "
+            "accelerometer is bad"
+        )
+    return fit
+
+
+def _checked_speed(seen: _Beginning, state: NavState, covariance: NDArray[np.float64]) -> float:
+    """The largest standard deviation of the velocity [m/s], where that was found."""
+    variances, axes = np.linalg.eigh(covariance[T_V : T_V + 3, T_V : T_V + 3])
+    sigma = float(np.sqrt(variances[-1]))
+    if sigma > _UNKNOWN_SPEED:
+        axis = (state.R_world_imu @ seen.extrinsic.R_imu_lidar).T @ axes[:, -1]
+        raise seen.not_moving(
+            f"the surroundings do not show how fast the platform moves along {_axis_text(axis)} (LiDAR axes): {sigma:.0f} m/s "
+            "more or less"
+        )
+    return sigma
+
+
+def _first_velocity(path: LidarPath) -> NDArray[np.float64]:
+    """(3,) over the first scans [m/s]."""
+    last = min(3, len(path) - 1)
+    seconds = (path.time_ns[last] - path.time_ns[0]) * 1e-9
+    velocity: NDArray[np.float64] = (path.p_path_lidar[last] - path.p_path_lidar[0]) / seconds
+    return velocity
+
+
+def _shaken_only(imu: ImuSamples) -> bool:
+    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree."""
+    parts = np.array_split(imu.accel, _PARTS)
+    means = np.array([part.mean(axis=0) for part in parts if len(part)])
+    return bool(means.std(axis=0).max() < _STEADY_ACCEL)
+
+
+def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K, 3) axes along which nothing shows rest, LiDAR frame; up and down, hardly anything begins at a constant speed."""
+    return rest.open_axes[np.abs(rest.open_axes @ up_lidar) < _UPRIGHT].reshape(-1, 3)
+
+
+def _undecided(axes: NDArray[np.float64]) -> str:
+    """A sentence about the axes along which nothing shows rest."""
+    if not len(axes):
+        return ""
+    return (
+        "the surroundings do not show whether the platform moves along "
+        f"{' and '.join(_axis_text(axis) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
+        "at a constant speed it would be as quiet, so the position along it is called weak and its standard deviation grows by "
+        "10 m/s until something shows the speed"
+    )
+
+
+def _axis_text(axis: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:+.2f}" for value in axis) + ")"
+
+
+def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
+    """The IMU samples of several frames, each once."""
+    imu = ImuSamples.joined(frame.imu for frame in frames)
+    time, first = np.unique(imu.time_ns, return_index=True)
+    return ImuSamples(time, imu.gyro[first], imu.accel[first])
