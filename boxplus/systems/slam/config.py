@@ -46,7 +46,7 @@ class SlamConfig(BaseModel):
     nearby_count: int = Field(3, ge=0, description="how many of them")
     least_overlap: float = Field(0.5, ge=0, le=1, description="share of points of either map that the other one has too")
     largest_rms: float = Field(1.5, gt=0, description="distances to planes against those of successive maps, at most")
-    least_measured: int = Field(3, ge=1, le=6, description="directions of the pose that the surfaces determine")
+    least_measured: int = Field(5, ge=1, le=6, description="directions of the pose that the surfaces determine")
     innovation: float = Field(0.999, gt=0, lt=1, description="probability of a true loop to agree with the odometry")
     odometry_scale: float = Field(1.5, gt=0, description="factor of the odometry's standard deviations in that test")
     rival_distance: float = Field(1.5, gt=0, description="as good a fit this far away makes a loop ambiguous [m]")

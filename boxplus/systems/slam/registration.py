@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 
 _NEIGHBOURS = 8  # a plane is fitted to
 _CHUNK = 1024
-_STAGES = ((2.0, 4, 2000), (1.2, 6, 4000), (0.8, 20, 12_000))  # largest distance of a plane's points [m], steps, points
+_STAGES = ((2.0, 4, 1500), (1.2, 6, 3000), (0.8, 15, 8000))  # largest distance of a plane's points [m], steps, points
 _STEP = 2e-4  # m, at the points: shorter ones are the end
 _FEWEST = 60  # points on planes
 _SCALE = 1.4826  # from the median of |e| to a standard deviation
@@ -120,6 +120,16 @@ def surface_distance(source: Surface, target: Surface, T_target_source: Floats, 
     distance, _, count = _STAGES[-1]
     found = _Matched.of(_spread(source.points, count // 4), target, T_target_source, distance, config)
     return None if found is None else found.scale
+
+
+def fitting_share(
+    source: Surface, target: Surface, T_target_source: Floats, tolerance: float, config: RegistrationConfig
+) -> float:
+    """Share of a source's points that lie within `tolerance` [m] of a plane of the target; one without a plane does not."""
+    distance, _, count = _STAGES[-1]
+    points = _spread(source.points, count)
+    found = _Matched.of(points, target, T_target_source, distance, config)
+    return 0.0 if found is None else float(np.count_nonzero(np.abs(found.e) <= tolerance)) / len(points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

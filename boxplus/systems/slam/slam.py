@@ -15,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._opencv import opencv
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
-from boxplus.maps.descriptors.features import Features, describe
+from boxplus.maps.descriptors.features import WORDS, Features, describe
 from boxplus.maps.descriptors.place_index import PlaceIndex
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
@@ -57,6 +58,8 @@ class Slam:
     def __init__(self, config: SlamConfig | None = None, *, forbidden: Iterable[Pair] = (), forced: Iterable[Pair] = ()) -> None:
         self.config = config if config is not None else SlamConfig()
         self._forbidden, self._forced = _checked_pairs(forbidden, forced)
+        if self.config.appearance:
+            opencv("which describes density images")  # now, not after the first local map
         self._maps: list[LocalMap] = []
         self._odometry = OdometryChain()
         self._index = PlaceIndex(self.config.descriptor)
@@ -109,9 +112,10 @@ class Slam:
         free = [k for k in standing if self.loops[k].source != "forced"]
         agree = free if len(free) < 2 else [free[k] for k in largest_clique(self._consistent(free))]
         chosen = sorted(forced + agree)
+        scale = self._drift_scale([self.loops[k] for k in chosen])
         graph = close_graph(
             self._odometry.poses,
-            [m.covariance for m in self._maps],
+            [scale * m.covariance for m in self._maps],
             [self.loops[k] for k in chosen],
             self.config.gravity_sigma,
             [k in forced for k in chosen],
@@ -120,6 +124,15 @@ class Slam:
         kept = {k for k, is_kept in zip(chosen, graph.is_kept, strict=True) if is_kept}
         for k in standing:
             self.loops[k] = replace(self.loops[k], weight=float(k in kept))
+
+    def _drift_scale(self, loops: list[Loop]) -> float:
+        """Factor of the odometry's covariances: what the innovations of loops make of it, and one loop's worth of belief in it.
+
+        An odometry that drifts less than is assumed for every sensor must not be bent to the centimetres of a registration.
+        """
+        squares = sum((self.config.odometry_scale * loop.innovation) ** 2 for loop in loops if loop.source != "forced")
+        dof = sum(loop.measured for loop in loops if loop.source != "forced")
+        return (6.0 + squares) / (6.0 + dof)
 
     def _consistent(self, numbers: list[int]) -> NDArray[np.bool_]:
         adjacent = np.eye(len(numbers), dtype=np.bool_)
@@ -134,7 +147,11 @@ class Slam:
         return poses[0] if query == 0 else se3.compose(self.T_map[-1], se3.compose(se3.inverse(poses[-2]), poses[-1]))
 
     def _described(self, local_map: LocalMap) -> Features | None:
-        return describe(local_map.points, self.config.descriptor) if self.config.appearance else None
+        if not self.config.appearance:
+            return None
+        if not len(local_map.points):  # of lost scans only: nothing to be recognised by, but the index counts on
+            return Features(np.zeros((0, 2)), np.zeros((0, WORDS), np.uint64))
+        return describe(local_map.points, self.config.descriptor)
 
     def _proposals(self, query: int, features: Features | None) -> list[Proposal]:
         way = self._maps[query].path_m - np.array([m.path_m for m in self._maps])

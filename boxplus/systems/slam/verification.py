@@ -14,14 +14,15 @@ from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain, mahalanobis
 from boxplus.systems.slam.proposals import Proposal
-from boxplus.systems.slam.registration import Registration, Surface, register
+from boxplus.systems.slam.registration import Registration, Surface, fitting_share, register
 from boxplus.systems.slam.rivals import rival_shifts
 
 Floats = NDArray[np.float64]
 
 _RIVAL_AGREEMENT = 0.6  # of two density images, against that where the query was laid, for a shift to be tried
 _RIVALS = 3  # tried
-_AS_GOOD = 0.9  # of the overlap, for a rival
+_AS_GOOD = 0.95  # of the share of points that fit, for a rival
+_TOLERANCE = 2.5  # standard deviations from a plane within which a point fits
 _SAME_MINIMUM = 0.5  # m: a start that comes back to within this is no rival
 _BASIN_ROTATION, _BASIN_POSITION = 0.1, 1.0  # rad, m: by which density images misplace a true loop
 _RMS_FLOOR = 0.02  # m: successive maps that fit better than this say nothing about others
@@ -160,18 +161,18 @@ def _rival(
         share=_RIVAL_AGREEMENT,
         count=_RIVALS,
     )
+    tolerance = _TOLERANCE * max(found.rms, _RMS_FLOOR)
+    fitting = fitting_share(own, there, T, tolerance, config.registration) if len(shifts) else 0.0
     for shift in shifts:
         start = T.copy()
         start[4:6] += shift
         other = register(own, there, start, config.registration)
-        if (
-            other is None
-            or min(other.overlap) < _AS_GOOD * min(found.overlap)
-            or other.rms > max(found.rms, _RMS_FLOOR) / _AS_GOOD
-        ):
+        if other is None:
+            continue
+        if fitting_share(own, there, other.T_target_source, tolerance, config.registration) < _AS_GOOD * fitting:
             continue
         moved = np.linalg.norm(other.T_target_source[4:] - T[4:])
-        if moved < _SAME_MINIMUM or _is_open(found, T, other.T_target_source):
+        if moved < _SAME_MINIMUM or _is_open(found, other.T_target_source):
             continue
         xi = se3.log(se3.compose(se3.inverse(other.T_target_source), T_odo))
         if mahalanobis(xi, config.odometry_scale**2 * S_odo + other.covariance) <= loop.innovation_limit:
@@ -179,7 +180,10 @@ def _rival(
     return None
 
 
-def _is_open(found: Registration, T: Floats, T_other: Floats) -> bool:
-    """Whether two poses differ along what the surfaces leave open only."""
-    xi = se3.log(se3.compose(se3.inverse(T), T_other))
-    return bool(xi @ found.information @ xi < 16.0)
+def _is_open(found: Registration, T_other: Floats) -> bool:
+    """Whether another pose differs along what the surfaces leave open only."""
+    if not len(found.weak):
+        return False
+    xi = se3.log(se3.compose(se3.inverse(found.T_target_source), T_other)) * np.repeat([found.lever_m, 1.0], 3)
+    along = np.linalg.qr(found.weak.T)[0]
+    return bool(np.linalg.norm(xi - along @ (along.T @ xi)) < _SAME_MINIMUM)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,14 @@ def test_without_opencv_places_nearby_are_still_found(block: MappedDrive, monkey
     assert any(loop.is_accepted for loop in found.loops)
     with pytest.raises(InputError, match=r"boxplus\[vision\]"):
         closed(block)
+
+
+def test_a_map_without_points_is_a_link_of_the_chain_only(block: MappedDrive) -> None:
+    slam, none = Slam(SlamConfig(nearby=0.0)), np.zeros((0, 3), np.float32)
+    for local_map in block.maps:
+        found = slam.add(local_map if local_map.number != 1 else replace(local_map, points=none))
+    assert not any(1 in (loop.query, loop.place) for loop in slam.loops)
+    assert any(loop.is_accepted for loop in found)  # the places after it are still found under their numbers
 
 
 def test_pairs_that_make_no_sense_are_refused(block: MappedDrive) -> None:

@@ -1,0 +1,110 @@
+"""`boxplus slam`: a recording in, a trajectory and a map with loops closed out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.options import takes_recording_options
+from boxplus.recordings.options import RecordingOptions
+
+if TYPE_CHECKING:
+    from boxplus.runs.slam.slam_run import SlamResult
+
+
+@takes_recording_options
+def slam(
+    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_slam here.")
+    ] = None,
+    loops: Annotated[
+        Path | None, typer.Option("--loops", help="YAML file of loops to forbid or to force, pairs as in loops.csv.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="One setting, e.g. slam.least_overlap=0.6; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    T_imu_lidar: Annotated[
+        str | None, typer.Option("--T-imu-lidar", help="Pose of the LiDAR in the IMU frame, as for 'boxplus lio'.")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+    ] = None,
+    no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    *,
+    options: RecordingOptions,
+) -> None:
+    """Turn a recording into a trajectory and a map, with loops closed.
+
+    The odometry of 'boxplus lio', with its results in the folder odometry/, and beside it the places that were seen again:
+    corrected trajectory and map, and every loop that was looked at in loops.csv and in the report. Exit codes: as 'boxplus lio'.
+    """
+    from boxplus.runs.slam.config import load_slam_config
+    from boxplus.runs.slam.loop_file import read_loop_decisions
+    from boxplus.runs.transform import parse_transform
+
+    odometry: dict[str, object] = {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)}
+    if T_imu_lidar is not None:
+        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
+    overrides: dict[str, dict[str, object]] = {
+        "recording": options.model_dump(exclude_defaults=True),
+        "odometry": odometry,
+        "map": {"save": False} if no_map else {},
+    }
+    run_config = load_slam_config(config, settings or (), overrides)
+    forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
+    folder = output or Path(f"{recording.resolve().stem}_slam")
+
+    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.recordings import open_recording
+    from boxplus.runs.slam.folder import claim_slam_folder
+    from boxplus.runs.slam.slam_run import run_slam
+
+    terminal = RunTerminal()
+    with (
+        stop_on_interrupt(terminal.announce_stop) as should_stop,
+        open_recording(recording, run_config.recording) as opened,
+        claim_slam_folder(folder, overwrite=overwrite) as claimed,
+    ):
+        info = opened.info
+        terminal.print_evidence(
+            info.path, f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages", info.evidence
+        )
+        with terminal.progress() as progress:
+            result = run_slam(
+                opened, claimed, run_config, forbidden=forbidden, forced=forced, progress=progress, should_stop=should_stop
+            )
+        if not no_report:
+            from boxplus.report.slam_page import write_slam_report
+
+            with terminal.status("drawing the report"):
+                write_slam_report(folder, result)
+    terminal.print_results(result.odometry, _rows(result), folder, ("report.html", "trajectory.tum", "loops.csv", "map.ply"))
+    if result.summary.state == "interrupted":
+        raise typer.Exit(130)
+    if result.summary.contradiction is not None:
+        raise typer.Exit(3)
+
+
+def _rows(result: SlamResult) -> list[tuple[str, str]]:
+    """What the terminal shows of loops."""
+    summary = result.summary
+    forced = f", {summary.loops_forced} of them forced" if summary.loops_forced else ""
+    rows = [
+        (
+            "loops",
+            f"{summary.loops_accepted} closed{forced}, of {summary.loops_looked_at} looked at, {summary.local_maps} local maps",
+        ),
+        ("correction", f"{summary.largest_shift_m:.2f} m at most, {summary.last_shift_m:.2f} m at the end"),
+        ("map", f"{summary.map_points:,} points" if summary.map_points else "not kept"),
+    ]
+    return rows + [("warning", text) for text in summary.warnings]

@@ -1,0 +1,152 @@
+"""The report of `boxplus slam`: the corrected trajectory over the odometry's, and every loop with both maps over each other."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from boxplus.manifolds import se3
+from boxplus.report.palette import INK
+from boxplus.report.plots import plain
+from boxplus.report.skeleton import html_table, tiles, warnings_section, write_html
+from boxplus.runs.slam.folder import SlamFolder
+from boxplus.runs.slam.loop_file import why_refused
+from boxplus.runs.slam.slam_run import SlamResult
+from boxplus.systems.slam.loop import Loop
+
+_PLACE, _QUERY = "#8a8f98", "#d1495b"
+_PICTURES = 60  # loops drawn: all accepted ones first
+_POINTS = 8000  # of a local map in a picture
+_DPI = 80
+
+
+def write_slam_report(folder: str | Path, result: SlamResult) -> Path:
+    """Draw `report.html` of a run with loop closure; that of the odometry too, in its own folder. Returns the path.
+
+    Raises:
+        OutputError: the files cannot be written.
+    """
+    from boxplus.report import write_report
+
+    own = SlamFolder(Path(folder))
+    if result.odometry.scans:
+        write_report(own.odometry.path)
+    return write_html(own.report, Path(result.summary.recording).name, _body(result))
+
+
+def _body(result: SlamResult) -> str:
+    summary = result.summary
+    numbers = [
+        (f"{summary.loops_accepted}", f"loops closed, of {summary.loops_looked_at} looked at"),
+        (f"{summary.local_maps}", "local maps"),
+        (f"{summary.largest_shift_m:.2f} m", "largest correction of a local map"),
+        (f"{summary.path_length_m:.1f} m", "path of the odometry"),
+        (f"{summary.map_points:,}", "points of the corrected map"),
+    ]
+    head = (
+        f"<h1>{escape(Path(summary.recording).name)}</h1>"
+        f'<p class="lead"><span class="state {summary.state}">{summary.state}</span> loops closed on LiDAR-inertial odometry · '
+        f"boxplus {escape(summary.versions['boxplus'])} · {summary.started:%Y-%m-%d %H:%M} UTC · "
+        '<a href="odometry/report.html">report of the odometry</a></p>' + tiles(numbers)
+    )
+    warnings = [escape(text) for text in summary.warnings]
+    if summary.contradiction is not None:
+        warnings.insert(0, escape(summary.contradiction))
+    parts = [head, warnings_section(warnings), _overview(result), _table(result), *_pictures(result)]
+    return "\n".join(parts)
+
+
+def _overview(result: SlamResult) -> str:
+    correction = result.slam.correction()
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    axes = figure.subplots()
+    before, after = correction.T_odo[:, 4:6], correction.T_map[:, 4:6]
+    axes.plot(*before.T, color=_PLACE, linewidth=1.2, label="odometry")
+    axes.plot(*after.T, color=INK, linewidth=1.4, marker=".", label="corrected")
+    for loop in result.slam.loops:
+        if loop.is_accepted:
+            ends = after[[loop.place, loop.query]]
+            axes.plot(*ends.T, color=_QUERY, linewidth=1.6)
+    axes.plot([], [], color=_QUERY, linewidth=1.6, label="loop")
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.legend(framealpha=0.9, fontsize=9)
+    plain(axes)
+    text = "Local maps from above. A loop joins two of them; the correction is spread over the way between."
+    return f"<section><h2>Loops</h2><p>{text}</p>{_embedded(figure, 'trajectory from above')}</section>"
+
+
+def _table(result: SlamResult) -> str:
+    heading = ("loop", "at", "verdict", "found by", "overlap", "surfaces apart", "innovation", "measured", "weight", "why not")
+    rows = [_row(loop, result.map_time_s) for loop in _ordered(result.slam.loops)]
+    how = (
+        "To remove a loop or to force one, write its pair into a file and run again with --loops: "
+        "<code>forbid: [[query, place]]</code>, <code>force: [[query, place]]</code>."
+    )
+    table = html_table(rows, heading) if rows else "<p>No place was proposed.</p>"
+    return f"<section><h2>Every loop that was looked at</h2><p>{how}</p>{table}</section>"
+
+
+def _row(loop: Loop, seconds: NDArray[np.float64]) -> tuple[str, ...]:
+    was_laid = loop.measured > 0
+    return (
+        f"[{loop.query}, {loop.place}]",
+        f"{seconds[loop.query]:.0f} s → {seconds[loop.place]:.0f} s",
+        "closed" if loop.is_accepted else "refused",
+        f"{loop.source}, {loop.inliers} features" if loop.inliers else loop.source,
+        " / ".join(f"{100.0 * share:.0f} %" for share in loop.overlap) if was_laid else "–",
+        f"{100.0 * loop.rms:.1f} cm" if was_laid else "–",
+        f"{loop.innovation:.1f} of {loop.innovation_limit:.1f} σ" if was_laid else "–",
+        f"{loop.measured} of 6" if was_laid else "–",
+        f"{loop.weight:g}",
+        why_refused(loop),
+    )
+
+
+def _ordered(loops: Sequence[Loop]) -> list[Loop]:
+    return sorted(loops, key=lambda loop: (not loop.is_accepted, loop.query, loop.place))
+
+
+def _pictures(result: SlamResult) -> list[str]:
+    drawn = [loop for loop in _ordered(result.slam.loops) if loop.measured > 0]
+    sections = []
+    for loop in drawn[:_PICTURES]:
+        verdict = "closed" if loop.is_accepted else f"refused: {why_refused(loop)}"
+        title = f"Loop [{loop.query}, {loop.place}]"
+        picture = _embedded(_both_maps(result, loop), title)
+        sections.append(f"<section><h2>{title}</h2><p>{escape(verdict)}</p>{picture}</section>")
+    if len(drawn) > _PICTURES:
+        sections.append(f"<p>{len(drawn) - _PICTURES} more loops are not drawn.</p>")
+    return sections
+
+
+def _both_maps(result: SlamResult, loop: Loop) -> Figure:
+    """From above and from the side, the query over the place as it was registered."""
+    place = _some(result.maps[loop.place].points)
+    query = se3.act(loop.T_place_query, _some(result.maps[loop.query].points))
+    figure = Figure(figsize=(10.0, 6.0), layout="constrained")
+    above, side = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
+    for axes, (i, j), names in ((above, (0, 1), ("x [m]", "y [m]")), (side, (0, 2), ("x [m]", "z [m]"))):
+        axes.scatter(place[:, i], place[:, j], s=1.0, linewidths=0, color=_PLACE)
+        axes.scatter(query[:, i], query[:, j], s=1.0, linewidths=0, color=_QUERY, alpha=0.6)
+        axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
+        plain(axes)
+    above.set_title(f"grey: local map {loop.place}, red: {loop.query}", loc="left", fontsize=10)
+    return figure
+
+
+def _some(points: NDArray[np.float32]) -> NDArray[np.float64]:
+    return points[:: max(len(points) // _POINTS, 1)].astype(np.float64)
+
+
+def _embedded(figure: Figure, name: str) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=_DPI)
+    encoded = base64.b64encode(data.getvalue()).decode()
+    return f'<img alt="{escape(name)}" style="max-width:100%" src="data:image/png;base64,{encoded}">'

@@ -1,0 +1,1 @@
+"""`boxplus slam`: odometry over a recording, with loops closed beside it."""

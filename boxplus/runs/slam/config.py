@@ -1,0 +1,43 @@
+"""Everything that can be set for a run with loop closure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import yaml
+from pydantic import Field
+
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.runs.config import RunConfig
+from boxplus.runs.settings_file import load_settings
+from boxplus.systems.slam.config import SlamConfig
+
+
+class SlamRunConfig(RunConfig):
+    """Settings of `boxplus slam`: those of the odometry, of the local maps and of loop closure. None has to be given."""
+
+    local_maps: LocalMapConfig = Field(default_factory=lambda: LocalMapConfig())  # type: ignore[call-arg]
+    slam: SlamConfig = Field(default_factory=lambda: SlamConfig())  # type: ignore[call-arg]
+
+    def of_odometry(self) -> RunConfig:
+        """The part that `boxplus lio` has."""
+        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map)
+
+
+def load_slam_config(
+    path: str | Path | None = None, settings: Iterable[str] = (), overrides: Mapping[str, Mapping[str, object]] | None = None
+) -> SlamRunConfig:
+    """Settings of `boxplus slam` from a YAML file, then single `key=value` texts, then overrides; see `load_settings`.
+
+    Raises:
+        InputError: the file cannot be read, a key is unknown, or a value is not valid.
+    """
+    return load_settings(SlamRunConfig, path, settings, overrides)
+
+
+def dump_slam_config(config: SlamRunConfig) -> str:
+    """The text of `slam/config.yaml`."""
+    head = "# Settings of this run: 'boxplus slam RECORDING --config FILE' repeats it.\n"
+    body: str = yaml.safe_dump(config.model_dump(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return head + body

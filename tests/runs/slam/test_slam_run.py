@@ -1,0 +1,147 @@
+"""`boxplus slam` over a simulated drive round a block: files, facts, loops that a user forbids, the report."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boxplus.errors import InputError
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.recordings.recording import Recording
+from boxplus.report.slam_page import write_slam_report
+from boxplus.runs.run_summary import read_summary
+from boxplus.runs.slam.config import load_slam_config
+from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
+from boxplus.runs.slam.loop_file import read_loop_decisions
+from boxplus.runs.slam.slam_run import SlamResult, run_slam
+from boxplus.runs.slam.spool import ScanSpool, SpooledScan
+from boxplus.simulation import SpinningLidar
+from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.scenarios import make_scenario
+from boxplus.simulation.simulation import Simulation
+from boxplus.simulation.worlds.worlds import city
+from tests.systems.slam.drives import ate
+
+SETTINGS = [
+    *("odometry.scan_voxel=0.5", "odometry.map_cell=0.5", "map.pcd=false", "map.voxel=0.5"),
+    *("local_maps.length=15", "local_maps.voxel=0.5", "slam.nearby_count=1"),
+]
+ROUTE = ((18.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0), (0.0, 0.0), (40.0, 0.0), (40.0, 22.0))
+
+
+def round_a_block() -> Simulation:
+    world = city(1, 1, pitch=40.0, street=14.0, seed=3)
+    lidar = SpinningLidar(channels=16, azimuth_steps=250, vertical_fov_deg=(-25.0, 15.0), rate_hz=5.0)
+    drive = trajectories.drive(ROUTE, speed=9.0, standstill_s=1.0, seed=3)
+    return Simulation(replace(make_scenario("drive"), name="round a block", world=world, trajectory=drive, lidar=lidar), seed=3)
+
+
+@dataclass(frozen=True)
+class Finished:
+    folder: SlamFolder
+    result: SlamResult
+    simulation: Simulation
+
+    def error(self, trajectory: Trajectory) -> float:
+        return ate(trajectory.p, self.simulation.ground_truth(trajectory.times).p_world_imu)
+
+
+def block() -> Recording:
+    return as_recording(round_a_block())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    folder = SlamFolder(tmp_path_factory.mktemp("slam") / "out")
+    config = load_slam_config(settings=SETTINGS)
+    result = run_slam(block(), folder.path, config)
+    write_slam_report(folder.path, result)
+    return Finished(folder, result, round_a_block())
+
+
+def test_the_folder_holds_the_corrected_results_and_the_odometry_s_own(finished: Finished) -> None:
+    folder, summary = finished.folder, finished.result.summary
+    assert json.loads(folder.summary.read_text())["program"] == "boxplus slam" and summary.state == "finished"
+    assert read_summary(folder.odometry.summary) == finished.result.odometry
+    corrected, own = read_trajectory(folder.trajectory), read_trajectory(folder.odometry.trajectory)
+    np.testing.assert_array_equal(corrected.times, own.times)
+    assert corrected.status == own.status
+    assert not folder.spool.exists()
+    points = len(read_ply(folder.map_ply).points)  # merging thins what came in apart from each other
+    assert 0.95 * summary.map_points < points <= summary.map_points and points > 1000
+
+
+def test_the_loop_is_closed_and_nothing_gets_worse(finished: Finished) -> None:
+    assert finished.result.summary.loops_accepted >= 1
+    after, before = (
+        finished.error(read_trajectory(path)) for path in (finished.folder.trajectory, finished.folder.odometry.trajectory)
+    )
+    assert after <= before + 0.005
+
+
+def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> None:
+    loops = finished.result.slam.loops
+    with finished.folder.loops.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(int(row["query"]), int(row["place"]), row["accepted"] == "1") for row in rows] == [
+        (loop.query, loop.place, loop.is_accepted) for loop in loops
+    ]
+    assert all((row["refusal"] == "") == (row["accepted"] == "1") for row in rows)
+    page = finished.folder.report.read_text(encoding="utf-8")
+    for loop in loops:
+        assert f"[{loop.query}, {loop.place}]" in page
+    assert page.count("<img alt=") == 1 + sum(loop.measured > 0 for loop in loops)
+    assert finished.folder.odometry.report.exists()
+    assert sum(finished.result.summary.loops_refused.values()) == sum(not loop.is_accepted for loop in loops)
+
+
+def test_a_folder_with_results_is_replaced_only_when_asked(finished: Finished) -> None:
+    with pytest.raises(InputError, match="--overwrite"), claim_slam_folder(finished.folder.path):
+        pass
+
+
+def test_decisions_of_a_user(tmp_path: Path) -> None:
+    path = tmp_path / "loops.yaml"
+    path.write_text("forbid: [[41, 3], [42, 3]]\nforce:\n  - [57, 12]\n")
+    assert read_loop_decisions(path) == ([(41, 3), (42, 3)], [(57, 12)])
+    path.write_text("")
+    assert read_loop_decisions(path) == ([], [])
+    for text, message in (
+        ("forbid: [3]", "pairs of local maps under forbid"),
+        ("remove: []", "the keys forbid and force"),
+        ("a: [", "readable YAML"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            read_loop_decisions(path)
+    with pytest.raises(InputError, match="readable YAML"):
+        read_loop_decisions(tmp_path / "none.yaml")
+
+
+def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    pose = np.array([1.0, 0, 0, 0, 5.0, 0, 0])
+    with ScanSpool(tmp_path / "spool", 0.1) as spool:
+        scans = []
+        for k in range(3):
+            points = random.uniform(-5.0, 5.0, (40, 3)).astype(np.float32)
+            scans.append(SpooledScan(k, pose, points, np.arange(40, dtype=np.float32) if k else None))
+            spool.append(scans[-1], points + pose[4:])
+        spool.append(scans[0], scans[0].p_body + pose[4:])  # nothing of it is new
+        spool.forget()
+        spool.append(scans[0], scans[0].p_body + pose[4:])  # all of it is, for another local map
+        back = list(spool.scans())
+    assert [scan.time_ns for scan in back] == [0, 1, 2, 0, 0]
+    assert [len(scan.p_body) for scan in back][3:] == [0, len(back[0].p_body)]
+    for put, got in zip(scans, back, strict=False):
+        np.testing.assert_array_equal(got.T_odo_body, put.T_odo_body)
+        assert set(map(tuple, got.p_body.tolist())) <= set(map(tuple, put.p_body.tolist()))
+        assert (got.intensity is None) == (put.intensity is None)
+    assert not (tmp_path / "spool").exists()
