@@ -29,6 +29,10 @@ def vio(
         list[str] | None, typer.Option("--set", help="One setting, e.g. features=200; may be repeated.", metavar="KEY=VALUE")
     ] = None,
     mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the accelerometer gives the scale.")] = False,
+    lines: Annotated[
+        bool,
+        typer.Option("--lines", help="Follow straight lines too: where walls are bare. Takes longer."),
+    ] = False,
     ground_truth: Annotated[
         Path | None, typer.Option("--gt", help="Ground truth to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
     ] = None,
@@ -52,7 +56,7 @@ def vio(
 
     overrides: dict[str, dict[str, object]] = {
         "recording": options.model_dump(exclude_defaults=True),
-        "odometry": {"cameras": "first"} if mono else {},
+        "odometry": ({"cameras": "first"} if mono else {}) | ({"lines": True} if lines else {}),
     }
     run_config = load_settings(VioRunConfig, config, settings or (), overrides)
     shown: View | None = None
@@ -84,4 +88,6 @@ def _rows(summary: VioSummary) -> list[tuple[str, str]]:
         rows.append(("before the start", f"{summary.frames_before_start} frames without a state"))
     rows += timing_rows(summary.timing)
     rows.append(("landmarks", f"{summary.landmarks:,} of {summary.keyframes} keyframes"))
+    if summary.lines:
+        rows.append(("lines", f"{summary.lines:,}"))
     return rows

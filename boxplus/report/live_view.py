@@ -110,6 +110,8 @@ class LiveCameraView(_Viewer):
         rerun, T = self._rerun, estimate.T_world_imu
         self._show_pose(estimate.time_ns, estimate.status, T[:3, :3], T[:3, 3])
         rerun.log("world/landmarks", rerun.Points3D(estimate.landmarks, radii=0.03, colors=[_SEEN_RGB]))
+        lines = rerun.LineStrips3D(estimate.line_ends.reshape(-1, 2, 3), radii=0.01, colors=[_SEEN_RGB])
+        rerun.log("world/lines", lines)
         if estimate.is_keyframe:
             known = estimate.landmarks[estimate.landmark_sigmas < _VAGUE_M]
             rerun.log(f"world/map/{self._count % _MAP_SCANS}", rerun.Points3D(known, radii=0.01))

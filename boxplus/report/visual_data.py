@@ -15,13 +15,14 @@ from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.report.run_data import sigmas_of
 from boxplus.runs.cameras.folder import CameraRunFolder, DirectFolder, VioFolder
+from boxplus.runs.cameras.landmark_file import read_lines
 from boxplus.runs.direct import frame_log as direct_log
 from boxplus.runs.direct.summary import DirectSummary, read_direct_summary
 from boxplus.runs.row_log import RowLog
 from boxplus.runs.visual_inertial import frame_log as visual_log
 from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
 
-_MOST_POINTS = 100_000
+_MOST_POINTS, _MOST_LINES = 100_000, 10_000
 
 SummaryT = TypeVar("SummaryT", VioSummary, DirectSummary)
 
@@ -38,6 +39,7 @@ class VisualData(Generic[SummaryT]):
         sigma: (N, 6) standard deviations of the pose: rotation [rad], position [m].
         log: everything else per frame.
         map_points: (M, 3) the landmarks [m].
+        map_lines: (L, 6) the ends of lines [m].
         evaluation: the comparison with a ground truth, or None.
     """
 
@@ -48,6 +50,7 @@ class VisualData(Generic[SummaryT]):
     sigma: NDArray[np.float64]
     log: RowLog
     map_points: NDArray[np.float32]
+    map_lines: NDArray[np.float32]
     evaluation: dict[str, Any] | None
 
     @property
@@ -94,6 +97,7 @@ def _load(run: CameraRunFolder, summary: SummaryT, log: RowLog) -> VisualData[Su
         }
         summary = summary.model_copy(update=counted)
     points = read_ply(run.landmarks).points if run.landmarks.is_file() else np.zeros((0, 3), np.float32)
+    lines = read_lines(run.lines) if isinstance(run, VioFolder) and run.lines.is_file() else np.zeros((0, 6), np.float32)
     evaluation = json.loads(run.evaluation.read_text(encoding="utf-8")) if run.evaluation.is_file() else None
     return VisualData(
         folder=run,
@@ -103,5 +107,6 @@ def _load(run: CameraRunFolder, summary: SummaryT, log: RowLog) -> VisualData[Su
         sigma=sigmas_of(trajectory, count),
         log=log,
         map_points=points[:: max(1, -(-len(points) // _MOST_POINTS))].astype(np.float32),
+        map_lines=lines[:: max(1, -(-len(lines) // _MOST_LINES))],
         evaluation=evaluation,
     )

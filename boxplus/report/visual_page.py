@@ -15,7 +15,7 @@ from plotly.subplots import make_subplots
 
 from boxplus.report import figures
 from boxplus.report.page import evidence_table, headline, matrix_text, warning_lines, weak_table
-from boxplus.report.palette import REJECTED, STATUS, shown_rows
+from boxplus.report.palette import REJECTED, SERIES, STATUS, shown_rows
 from boxplus.report.plots import biases_picture, plain, status_strip, trajectory_picture, write_pictures
 from boxplus.report.skeleton import figure_section, html_table, warnings_section, write_html
 from boxplus.report.timeline import Timeline
@@ -49,7 +49,7 @@ def _body(data: VisualData[VioSummary]) -> str:
         figure_section(
             "Landmarks and trajectory",
             f"{landmarks} Drag to turn, scroll to zoom, click in the legend to hide.",
-            figures.map_and_trajectory(data),
+            _map(data),
         ),
         figure_section(
             "Status and corners",
@@ -78,10 +78,21 @@ def _head(data: VisualData[VioSummary]) -> str:
         (f"{summary.path_length_m:.2f} m", f"path in {summary.duration_s:.1f} s"),
         (f"{summary.status.get('ok', 0) / max(summary.frames, 1):.1%}", "of the frames ok"),
         *timing_tiles(frame),
-        (f"{summary.landmarks:,}", "landmarks"),
+        (f"{summary.landmarks:,}", f"landmarks, and {summary.lines:,} lines" if summary.lines else "landmarks"),
         *accuracy_tiles(data.evaluation),
     ]
     return headline(summary, summary.recording.path, summary.recording.format, numbers)
+
+
+def _map(data: VisualData[VioSummary]) -> go.Figure:
+    """Landmarks, lines and trajectory."""
+    figure = figures.map_and_trajectory(data)
+    if len(data.map_lines):
+        gaps = np.full((len(data.map_lines), 3), np.nan)
+        x, y, z = np.stack([data.map_lines[:, :3], data.map_lines[:, 3:], gaps], axis=1).reshape(-1, 3).T
+        line = {"color": SERIES[0], "width": 2.5}
+        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", name="lines", hoverinfo="skip", line=line)
+    return figure
 
 
 def timing_tiles(frame: Distribution | None) -> list[tuple[str, str]]:
@@ -106,6 +117,9 @@ def _tracked(data: VisualData[VioSummary]) -> go.Figure:
     rows = shown_rows(data)
     figures.add_status(figure, data, rows)
     figures.add_area(figure, data, rows, data.log.column("tracked"), "agree", STATUS["ok"], "%{y:.0f} landmarks", row=2)
+    lines = data.log.column("lines_tracked")
+    if lines.any():
+        figures.add_line(figure, data.seconds[rows], lines[rows], "lines that agree", SERIES[0], row=2)
     for color, (reason, count) in zip(cycle(REJECTED), data.log.pairs("rejected").items(), strict=False):
         figures.add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} corners", row=2)
     figure.update_yaxes(title_text="corners", rangemode="tozero", row=2, col=1)

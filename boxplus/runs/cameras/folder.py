@@ -60,6 +60,15 @@ class VioFolder(CameraRunFolder):
         """See `CameraRunFolder.pictures`."""
         return ("trajectory.png", "tracked.png", "biases.png")
 
+    @property
+    def lines(self) -> Path:
+        """The lines of the map, where the run followed some."""
+        return self.path / "lines.csv"
+
+    def own_files(self) -> Iterator[Path]:
+        """The files in the folder that a run writes."""
+        yield from self.existing([self.frames, self.landmarks, self.lines, self.evaluation], self.pictures)
+
 
 @dataclass(frozen=True, slots=True)
 class DirectFolder(CameraRunFolder):

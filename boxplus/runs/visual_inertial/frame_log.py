@@ -14,7 +14,7 @@ from boxplus.systems.visual_inertial_odometry.estimate import Status, VioEstimat
 FRAME_COLUMNS = Columns(
     numbers=(
         *xyz("velocity", "bias_gyro", "bias_accel", "sigma_velocity", "sigma_bias_gyro", "sigma_bias_accel"),
-        *("tracked", "new", "landmarks", "is_keyframe", "time_offset_s", "total_ms"),
+        *("tracked", "new", "landmarks", "lines_tracked", "is_keyframe", "time_offset_s", "total_ms"),
     ),
     texts=("rejected", "timing_ms", "reasons"),
     statuses=get_args(Status),
@@ -48,7 +48,7 @@ class FrameLogWriter(RowLogWriter):
             [
                 *(estimate.velocity_world, estimate.gyro_bias, estimate.accel_bias),
                 *(sigma[6:9], sigma[9:12], sigma[12:15]),
-                [estimate.tracked, estimate.new, len(estimate.landmark_ids), estimate.is_keyframe],
+                [estimate.tracked, estimate.new, len(estimate.landmark_ids), estimate.lines_tracked, estimate.is_keyframe],
                 [estimate.time_offset_s, 1e3 * sum(timing_s.values())],
             ]
         )

@@ -33,6 +33,7 @@ class VioSummary(CameraSummary):
     cameras: list[CameraFacts]
     start_problem: str | None = Field(None, description="why there was no start, when the last frame before it was seen")
     start_facts: dict[str, float] = Field(default={}, description="the tests that the start has passed, with their numbers")
+    lines: int = Field(0, description="lines in lines.csv")
     time_offset_s: float = Field(0.0, description="added to the times of the images at the end, beside what the recording knows")
 
 

@@ -15,7 +15,7 @@ from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
-from boxplus.runs.cameras.landmark_file import LandmarksById
+from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
 from boxplus.runs.run_facts import StartFacts, State
 from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
@@ -103,13 +103,15 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         view: View | None,
     ) -> None:
         text = dump_vio_config(config, recording.info)
-        self._landmarks = LandmarksById()
+        self._landmarks, self._lines = LandmarksById(), LandmarksById(size=6)
+        self._line_file = LandmarkFile(folder.lines, self._lines.points, write_lines)
         super().__init__(recording, folder, text, progress, self._landmarks.points)
         self._rig = rig_of_recording(recording.info, config.odometry)
         self._odometry = VisualInertialOdometry(config.odometry, self._rig)
         self._view = view
         self._images: Counter[int] = Counter()
         self._rejected: Counter[str] = Counter()
+        self._lines_rejected: Counter[str] = Counter()
         self._keyframes = self._before_start = 0
         self._push_s = 0.0  # since the frame before
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
@@ -119,6 +121,16 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         """See `RunLoop.open`."""
         super().open(stack)
         self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
+
+    def between_events(self) -> None:
+        """See `RunLoop.between_events`."""
+        super().between_events()
+        self.seconds["writing"] += self._line_file.write_if_due()
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        super().at_end(state)
+        self.seconds["writing"] += self._line_file.write()
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
         """See `RunLoop.push`."""
@@ -142,6 +154,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         stages["window"] = max(self._push_s - sum(stages.values()), 0.0)
         self._push_s, self.status = 0.0, estimate.status
         self._rejected.update(estimate.rejected)
+        self._lines_rejected.update(estimate.lines_rejected)
         if self._view is not None:
             self._view.show(estimate)
         if estimate.status == "starting":
@@ -157,6 +170,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             self._keyframes += 1
             good = estimate.landmark_sigmas < _VAGUE_M
             self._landmarks.update(estimate.landmark_ids[good], estimate.landmarks[good])
+            self._lines.update(estimate.line_ids, estimate.line_ends)
         self._mountings, self._time_offset_s = estimate.T_imu_camera, estimate.time_offset_s
         self.seconds["writing"] += time.perf_counter() - began
 
@@ -190,10 +204,12 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 "recording": self.recording.rejected,
                 "odometry": dict(self._odometry.counters),
                 "corners": dict(self._rejected),
-            },
+            }
+            | ({"lines": dict(self._lines_rejected)} if self._lines_rejected else {}),
             imu_gaps=counts.imu_gaps(),
             time_offset_s=self._time_offset_s,
             landmarks=len(self._landmarks),
+            lines=len(self._lines),
         )
 
     def _cameras(self) -> list[CameraFacts]:

@@ -26,6 +26,9 @@ class VioConfig(BaseModel):
     pixel_sigma: float = Field(0.3, gt=0, description="standard deviation of a tracked corner along each axis [px]")
     there_and_back: float = Field(0.7, gt=0, description="a corner tracked to the next image and back ends this near [px]")
     epipolar: float = Field(1.5, gt=0, description="a corner lies this near to its epipolar line in another image [px]")
+    lines: bool = Field(False, description="follow straight lines beside the corners")
+    max_lines: int = Field(30, ge=1, le=200, description="lines followed at most")
+    line_sigma: float = Field(0.15, gt=0, description="standard deviation of the ends of a segment across it [px]")
     keyframes: int = Field(8, ge=3, le=30, description="keyframes in the window")
     recent_frames: int = Field(2, ge=1, le=5, description="newest frames that are kept whether keyframes or not")
     spared_keyframes: int = Field(

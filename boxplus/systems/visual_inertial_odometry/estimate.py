@@ -34,6 +34,9 @@ class VioEstimate:
         landmark_ids: (m,) int64 of the landmarks in the window; a landmark's last position is its best.
         landmarks: (m, 3) their positions in the world [m].
         landmark_sigmas: (m,) standard deviation of the distance from the camera that found them [m].
+        lines_tracked: lines of the window seen in this frame that agree with it.
+        lines_rejected: lines that were lost or not used, by reason.
+        line_ids: (k,) int64 of the lines in the window; line_ends: (k, 6) both ends of what was seen of them last [m].
         T_imu_camera: (c, 4, 4) as refined, or as given.
         time_offset_s: added to the times of the images, beside what the recording knows [s].
         timing_s: seconds spent, by stage.
@@ -54,6 +57,10 @@ class VioEstimate:
     landmark_ids: NDArray[np.int64]
     landmarks: NDArray[np.float64]
     landmark_sigmas: NDArray[np.float64]
+    lines_tracked: int
+    lines_rejected: Mapping[str, int]
+    line_ids: NDArray[np.int64]
+    line_ends: NDArray[np.float64]
     T_imu_camera: NDArray[np.float64]
     time_offset_s: float
     timing_s: Mapping[str, float]

@@ -61,13 +61,14 @@ class Health:
             position_sigma: standard deviation of the position, all axes together [m].
         """
         time_ns, reasons = tracks.time_ns, []
-        if fit.agreed >= _ANY or rests:
+        agreed = fit.agreed + fit.lines.agreed
+        if agreed >= _ANY or rests:
             self._seen_ns = time_ns
         blind_s = (time_ns - self._seen_ns) * 1e-9
-        if fit.agreed < _ENOUGH and not rests:
-            reasons.append(f"{fit.agreed} landmarks agree with the frame, of at least {_ENOUGH}{self._view(tracks)}")
+        if agreed < _ENOUGH and not rests:
+            reasons.append(f"{agreed} landmarks agree with the frame, of at least {_ENOUGH}{self._view(tracks)}")
         # Corners without a depth, as one camera has them before it moves, hold the attitude and bound what position does.
-        has_corners = fit.agreed + fit.not_agreed < _ANY and len(tracks) >= _ENOUGH
+        has_corners = agreed + fit.not_agreed < _ANY and len(tracks) >= _ENOUGH
         is_lost = blind_s > self.config.max_blind * (_CORNERS_HOLD if has_corners else 1.0)
         if is_lost:
             reasons.append(

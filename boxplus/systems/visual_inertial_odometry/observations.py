@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.systems.visual_inertial_odometry.lines.landmarks import NO_LINES, LineFit
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,7 @@ class Fit:
         given_up: corners of landmarks that turned out to be none.
         reprojection_px: standard deviation of the residuals of the newest frame, from their median [px]; NaN without any.
         imu_ratio: residuals of the IMU over the last intervals, over what its noise explains; 1 is noise.
+        lines: the same of lines.
     """
 
     agreed: int
@@ -46,6 +48,7 @@ class Fit:
     given_up: Ints
     reprojection_px: float
     imu_ratio: float
+    lines: LineFit = NO_LINES
 
 
 @dataclass(slots=True)

@@ -25,10 +25,11 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
+from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker, grey_8_bit, opencv
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
@@ -48,18 +49,24 @@ class VisualInertialOdometry:
         config: the settings; None for the defaults.
         rig: cameras and IMU.
         tracker: what follows corners through the images; optical flow if left out, for which OpenCV has to be installed.
+        line_tracker: what follows lines; if left out `LineTracker`, where the settings ask for lines.
 
     Raises:
         InputError: OpenCV, the extra `vision`, is not installed.
     """
 
-    def __init__(self, config: VioConfig | None, rig: Rig, tracker: Tracker | None = None) -> None:
+    def __init__(
+        self, config: VioConfig | None, rig: Rig, tracker: Tracker | None = None, line_tracker: LineFollower | None = None
+    ) -> None:
         self.config = config or VioConfig()
         self.rig = rig if self.config.cameras == "all" else replace(rig, cameras=rig.cameras[:1], mountings=rig.mountings[:1])
         self.start: Start | None = None
         self.start_problem: str | None = None
         self.window = Window(self.config, self.rig)
         self._tracker = FeatureTracker(self.config, self.rig) if tracker is None else tracker
+        self._line_tracker = line_tracker
+        if self.config.lines and line_tracker is None:
+            self._line_tracker = LineTracker(opencv(), self.rig, self.config.max_lines)
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._waiting: deque[Tracks] = deque()
@@ -153,10 +160,14 @@ class VisualInertialOdometry:
         pose, state = self.window.predict(time_ns, self._imu)
         before = self.window.bodies.values[-1]
         R = quaternion.to_matrix(before[:4]).T
-        tracks = self._tracker.track(time_ns, images, R @ quaternion.to_matrix(pose[:4]), R @ (pose[4:] - before[4:]))
+        R_before_now, p_before_now = R @ quaternion.to_matrix(pose[:4]), R @ (pose[4:] - before[4:])
+        tracks = self._tracker.track(time_ns, images, R_before_now, p_before_now)
         is_keyframe = self.window.wants_keyframe(tracks, pose)
         if is_keyframe:
             tracks = self._tracker.detect(tracks)
+        if self._line_tracker is not None:
+            greys = {camera: grey_8_bit(image) for camera, image in images.items()}
+            tracks = replace(tracks, lines=self._line_tracker.track(greys, R_before_now, p_before_now, wants_new=is_keyframe))
         self.window.add(tracks, pose, state, is_keyframe, self._imu)
         rests = self.window.rests()
         if rests:
@@ -164,6 +175,8 @@ class VisualInertialOdometry:
         self.window.solve()
         fit = self.window.reject(_OUTLIER)
         self._tracker.forget(fit.given_up)
+        if self._line_tracker is not None:
+            self._line_tracker.forget(fit.lines.given_up)
         estimate = self._estimate(tracks, is_keyframe, fit, rests)
         self.window.shrink()
         self._forget_imu(self.window.frames[0].time_ns)
@@ -218,10 +231,14 @@ class VisualInertialOdometry:
             tracked=0,
             new=int(tracks.is_new.sum()),
             rejected=tracks.rejected,
+            lines_rejected={},
             is_keyframe=False,
             landmark_ids=np.zeros(0, np.int64),
             landmarks=np.zeros((0, 3)),
             landmark_sigmas=np.zeros(0),
+            lines_tracked=0,
+            line_ids=np.zeros(0, np.int64),
+            line_ends=np.zeros((0, 6)),
             T_imu_camera=np.array([camera.T_imu_camera for camera in self.rig.cameras]),
             time_offset_s=0.0,
             timing_s={},
@@ -230,6 +247,8 @@ class VisualInertialOdometry:
     def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit, rests: bool) -> VioEstimate:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
         ids, landmarks, sigmas = self.window.landmarks()
+        line_ids, line_ends = self.window.lines.ends(self.window.bodies, self.window.mountings.values)
+        lines = tracks.lines
         covariance = self.window.covariance
         status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, position_sigma(covariance))
         return VioEstimate(
@@ -244,13 +263,18 @@ class VisualInertialOdometry:
             tracked=fit.agreed,
             new=int(tracks.is_new.sum()),
             rejected={**tracks.rejected, "does not fit the window": fit.not_agreed},
+            lines_rejected={**lines.rejected, "does not fit the window": fit.lines.not_agreed} if lines is not None else {},
             is_keyframe=is_keyframe,
             landmark_ids=ids,
             landmarks=landmarks,
             landmark_sigmas=sigmas,
+            lines_tracked=fit.lines.agreed,
+            line_ids=line_ids,
+            line_ends=line_ends,
             T_imu_camera=_matrices(self.window.mountings.values),
             time_offset_s=float(self.window.offset.values[0, 0]),
-            timing_s={"opencv": self._tracker.opencv_s},
+            timing_s={"opencv": self._tracker.opencv_s}
+            | ({} if self._line_tracker is None else {"lines": self._line_tracker.seconds}),
         )
 
 

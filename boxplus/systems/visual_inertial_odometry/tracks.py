@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.systems.visual_inertial_odometry.lines.tracks import LineTracks
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
@@ -23,6 +25,7 @@ class Tracks:
         motion_px: median motion of the corners in the first camera since the image before [px]; NaN without any.
         brightness: (c,) mean grey value of each camera, NaN without an image.
         contrast: (c,) standard deviation of the grey values, NaN without an image.
+        lines: the lines seen beside the corners; None where none are looked for.
     """
 
     time_ns: int
@@ -34,6 +37,7 @@ class Tracks:
     motion_px: float
     brightness: NDArray[np.float64]
     contrast: NDArray[np.float64]
+    lines: LineTracks | None = None
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -28,6 +28,8 @@ from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
+from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, imu_noise
@@ -44,7 +46,6 @@ _DAMPING = 1e-10
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
-_GAP_ACCEL, _GAP_RATE = 3.0, 0.5  # m/s², rad/s: of what may happen while the IMU is silent
 _LEAST_RHO = 0.1  # 1/m, for what is not known to be nearer
 _RECUT_NS = 1_000_000
 SPARE_NS = 20_000_000  # of IMU samples on both sides of the intervals, where these follow the clocks' offset
@@ -57,6 +58,7 @@ class Window:
     Attributes:
         problem: poses `bodies`, velocities and biases `states` [v, b_a, b_g], camera mountings, `points` [x, y, ρ] in the first
             camera of their anchor.
+        lines: landmarks that are lines.
         offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
         gap_s: longest time between IMU samples before the newest frame [s].
         frames: in order of time.
@@ -72,6 +74,7 @@ class Window:
         self.states = self.problem.add_variables(Euclidean(9), np.zeros((0, 9)), name="states")
         self.mountings = self.problem.add_variables(BodyPose, rig.mountings, name="mountings")
         self.points = self.problem.add_variables(Euclidean(3), np.zeros((0, 3)), name="points")
+        self.lines = LineLandmarks(self.problem, rig, config.line_sigma)
         if config.extrinsic_estimation:
             sigma = np.repeat([np.radians(config.extrinsic_rotation_sigma_deg), config.extrinsic_translation_sigma], 3)
             self.problem.add_residuals(Prior(BodyPose, rig.mountings, sigma=sigma), self.mountings, name="drawing")
@@ -118,26 +121,9 @@ class Window:
 
     def _step(self, time_ns: int, imu: ImuSamples) -> Preintegration:
         """What the IMU measured from the newest frame to a time of the cameras' clock."""
-        state = self.states.values[-1]
-        since, until = self.frames[-1].time_ns + self.cut_ns, time_ns + self.cut_ns
-        spare = SPARE_NS if self._config.time_offset_estimation else 0
-        first = max(int(np.searchsorted(imu.time_ns, since - spare, side="right")) - 1, 0)
-        last = int(np.searchsorted(imu.time_ns, until + spare, side="left")) + 1
-        step = Preintegration.integrate(
-            imu.time_ns[first:last],
-            imu.gyro[first:last],
-            imu.accel[first:last],
-            noise=self._noise,
-            intervals_ns=[since, until],
-            bias_accel=state[3:6],
-            bias_gyro=state[6:],
-        )
-        gap = float(step.longest_gap_s[0])
-        if gap > self._config.max_imu_gap:
-            # What happened meanwhile is not known; in the order [α, θ, β].
-            spread = np.repeat([0.5 * _GAP_ACCEL * gap**2, _GAP_RATE * gap, _GAP_ACCEL * gap], 3)
-            step.covariance[0][range(9), range(9)] += spread**2
-        return step
+        interval_ns = self.frames[-1].time_ns + self.cut_ns, time_ns + self.cut_ns
+        spare_ns = SPARE_NS if self._config.time_offset_estimation else 0
+        return imu_step(imu, interval_ns, self.states.values[-1], self._noise, self._config.max_imu_gap, spare_ns)
 
     def _follow_clock(self) -> None:
         """Cut the IMU's intervals anew where the clocks' offset moved away from that they were cut at."""
@@ -157,6 +143,7 @@ class Window:
             here = np.full(int(there.sum()), number)
             ids, pixels = self.points.ids[landmark[there]], tracks.pixels[row[there], camera]
             self._seen.add(here, ids, np.full(len(here), camera), pixels)
+        self.lines.add(number, tracks.lines)
         if is_keyframe:
             self._found_landmarks()
             self._founded = int(np.isin(tracks.ids, self._track).sum())
@@ -202,7 +189,11 @@ class Window:
         newest = self.frames[-1].tracks
         lone = newest.ids[~np.isin(newest.ids, self._track)]
         keyframes = [frame for frame in self.frames if frame.is_keyframe]
-        if not len(lone) or not keyframes:
+        if not keyframes:
+            return
+        poses = self.bodies.values[[self._row(frame.number) for frame in keyframes]]
+        self.lines.found([(frame.number, frame.tracks.lines) for frame in keyframes], poses, self.mountings.values)
+        if not len(lone):
             return
         count, cameras = len(lone), newest.pixels.shape[1]
         pixels = np.full((len(keyframes), count, cameras, 2), np.nan)
@@ -213,7 +204,6 @@ class Window:
             at[at == len(frame.tracks.ids)] = 0
             there = (frame.tracks.ids[at] == lone) & (frame.number >= free_from) if len(frame.tracks) else np.zeros(count, bool)
             pixels[k, there], rays[k, there] = frame.tracks.pixels[at[there]], frame.tracks.rays[at[there]]
-        poses = self.bodies.values[[self._row(frame.number) for frame in keyframes]]
         sigma = self._config.pixel_sigma / self._rig.cameras[0].model.fx
         anchor, rho, good = triangulate(rays, poses, self.mountings.values, sigma)
         chosen = np.flatnonzero(good)
@@ -259,6 +249,7 @@ class Window:
         """Minimise over the window, from where it is; with as many steps as the settings say, if left out."""
         self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
+        self.lines.connect(self.bodies, self.mountings)
         most = self._config.max_iterations if max_iterations is None else max_iterations
         solution = self.problem.solve(
             max_iterations=most, cost_tolerance=_COST_TOLERANCE, initial_damping=_DAMPING, examine=False
@@ -338,6 +329,7 @@ class Window:
             given_up=self._track[gone],
             reprojection_px=self._config.pixel_sigma * float(np.sqrt(spread / _MEDIAN_OF_TWO)),
             imu_ratio=float(np.sqrt(imu[-_LAST_INTERVALS:].mean())) if len(imu) else 0.0,
+            lines=self.lines.reject(values, self.frames[-1].number, threshold),
         )
         seen.keep(~bad)
         self._rho_sigma = self._inverse_depth_sigmas()
@@ -366,6 +358,7 @@ class Window:
         for frame in [f for f in self.frames[1 : -self._config.recent_frames] if not f.is_keyframe]:
             k = self.frames.index(frame)
             self._disconnect()
+            self.lines.drop(frame.number)
             self.problem.remove(self.bodies[frame.number], self.states[frame.number])
             self._seen.keep(self._seen.frame != frame.number)
             if self._imu is not None:
@@ -390,9 +383,11 @@ class Window:
             self._free_from.pop(int(corner), None)
         self._free_from |= dict.fromkeys(corners[lives].tolist(), spared)
         self._connect(np.flatnonzero(absorbed), 1)
-        variables = [self.bodies[oldest.number], self.states[oldest.number], self.points[ids]]
+        lines = self.lines.leave(self.bodies, self.mountings, keyframes, spared, self.frames[-1].tracks.lines)
+        variables = [self.bodies[oldest.number], self.states[oldest.number], self.points[ids], lines]
         self.leak = marginalize(self.problem, variables, at=None, gauge=self._gauge).leak
         self._imu_group = self._views = None
+        self.lines.forget(lines.ids)
         seen.keep(~np.isin(seen.landmark, ids))
         self._track, self._anchor = self._track[~leaving], self._anchor[~leaving]
         if self._imu is not None:

@@ -23,7 +23,9 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.report import write_report
+from boxplus.report.visual_data import load_visual_run
 from boxplus.runs.cameras.folder import VioFolder
+from boxplus.runs.cameras.landmark_file import read_lines, write_lines
 from boxplus.runs.settings_file import load_settings
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.frame_log import read_frame_log
@@ -103,6 +105,45 @@ def test_the_report_says_what_the_run_was(finished: tuple[VioFolder, VioSummary]
     for text in ("Landmarks and trajectory", "Status and corners", "Biases", f"{summary.frames} frames", "cam1: Pinhole"):
         assert text in page
     assert {path.name for path in folder.plots.iterdir()} == {"trajectory.png", "tracked.png", "biases.png"}
+
+
+def test_a_run_with_lines_says_so_and_is_as_good(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["vio", str(recorded), "-o", str(out), "--lines", "--no-report", "--set", "cell_size=12"])
+    assert result.exit_code == 0, result.output
+    folder, summary = VioFolder(out), read_vio_summary(out / "run.json")
+    assert load_settings(VioRunConfig, folder.config).odometry.lines
+    # The room has textures and hardly an edge: what is found of lines is in file and facts alike.
+    assert summary.lines == (len(read_lines(folder.lines)) if folder.lines.exists() else 0)
+    assert summary.rejected["lines"]["looks different"] > 0 and (read_frame_log(folder.frames).column("lines_tracked") >= 0).all()
+    truth = read_trajectory(recorded.with_name("room.gt.tum"))
+    assert evaluate(read_trajectory(folder.trajectory), truth, alignment="yaw", method="interpolate").ate.rmse < 0.01
+
+
+def test_lines_are_drawn_and_do_not_outlive_their_run(
+    finished: tuple[VioFolder, VioSummary], recorded: Path, tmp_path: Path
+) -> None:
+    folder = VioFolder(tmp_path / "again")
+    shutil.copytree(finished[0].path, folder.path)
+    assert '"name":"lines"' not in write_report(folder.path).read_text(encoding="utf-8")
+    ends = np.random.default_rng(1).normal(size=(9, 6)).astype(np.float32)
+    write_lines(folder.lines, ends)
+    assert '"name":"lines"' in write_report(folder.path).read_text(encoding="utf-8")
+    assert np.allclose(load_visual_run(folder.path).map_lines, ends, atol=1e-4)
+    with open_camera_recording(recorded) as recording:
+        run_visual_odometry(recording, folder.path, CONFIG, overwrite=True, should_stop=lambda: True)
+    assert not folder.lines.exists()
+
+
+def test_a_damaged_file_of_lines_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lines.csv"
+    ends = np.arange(12.0, dtype=np.float32).reshape(2, 6)
+    write_lines(path, ends)
+    assert np.array_equal(read_lines(path), ends)
+    for text in ("", "a,b\n", path.read_text().replace("11.0000", "eleven"), path.read_text()[:-12]):
+        path.write_text(text)
+        with pytest.raises(InputError, match="boxplus vio --lines"):
+            read_lines(path)
 
 
 def test_a_second_run_replaces_the_first_only_when_asked(

@@ -11,6 +11,7 @@ from boxplus import CameraImage, Pinhole, RadialTangential
 from boxplus.manifolds import so3
 from boxplus.residuals import ImuNoise
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VioEstimate, VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 NOISE = ImuNoise(gyro=1e-3, accel=1e-2, gyro_walk=1e-4, accel_walk=1e-3)
@@ -179,9 +180,10 @@ def run(
     config: VioConfig,
     tracker: SimulatedTracker | None = None,
     silent: tuple[float, float] = (1e9, 1e9),
+    line_tracker: LineFollower | None = None,
 ) -> tuple[VisualInertialOdometry, list[VioEstimate]]:
     """All of a flight through the odometry, but for the IMU samples between the two times `silent` [s]."""
-    vio = VisualInertialOdometry(config, its, tracker or SimulatedTracker(flight, its))
+    vio = VisualInertialOdometry(config, its, tracker or SimulatedTracker(flight, its), line_tracker)
     blank = np.zeros((480, 752), np.uint8)
     estimates = []
     for k in range(0, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY):
