@@ -23,6 +23,7 @@ def warmup() -> None:
 
         with on_compilation(show):
             _run_odometry()
+            _close_loops()
             _optimize_pose_graphs()
             _adjust_bundle()
             _follow_camera()
@@ -46,6 +47,29 @@ def _run_odometry() -> None:
     recording = as_recording(simulate("moving_start", duration_s=3.0, lidar=SpinningLidar(azimuth_steps=500)))
     with tempfile.TemporaryDirectory() as folder:
         run_odometry(recording, Path(folder) / "run", load_run_config(overrides={"odometry": odometry}))
+
+
+def _close_loops() -> None:
+    import importlib.util
+
+    import numpy as np
+
+    from boxplus.maps.local_maps.builder import LocalMapBuilder
+    from boxplus.maps.local_maps.config import LocalMapConfig
+    from boxplus.simulation.drifting_drive import DriftConfig, simulate_drifting_drive
+    from boxplus.simulation.worlds.worlds import city
+    from boxplus.systems.slam.config import SlamConfig
+    from boxplus.systems.slam.slam import Slam
+
+    route = [[20.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0], [0.0, 0.0], [40.0, 0.0]]
+    config = DriftConfig(channels=16, azimuth_steps=200)
+    drive = simulate_drifting_drive(city(1, 1, pitch=40.0, street=14.0), route, config)
+    has_opencv = importlib.util.find_spec("cv2") is not None
+    slam = Slam(SlamConfig(appearance="density" if has_opencv else "scan_context"))
+    builder, zero = LocalMapBuilder(LocalMapConfig(voxel=0.5)), np.zeros((6, 6))
+    for time_ns, T_odo_body, scan in zip(drive.time_ns.tolist(), drive.T_odo_body, drive.scans, strict=True):
+        for local_map in builder.push(time_ns, T_odo_body, zero, scan):
+            slam.add(local_map)
 
 
 def _optimize_pose_graphs() -> None:

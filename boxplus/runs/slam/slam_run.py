@@ -86,7 +86,8 @@ def run_slam(
         extrinsic, overwrite, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
-        InputError: OpenCV, the extra `vision`, is not installed and appearance is wanted; what `run_odometry` and `Slam` refuse.
+        InputError: OpenCV, the extra `vision`, is not installed and density images are wanted; what `run_odometry` and `Slam`
+            refuse.
         OutputError: the folder cannot be written or the disk is full.
         RecordingError: nothing could be read.
     """

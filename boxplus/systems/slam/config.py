@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.maps.descriptors.config import DescriptorConfig
@@ -39,7 +41,13 @@ class SlamConfig(BaseModel):
 
     descriptor: DescriptorConfig = Field(DescriptorConfig(), description="see DescriptorConfig")
     registration: RegistrationConfig = Field(RegistrationConfig(), description="see RegistrationConfig")
-    appearance: bool = Field(True, description="look for places that look alike; needs the extra vision")
+    appearance: Literal["density", "scan_context", "none"] = Field(
+        "density",
+        description="how places are recognised: by features of density images (needs the extra vision), and by scan contexts "
+        "where these find nothing; by scan contexts alone; or not at all, by where the estimate has them only",
+    )
+    context_range: float = Field(40.0, gt=0, description="reach of scan contexts [m]")
+    context_distance: float = Field(0.4, gt=0, le=1, description="of two scan contexts that look alike, at most")
     least_way: float = Field(30.0, ge=0, description="way between two visits of a loop, at least [m]")
     nearby: float = Field(12.0, ge=0, description="places within this of where one should be are tried [m]; 0: none")
     nearby_sigma: float = Field(3.0, gt=0, description="where the position against them is known to this [m]")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Source = Literal["appearance", "nearby", "forced"]
+Source = Literal["appearance", "scan context", "nearby", "forced"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,7 +18,7 @@ class Loop:
 
     Attributes:
         query, place: numbers of the local maps.
-        source: who proposed it: `appearance`, the density images; `nearby`, the estimate; `forced`, the user.
+        source: who proposed it: `appearance`, the density images; `scan context`; `nearby`, the estimate; `forced`, the user.
         inliers: matching features that agree on a motion; 0 where nobody looked.
         T_place_query: (7,) measured, and `T_start` (7,) what the registration started from.
         covariance, information: (6, 6) of it, on the right, see `Registration`.

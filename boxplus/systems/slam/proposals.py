@@ -8,14 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._opencv import opencv
 from boxplus.manifolds import se3
-from boxplus.maps.descriptors.features import Features
+from boxplus.maps.descriptors.features import WORDS, Features, describe
 from boxplus.maps.descriptors.place_index import Candidate, PlaceIndex
+from boxplus.maps.descriptors.scan_context import ScanContextIndex, scan_context
+from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Source
 from boxplus.systems.slam.odometry_chain import OdometryChain
+from boxplus.systems.slam.rivals import best_shift
 
 Floats = NDArray[np.float64]
+
+_CONTEXTS = 3  # places looked at that have a similar scan context
+_CONTEXT_REACH = 8.0  # m, from which a place still has a similar one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,25 +35,51 @@ class Proposal:
     inliers: int = 0
 
 
-def propose(
-    query: int,
-    features: Features | None,
-    index: PlaceIndex,
-    odometry: OdometryChain,
-    before: int,
-    T_map: Sequence[Floats],
-    config: SlamConfig,
-) -> list[Proposal]:
-    """Places before number `before` for a query, each once for every start that differs.
+class Proposer:
+    """Knows what all local maps so far look like.
 
-    Args:
-        features: of the query; None where density images are not used.
-        T_map: (7,) of every local map up to the query, as estimated now.
+    Raises:
+        InputError: OpenCV, the extra `vision`, is not installed and density images are wanted.
     """
-    if before <= 0:
-        return []
-    found = [] if features is None else [_seen(candidate) for candidate in index.candidates(features, before=before, seed=query)]
-    return found + _near(query, odometry, before, T_map, config)
+
+    def __init__(self, config: SlamConfig) -> None:
+        self._config = config
+        self._densities = PlaceIndex(config.descriptor)
+        self._contexts = ScanContextIndex()
+        if config.appearance == "density":
+            opencv("which describes density images")  # now, not after the first local map
+
+    def propose(self, maps: Sequence[LocalMap], before: int, odometry: OdometryChain, T_map: Sequence[Floats]) -> list[Proposal]:
+        """Places before number `before` for the newest of the maps, which is remembered for later ones.
+
+        Args:
+            maps: all so far; T_map: (7,) of each, as estimated now.
+        """
+        query = len(maps) - 1
+        found: list[Proposal] = []
+        if self._config.appearance == "density":
+            features = _described(maps[query], self._config)
+            found = [_seen(candidate) for candidate in self._densities.candidates(features, before=before, seed=query)]
+            self._densities.add(features)
+        if self._config.appearance != "none":
+            context = scan_context(maps[query].points, self._config.context_range)
+            if not found:
+                alike = self._contexts.candidates(context, before=before, count=_CONTEXTS)
+                found = [self._turned(maps, place, yaw) for place, far, yaw in alike if far <= self._config.context_distance]
+            self._contexts.add(context)
+        return found + (_near(query, odometry, before, T_map, self._config) if before > 0 else [])
+
+    def _turned(self, maps: Sequence[LocalMap], place: int, yaw: float) -> Proposal:
+        """A scan context tells the yaw; where the query is in the place, the correlation of the density images does."""
+        T = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), 0.0, 0.0, 0.0])
+        T[4:6] = best_shift(maps[-1].points, maps[place].points, T, self._config.descriptor.cell, _CONTEXT_REACH)
+        return Proposal(place, T, "scan context")
+
+
+def _described(local_map: LocalMap, config: SlamConfig) -> Features:
+    if not len(local_map.points):  # of lost scans only: nothing to be recognised by, but the index counts on
+        return Features(np.zeros((0, 2)), np.zeros((0, WORDS), np.uint64))
+    return describe(local_map.points, config.descriptor)
 
 
 def _seen(candidate: Candidate) -> Proposal:

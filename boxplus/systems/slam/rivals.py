@@ -36,22 +36,12 @@ def rival_shifts(
         share: of the agreement where it was laid.
         count: K at most.
     """
-    moved = se3.act(T_place_query, query.astype(np.float64))[:, :2]
-    there = place[:, :2].astype(np.float64)
     reach = 3.0 * float(np.sqrt(max(np.linalg.eigvalsh(sigma)[-1], 0.0)))
     if reach < least:
         return np.zeros((0, 2))
-    low = there.min(axis=0)
-    shape = np.ceil((there.max(axis=0) - low) / cell).astype(int) + 1
-    inside = ((moved >= low - reach) & (moved <= low + shape * cell + reach)).all(axis=1)
-    pad = int(np.ceil(reach / cell)) + 1
-    size = shape + 2 * pad
-    a, b = (_image(points, low - pad * cell, size, cell) for points in (there, moved[inside]))
-    agreement = np.fft.irfft2(np.fft.rfft2(a) * np.conj(np.fft.rfft2(b)), s=a.shape)
+    agreement, shift = _agreement(query, place, T_place_query, cell, reach)
     at_zero = agreement[0, 0]
-    steps = [np.where((k := np.arange(n)) > n // 2, k - n, k) * cell for n in a.shape]
-    x, y = np.meshgrid(*steps, indexing="ij")
-    shift = np.stack([x, y], axis=-1)
+    x, y = shift[..., 0], shift[..., 1]
     within = np.einsum("uva,ab,uvb->uv", shift, np.linalg.inv(sigma), shift) <= 9.0
     possible = within & (np.hypot(x, y) >= least) & (agreement >= share * at_zero)
     found: list[Floats] = []
@@ -63,6 +53,32 @@ def rival_shifts(
         if possible[place_of] and all(np.linalg.norm(own - other) >= least for other in found):
             found.append(own)
     return np.array(found).reshape(-1, 2)
+
+
+def best_shift(
+    query: NDArray[np.float32], place: NDArray[np.float32], T_place_query: Floats, cell: float, reach: float
+) -> Floats:
+    """(2,) shift within `reach` [m], in the place's frame, at which the images agree best [m]."""
+    agreement, shift = _agreement(query, place, T_place_query, cell, reach)
+    near = (shift**2).sum(axis=-1) <= reach**2
+    return np.asarray(shift[np.unravel_index(int(np.argmax(np.where(near, agreement, -np.inf))), agreement.shape)])
+
+
+def _agreement(
+    query: NDArray[np.float32], place: NDArray[np.float32], T_place_query: Floats, cell: float, reach: float
+) -> tuple[Floats, Floats]:
+    """Correlation (U, V) of the two density images over shifts (U, V, 2) of the query [m], sound up to `reach`."""
+    moved = se3.act(T_place_query, query.astype(np.float64))[:, :2]
+    there = place[:, :2].astype(np.float64)
+    low = there.min(axis=0)
+    shape = np.ceil((there.max(axis=0) - low) / cell).astype(int) + 1
+    inside = ((moved >= low - reach) & (moved <= low + shape * cell + reach)).all(axis=1)
+    pad = int(np.ceil(reach / cell)) + 1
+    size = shape + 2 * pad
+    a, b = (_image(points, low - pad * cell, size, cell) for points in (there, moved[inside]))
+    agreement = np.fft.irfft2(np.fft.rfft2(a) * np.conj(np.fft.rfft2(b)), s=a.shape)
+    x, y = np.meshgrid(*(np.where((k := np.arange(n)) > n // 2, k - n, k) * cell for n in a.shape), indexing="ij")
+    return agreement, np.stack([x, y], axis=-1)
 
 
 def _image(xy: Floats, low: Floats, size: NDArray[np.int64], cell: float) -> Floats:

@@ -15,11 +15,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
-from boxplus.maps.descriptors.features import WORDS, Features, describe
-from boxplus.maps.descriptors.place_index import PlaceIndex
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.consistency import agree, largest_clique
@@ -27,7 +24,7 @@ from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.graph import close_graph
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
-from boxplus.systems.slam.proposals import Proposal, propose
+from boxplus.systems.slam.proposals import Proposal, Proposer
 from boxplus.systems.slam.registration import Surface, surface_distance
 from boxplus.systems.slam.verification import verify
 
@@ -58,11 +55,9 @@ class Slam:
     def __init__(self, config: SlamConfig | None = None, *, forbidden: Iterable[Pair] = (), forced: Iterable[Pair] = ()) -> None:
         self.config = config if config is not None else SlamConfig()
         self._forbidden, self._forced = _checked_pairs(forbidden, forced)
-        if self.config.appearance:
-            opencv("which describes density images")  # now, not after the first local map
         self._maps: list[LocalMap] = []
         self._odometry = OdometryChain()
-        self._index = PlaceIndex(self.config.descriptor)
+        self._proposer = Proposer(self.config)
         self._surfaces: dict[int, Surface] = {}
         self._rms: list[float] = []
         self.loops: list[Loop] = []
@@ -81,11 +76,7 @@ class Slam:
         self._odometry.add(local_map)
         self.T_map.append(self._predicted(query))
         self._rms.append(self._rms_of_odometry(query))
-        features = self._described(local_map)
-        proposals = self._proposals(query, features)
-        if features is not None:
-            self._index.add(features)
-        verified = [self._verified(query, proposal) for proposal in proposals]
+        verified = [self._verified(query, proposal) for proposal in self._proposals(query)]
         looked_at = _without_contradictions(verified, self._odometry, self.config)
         first = len(self.loops)
         self.loops += _best_of_each_place(looked_at)
@@ -146,17 +137,10 @@ class Slam:
         poses = self._odometry.poses
         return poses[0] if query == 0 else se3.compose(self.T_map[-1], se3.compose(se3.inverse(poses[-2]), poses[-1]))
 
-    def _described(self, local_map: LocalMap) -> Features | None:
-        if not self.config.appearance:
-            return None
-        if not len(local_map.points):  # of lost scans only: nothing to be recognised by, but the index counts on
-            return Features(np.zeros((0, 2)), np.zeros((0, WORDS), np.uint64))
-        return describe(local_map.points, self.config.descriptor)
-
-    def _proposals(self, query: int, features: Features | None) -> list[Proposal]:
+    def _proposals(self, query: int) -> list[Proposal]:
         way = self._maps[query].path_m - np.array([m.path_m for m in self._maps])
         before = int(np.count_nonzero(way >= self.config.least_way))
-        found = propose(query, features, self._index, self._odometry, before, self.T_map, self.config)
+        found = self._proposer.propose(self._maps, before, self._odometry, self.T_map)
         free = [p for p in found if (query, p.place) not in self._forbidden and (query, p.place) not in self._forced]
         wanted = sorted(place for q, place in self._forced if q == query)
         T = self.T_map

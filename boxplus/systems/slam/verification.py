@@ -54,7 +54,7 @@ def verify(
         np.eye(6),
         np.zeros((6, 6)),
     )
-    if proposal.source == "appearance" and (refusal := _far_off(base, odometry, config)):
+    if proposal.source in ("appearance", "scan context") and (refusal := _far_off(base, odometry, config)):
         return replace(base, refusal=refusal)
     bend = _deformation(query, place, proposal.T_start)
     found = register(own, there, proposal.T_start, config.registration, bend)

@@ -15,6 +15,7 @@ from boxplus.maps.descriptors.density_image import density_image
 from boxplus.maps.descriptors.features import Features, describe, match_features
 from boxplus.maps.descriptors.place_index import PlaceIndex
 from boxplus.maps.descriptors.rigid_2d import find_rigid_motion
+from boxplus.maps.descriptors.scan_context import SECTORS, ScanContextIndex, scan_context
 from tests.maps.descriptors.places import visited, walls
 
 _NO_OPENCV = r"OpenCV, which describes density images – got it is not installed – pip install 'boxplus\[vision\]'"
@@ -135,3 +136,39 @@ def test_votes_are_brute_force_where_bits_agree(random_seed: int = 5) -> None:
     assert index.candidates(query, before=0) == []
     with pytest.raises(InputError, match="a place from 0 to 119"):
         index.align(query, 120)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**31), st.integers(0, SECTORS - 1))
+def test_a_turn_by_whole_sectors_is_found_exactly(seed: int, sectors: int) -> None:
+    random = np.random.default_rng(seed)
+    # Within the sectors, so that a turn moves whole cells.
+    cell = (random.integers(0, SECTORS, 300) + random.uniform(0.1, 0.9, 300)) / SECTORS * 2 * np.pi
+    distance, height = random.uniform(1.0, 39.0, 300), random.uniform(0.0, 5.0, 300)
+    turn = 2 * np.pi * sectors / SECTORS
+    one, two = (
+        scan_context(np.column_stack([distance * np.cos(a), distance * np.sin(a), height]), 40.0) for a in (cell, cell + turn)
+    )
+    np.testing.assert_allclose(one.ring_key, two.ring_key)
+    far, yaw = one.distance(two)
+    assert far == pytest.approx(0.0, abs=1e-9)
+    assert abs((yaw - turn + np.pi) % (2 * np.pi) - np.pi) < 1e-9
+
+
+def test_scan_contexts_find_places_from_near_by() -> None:
+    index = ScanContextIndex()
+    places = [walls(seed) for seed in range(80)]  # more than there is room for in the beginning
+    for place in places:
+        index.add(scan_context(place, 28.0))
+    right = 0
+    for k in range(0, 80, 8):
+        points, yaw, t = visited(places[k], seed=300 + k)
+        c, s = np.cos(yaw), np.sin(yaw)
+        points[:, :2] += 0.9 * t @ np.array([[c, -s], [s, c]])  # within a metre of where the place was described
+        place, far, turned = index.candidates(scan_context(points, 28.0))[0]
+        right += place == k and far < 0.65 and abs((turned - yaw + np.pi) % (2 * np.pi) - np.pi) < 0.16
+    assert right >= 9
+    assert all(place < 5 for place, _, _ in index.candidates(scan_context(places[40], 28.0), before=5))
+    assert index.candidates(scan_context(places[40], 28.0), before=0) == []
+    with pytest.raises(InputError, match="a positive range"):
+        scan_context(places[0], 0.0)

@@ -62,14 +62,18 @@ def test_a_forbidden_loop_is_not_looked_at_and_a_forced_one_is_believed(block: M
     pairs = [(loop.query, loop.place) for loop in slam.loops if loop.is_accepted]
     without = closed(block, forbidden=pairs)
     assert not {(loop.query, loop.place) for loop in without.loops} & set(pairs)
-    forced = closed(block, SlamConfig(appearance=False, nearby=0.0), forced=pairs[:1])
+    forced = closed(block, SlamConfig(appearance="none", nearby=0.0), forced=pairs[:1])
     assert [(loop.query, loop.place, loop.source, loop.is_accepted) for loop in forced.loops] == [(*pairs[0], "forced", True)]
 
 
-def test_without_opencv_places_nearby_are_still_found(block: MappedDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_opencv_places_are_still_found(block: MappedDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    found = closed(block, SlamConfig(appearance=False))
-    assert any(loop.is_accepted for loop in found.loops)
+    nearby = closed(block, SlamConfig(appearance="none"))
+    assert any(loop.is_accepted for loop in nearby.loops)
+    contexts = closed(block, SlamConfig(appearance="scan_context", nearby=0.0))
+    accepted = [loop for loop in contexts.loops if loop.is_accepted]
+    assert accepted and all(loop.source == "scan context" for loop in accepted)
+    assert all(np.linalg.norm(block.error(loop)[3:]) < 0.25 for loop in accepted)
     with pytest.raises(InputError, match=r"boxplus\[vision\]"):
         closed(block)
 
