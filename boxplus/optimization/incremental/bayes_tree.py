@@ -201,14 +201,19 @@ class BayesTree:
         self.factors = end
         return first
 
-    def touched(self, variables: Indices, first: int) -> tuple[Indices, Indices]:
-        """The factors of `variables` and those from number `first` on, and the variables of all of them."""
+    def factors_of(self, variables: Indices, first: int) -> tuple[Indices, int]:
+        """The factors of `variables` and those from number `first` on, and how many connections they have."""
         self._mark += 1
         count, connections = _touched(
             self._mark, variables, first, self.factors, self._adjacency, self._next_entry, self._factor_of, self._factor_start,
             self._factor_mark, self._found,
         )  # fmt: skip
-        factors, seeds = self._found[:count].copy(), np.empty(connections, np.int64)
+        return self._found[:count].copy(), int(connections)
+
+    def touched(self, variables: Indices, first: int) -> tuple[Indices, Indices]:
+        """The factors of `variables` and those from number `first` on, and the variables of all of them."""
+        factors, connections = self.factors_of(variables, first)
+        seeds = np.empty(connections, np.int64)
         _variables_of(factors, self._factor_start, self._factor_variables, seeds)
         return factors, seeds
 

@@ -19,7 +19,7 @@ from boxplus.optimization.incremental.factor_store import FactorStore, GroupStor
 from boxplus.optimization.incremental.growing import grown
 from boxplus.optimization.incremental.options import IncrementalOptions
 from boxplus.optimization.incremental.reports import IncrementalSolution, IncrementalUpdate
-from boxplus.optimization.incremental.variables import GrowingVariables
+from boxplus.optimization.incremental.variables import GrowingVariables, gather_points, scatter_points
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solver_options import options_from
@@ -224,9 +224,10 @@ class IncrementalProblem:
         """Bring the estimates to the new δ, and find the variables of residuals that are off their linearisation there."""
         tree = self._tree
         for block, variables in self._by_block(changed):
-            rows = self._row_of[variables]
-            block.estimates[rows] = block.manifold.boxplus(block.points[rows], tree.delta[self._places(variables, block)])
-        factors = tree.touched(changed, tree.factors)[0]
+            x, delta = np.empty((len(variables), block.manifold.size)), np.empty((len(variables), block.manifold.dof))
+            gather_points(variables, self._row_of, block.points, tree.start, tree.delta, x, delta)
+            scatter_points(variables, self._row_of, block.manifold.boxplus(x, delta), block.estimates)
+        factors = tree.factors_of(changed, tree.factors)[0]
         off = []
         for number, own in self._by_store(factors):
             store = self._stores[number]
@@ -255,6 +256,9 @@ class IncrementalProblem:
 
     def _by_store(self, factors: Indices) -> Iterator[tuple[int, Indices]]:
         if not len(factors):
+            return
+        if len(self._stores) == 1:
+            yield 0, factors
             return
         stores = self._factor_store[factors]
         if (stores == stores[0]).all():

@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.incremental.growing import grown
 from boxplus.optimization.variables import Variables
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 class GrowingVariables(Variables):
@@ -69,7 +73,29 @@ class GrowingVariables(Variables):
         """At which row each variable stands: its id."""
         return ids.astype(np.uint32)
 
-    @property
-    def has_first_estimate(self) -> NDArray[np.bool_]:
-        """(n,) none: the tree is linearised at `points` as a whole."""
-        return np.zeros(self._count, dtype=np.bool_)
+    def has_first_estimate(self, rows: NDArray[np.uint32]) -> bool:
+        """None has: the tree is linearised at `points` as a whole."""
+        return False
+
+
+@kernel
+def gather_points(
+    variables: Indices, row_of: Indices, points: Array, start: Indices, delta: Array, x: Array, own_delta: Array
+) -> None:
+    """Points (n, size) and δ (n, dof) of variables of one block; `row_of` and `start` of every variable of the tree."""
+    for k in range(np.uint64(len(variables))):
+        v = variables[k]
+        row, at = np.uint64(row_of[v]), np.uint64(start[v])
+        for c in range(np.uint64(x.shape[1])):
+            x[k, c] = points[row, c]
+        for c in range(np.uint64(own_delta.shape[1])):
+            own_delta[k, c] = delta[at + c]
+
+
+@kernel
+def scatter_points(variables: Indices, row_of: Indices, x: Array, estimates: Array) -> None:
+    """estimates[row] = x for the variables of one block."""
+    for k in range(np.uint64(len(variables))):
+        row = np.uint64(row_of[variables[k]])
+        for c in range(np.uint64(x.shape[1])):
+            estimates[row, c] = x[k, c]
