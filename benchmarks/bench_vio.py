@@ -72,14 +72,25 @@ class TimedCalls:
         return timed
 
 
-def frames(path: Path, calibration: Path | None) -> tuple[list[VioEstimate], NDArray[np.float64]]:
+def folder_of(name: str, shared: Path) -> Path | None:
+    """Where the recording lies; None, with a message, where it is not."""
+    folder = shared / "data" / "cameras"
+    if (folder / RECORDINGS[name][0]).exists():
+        return folder
+    print(f"vio: {RECORDINGS[name][0]} is not in {folder}, left out", file=sys.stderr)
+    return None
+
+
+def frames(folder: Path, name: str, config: VioConfig) -> tuple[list[VioEstimate], NDArray[np.float64]]:
     """Every estimate, and (n, 2) milliseconds of the frame and of the calls of OpenCV in it."""
     import cv2
 
     cv2.setNumThreads(1)
+    path, _, calibration = RECORDINGS[name]
+    given = CameraRecordingOptions(calibration=None if calibration is None else folder / calibration)
     estimates, spent = [], []
-    with open_camera_recording(path, CameraRecordingOptions(calibration=calibration)) as recording:
-        vio = VisualInertialOdometry(VioConfig(), rig_of_recording(recording.info, VioConfig()))
+    with open_camera_recording(folder / path, given) as recording:
+        vio = VisualInertialOdometry(config, rig_of_recording(recording.info, config))
         calls = vio._tracker._cv2 = TimedCalls(cv2)  # type: ignore[attr-defined]
         passed = 0.0
         for event in recording:
@@ -93,27 +104,29 @@ def frames(path: Path, calibration: Path | None) -> tuple[list[VioEstimate], NDA
     return estimates, np.array(spent)
 
 
+def position_error(known: list[VioEstimate], folder: Path, name: str) -> float:
+    """Root mean square after alignment by yaw and translation [cm] of estimates after the start."""
+    T = np.array([e.T_world_imu for e in known])
+    path = Trajectory(np.array([e.time_ns for e in known]), T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3]))
+    truth = read_trajectory(folder / RECORDINGS[name][1])
+    return 100.0 * evaluate(path, truth, alignment="yaw", method="interpolate").ate.rmse
+
+
 def metrics_of(name: str, shared: Path) -> list[Metric]:
     """Time and accuracy on one recording."""
-    recording, truth, calibration = RECORDINGS[name]
-    folder = shared / "data" / "cameras"
-    if not (folder / recording).exists():
-        print(f"vio: {recording} is not in {folder}, left out", file=sys.stderr)
+    folder = folder_of(name, shared)
+    if folder is None:
         return []
-    given = None if calibration is None else folder / calibration
-    frames(folder / recording, given)  # compiles, and warms up
-    estimates, spent = frames(folder / recording, given)
+    frames(folder, name, VioConfig())  # compiles, and warms up
+    estimates, spent = frames(folder, name, VioConfig())
     is_known = np.array([e.status != "starting" for e in estimates])
     known = [e for e in estimates if e.status != "starting"]
     total, opencv = spent[is_known][WARM:].T
-    T = np.array([e.T_world_imu for e in known])
-    path = Trajectory(np.array([e.time_ns for e in known]), T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3]))
-    result = evaluate(path, read_trajectory(folder / truth), alignment="yaw", method="interpolate")
     median = float(np.median(total))
     return [
         Metric(f"vio/{name}: frame", median, "ms", "lower", FRAME_BAR, "OpenCV in it", float(np.median(opencv)), 0.2),
         Metric(f"vio/{name}: 99th percentile over median", float(np.quantile(total, 0.99)) / median, "ratio", bar=TAIL_BAR),
-        Metric(f"vio/{name}: position error", 100.0 * result.ate.rmse, "cm", tolerance=0.2),
+        Metric(f"vio/{name}: position error", position_error(known, folder, name), "cm", tolerance=0.2),
     ]
 
 

@@ -94,6 +94,8 @@ BENCHMARKS = {
     "direct": Benchmark(("--rounds", "1")),
     "direct_runs": Benchmark(()),
     "vio": Benchmark(("--only", "mh01")),
+    "vio_runs": Benchmark(("--only", "mh01", "--modes", "stereo")),
+    "vio_nees": Benchmark(("--seeds", "500:502", "--seconds", "4")),
     "vio_start": Benchmark(("--seeds", "2001:2021"), arguments=("--half", "odd", "--seeds", "2001:2201")),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
