@@ -146,7 +146,7 @@ class Group:
     def synchronize(self) -> None:
         """Look up where the variables stand, after some were removed, held, or had their first estimates kept."""
         self._index = tuple(c.rows for c in self.connections)
-        self._at_first = any(c.block.has_first_estimate[c.rows].any() for c in self.connections)
+        self._at_first = any(c.block.has_first_estimate(rows) for c, rows in zip(self.connections, self._index, strict=True))
         self._free = [
             None if c.block.is_held is None or self._holds else (~c.block.is_held).astype(np.float64) for c in self.connections
         ]

@@ -40,9 +40,10 @@ class Layout:
         for block in self.blocks:
             number = np.full(len(block), -1, dtype=np.int64)
             free = ~block.is_fixed & (block is not without)
-            sizes.append(np.full(int(free.sum()), block.manifold.dof, dtype=np.int64))
-            number[free] = count + np.arange(int(free.sum()))
-            count += int(free.sum())
+            own = int(np.count_nonzero(free))
+            sizes.append(np.full(own, block.manifold.dof, dtype=np.int64))
+            number[free] = count + np.arange(own)
+            count += own
             self.number.append(number)
         self.sizes = np.concatenate(sizes) if sizes else np.zeros(0, dtype=np.int64)
         self.start = np.concatenate([[0], np.cumsum(self.sizes)])

@@ -151,9 +151,11 @@ class Problem:
         return self.take_out(gone, chosen)
 
     @changes
-    def take_out(self, gone: Masks, chosen: Masks) -> dict[str, int]:
-        """`remove` for what `reach_of` has found: the variables, and the residuals, all that touch these among them."""
+    def take_out(self, gone: Masks, chosen: Masks, *, prior_follows: bool = False) -> dict[str, int]:
+        """`remove` for what `reach_of` has found; a marginal prior that follows finds the first estimates for both."""
         self.groups, counts = take_out(self.blocks, self.groups, gone, chosen)
+        if not prior_follows:
+            keep_first_estimates(self.blocks, self.groups)
         self._analysed = None
         return counts
 
@@ -281,7 +283,7 @@ class Problem:
         self._analysed = None
 
     def _require_own(self, rows: VariableRows) -> None:
-        if not (isinstance(rows, VariableRows) and any(rows.block is block for block in self.blocks)):
+        if not (isinstance(rows, VariableRows) and rows.block in self.blocks):
             what = f"{rows.block!r} of another one" if isinstance(rows, VariableRows) else f"{rows!r}"
             raise InputError("variables of this problem", what, "use a block that `add_variables` returned, or rows of it")
 

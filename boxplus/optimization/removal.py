@@ -19,8 +19,12 @@ Masks = list[NDArray[np.bool_]]
 def touching(groups: Sequence[Group], gone: Masks) -> Masks:
     """For every group (N,) which residuals are there and connected to one of the variables `gone`."""
     touched = []
+    leaves = [bool(mask.any()) for mask in gone]
     for group in groups:
-        hit: NDArray[np.bool_] = np.any([gone[c.block.number][c.rows] for c in group.connections], axis=0)
+        hit = np.zeros(group.residual.count, dtype=np.bool_)
+        for c in group.connections:
+            if leaves[c.block.number]:
+                hit |= gone[c.block.number][c.rows]
         touched.append(hit if group.removed is None else hit & ~group.removed)
     return touched
 
@@ -45,7 +49,10 @@ def require_forgettable(groups: Sequence[Group], gone: Masks, chosen: Masks) -> 
 def take_out(
     blocks: Sequence[Variables], groups: Sequence[Group], gone: Masks, chosen: Masks
 ) -> tuple[list[Group], dict[str, int]]:
-    """Remove variables and residuals; returns the groups that have some left, and for every group that lost some how many."""
+    """Remove variables and residuals; returns the groups that have some left, and for every group that lost some how many.
+
+    `keep_first_estimates` has to follow.
+    """
     counts: dict[str, int] = {}
     left = []
     for group, rows in zip(groups, chosen, strict=True):
@@ -58,7 +65,6 @@ def take_out(
         left.append(group)
     for block, mask in zip(blocks, gone, strict=True):
         block.drop(mask)
-    keep_first_estimates(blocks, left)
     return left, counts
 
 
@@ -70,9 +76,9 @@ def keep_first_estimates(blocks: Sequence[Variables], groups: Sequence[Group]) -
         prior = group.residual
         if isinstance(prior, MarginalPrior) and prior.keeps_first_estimates:
             for c, x in zip(group.connections, prior.x0, strict=True):
-                if not known[c.block.number][c.rows[0]]:  # the earlier prior has the first estimate
-                    known[c.block.number][c.rows[0]] = True
-                    x0[c.block.number][c.rows[0]] = x
+                number, row = c.block.number, c.rows[0]
+                if not known[number][row]:  # the earlier prior has the first estimate
+                    known[number][row], x0[number][row] = True, x
     for block, mask, points in zip(blocks, known, x0, strict=True):
         block.keep_first_estimates(mask, points)
     for group in groups:

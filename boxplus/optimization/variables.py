@@ -63,10 +63,11 @@ class Variables:
         """
         if self.next_id == len(self.ids):  # nothing was ever removed
             return ids.astype(np.uint32)
+        if len(ids) == 1 and (row := int(self.ids.searchsorted(ids[0]))) < len(self.ids) and self.ids[row] == ids[0]:
+            return np.array([row], dtype=np.uint32)  # as marginal priors ask for theirs, one by one
         if not len(ids):
             return np.zeros(0, dtype=np.uint32)
-        span = int(self.ids[-1] - self.ids[0]) + 1 if len(self.ids) else 0
-        rows = self._by_table(ids) if 0 < span <= _WIDEST * len(ids) else np.searchsorted(self.ids, ids)
+        rows = self.rows_near(ids)
         if not (len(self.ids) and (self.ids.take(rows, mode="clip") == ids).all()):
             gone = ~np.isin(ids, self.ids)
             raise InputError(
@@ -75,6 +76,11 @@ class Variables:
                 "drop what was connected to it",
             )
         return rows.astype(np.uint32)
+
+    def rows_near(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """`rows_of` that does not look whether they are there."""
+        span = int(self.ids[-1] - self.ids[0]) + 1 if len(self.ids) else 0
+        return self._by_table(ids) if 0 < span <= _WIDEST * len(ids) else self.ids.searchsorted(ids)
 
     def _by_table(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Rows of many ids, which a table finds sooner than a search for each; some row for those that are not there."""
@@ -118,10 +124,9 @@ class Variables:
         self.is_held = is_held if is_held.any() else None
         self.revision += 1
 
-    @property
-    def has_first_estimate(self) -> NDArray[np.bool_]:
-        """(n,) variables whose Jacobians are taken at their first estimates, as a marginal prior knows them."""
-        return self._is_first
+    def has_first_estimate(self, rows: NDArray[np.uint32]) -> bool:
+        """Whether the Jacobians of one of these variables are taken at its first estimate, as a marginal prior knows it."""
+        return self._has_first and bool(self._is_first[rows].any())
 
     def keep_first_estimates(self, known: NDArray[np.bool_], x0: NDArray[np.float64]) -> None:
         """Take Jacobians of the variables `known` (n,) at their points x0 (n, size) from now on, others where they are."""
@@ -156,6 +161,8 @@ class VariableRows:
             self._rows, self._revision = block.rows_of(self.ids), block.revision
             return
         given = np.asarray(selected)
+        if given.dtype == np.int64 and given.ndim == 1 and self._is_there(given):
+            return
         if given.dtype == np.bool_ and given.shape == (len(block),):
             given = block.ids[given]
         if given.size == 0:
@@ -177,6 +184,22 @@ class VariableRows:
             )
         self.ids = given.astype(np.int64)
         self._rows, self._revision = block.rows_of(self.ids), block.revision
+
+    def _is_there(self, given: NDArray[np.int64]) -> bool:
+        """Takes these ids where all of them are in the block, as they mostly are."""
+        block = self.block
+        if not (len(given) and len(block)):
+            return False
+        if block.next_id == len(block):  # nothing was ever removed
+            if given.min() < 0 or given.max() >= block.next_id:
+                return False
+            rows = given.astype(np.uint32)
+        else:
+            rows = block.rows_near(given).astype(np.uint32)
+            if not (block.ids.take(rows, mode="clip") == given).all():
+                return False
+        self.ids, self._rows, self._revision = given.copy(), rows, self.block.revision
+        return True
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -68,7 +68,7 @@ class MarginalPrior(Residual):
             slots = [k for k, other in enumerate(manifolds) if other == manifold]
             checked = manifold.check("x0", np.array([x0[k] for k in slots]))
             points |= dict(zip(slots, checked, strict=True))
-            columns = np.concatenate([np.arange(ends[k] - manifold.dof, ends[k]) for k in slots])
+            columns = (ends[slots, None] + np.arange(-manifold.dof, 0)).reshape(-1)
             self._alike.append((manifold, slots, checked, columns))
         self.x0 = tuple(points[k] for k in range(len(manifolds)))
         rows = len(self.J)

@@ -85,7 +85,7 @@ def marginalize(
     for group, rows in zip(problem.groups, touched, strict=True):
         if rows.any():
             group.linearize(values, 1)
-            held = any(c.block.is_fixed[c.rows[rows]].any() for c in group.connections)
+            held = any(c.block.is_fixed.any() and c.block.is_fixed[c.rows[rows]].any() for c in group.connections)
             is_anchored |= group.residual.fixes_gauge or held
     columns = Columns.of(problem.blocks, problem.groups, touched, gone)
     J, r0 = prior_of(*triangle_of(problem.groups, touched, columns), columns.leaving)
@@ -95,10 +95,9 @@ def marginalize(
     if moved:
         r0 -= (J * np.concatenate([m.reshape(-1) for m in moved])).sum(axis=1)  # r₀ is that of x₀
     variables = tuple(block[block.ids[rows]] for block, rows in staying)
-    absorbed = problem.take_out(gone, touched)
     leak = None if gauge is None else leak_of(J, points, gauge, is_anchored=is_anchored)
     if not len(J):
-        return Marginal(None, (), absorbed, leak)
+        return Marginal(None, (), problem.take_out(gone, touched), leak)
     residual = MarginalPrior(
         [block.manifold for block, x0 in points for _ in x0],
         [x for _, x0 in points for x in x0],
@@ -108,5 +107,6 @@ def marginalize(
         fixes_gauge=is_anchored,
         keeps_first_estimates=first_estimates,
     )
+    absorbed = problem.take_out(gone, touched, prior_follows=True)
     prior = problem.add_residuals(residual, *(rows.block[k] for rows in variables for k in rows.ids))
     return Marginal(prior, variables, absorbed, leak)

@@ -17,8 +17,19 @@ from boxplus._jit import kernel
 
 OWN = -2  # column of a slot: the landmark that is eliminated
 BATCH = 256  # rows gathered before they are merged into the triangle; few enough for the second-level cache
+PANEL = 4  # columns of a batch that are reflected together
 TOGETHER = 3  # reflections applied in one go; the degrees of freedom of a point
 STEPS = 4  # parts of the columns; rows that begin in a later one are kept apart, as they have less to be merged into
+
+
+@kernel
+def copy_rows(J: NDArray[np.float64], rows: NDArray[np.int64], first: int, packed: NDArray[np.float64]) -> None:
+    """packed[:, :, first:] = J[rows], (n, d, k) into (n, d, more than k)."""
+    for n in range(np.uint64(rows.shape[0])):
+        row = np.uint64(rows[n])
+        for i in range(np.uint64(J.shape[1])):
+            for j in range(np.uint64(J.shape[2])):
+                packed[n, i, np.uint64(first) + j] = J[row, i, j]
 
 
 @kernel(fastmath=True)
@@ -30,6 +41,7 @@ def eliminate_columns(
     lengths: NDArray[np.float64],
     least: float,
     order: NDArray[np.int64],
+    head: NDArray[np.float64],
     W: NDArray[np.float64],
 ) -> np.int64:
     """Bring the columns A of [A X] to triangular form with pivoting, in place; returns their rank.
@@ -40,13 +52,14 @@ def eliminate_columns(
         lengths: (count,) of the columns as they were measured; permuted with the columns.
         least: share of its length below which what is left of a column is rounding.
         order: (count,) receives which column stands where.
+        head: (2, count) and
         W: (TOGETHER, columns) to work in.
     """
     columns, rows = np.uint64(columns_used), np.uint64(rows_used)
     n, one = np.uint64(A.shape[0]), np.uint64(1)
     for c in range(n):
         order[c] = c
-    diagonal, factor = np.empty(min(n, rows)), np.empty(min(n, rows))
+    diagonal, factor = head[0], head[1]
     rank = np.uint64(0)
     for s in range(min(n, rows)):
         best, pivot = 0.0, s
@@ -140,7 +153,7 @@ def _reflection(B: NDArray[np.float64], c: np.uint64, rows: np.uint64, triangle:
 
 @kernel(fastmath=True)
 def merge_batch(B: NDArray[np.float64], start: int, stop: int, used: int, triangle: NDArray[np.float64]) -> None:
-    """triangle ← R of [triangle; rows of B], two reflections at a time; B is used up and left at zero.
+    """triangle ← R of [triangle; rows of B], four reflections at a time; B is used up and left at zero.
 
     Args:
         B: (w + 1, BATCH), the last column the residuals; its columns before `start` and from `stop` on are zero.
@@ -150,40 +163,80 @@ def merge_batch(B: NDArray[np.float64], start: int, stop: int, used: int, triang
     """
     width, rows = np.uint64(triangle.shape[0]), np.uint64(used)
     one, last = np.uint64(1), np.uint64(stop)
+    head, factor = np.empty(PANEL), np.empty(PANEL)
     c = np.uint64(start)
     while c < last:
-        d = c + one
-        head_c, factor_c = _reflection(B, c, rows, triangle)
-        along = head_c * triangle[c, d]
-        for i in range(rows):
-            along += B[c, i] * B[d, i]
-        along *= factor_c
-        triangle[c, d] -= along * head_c
-        for i in range(rows):
-            B[d, i] -= along * B[c, i]
-        if d >= width:
-            break
-        head_d, factor_d = _reflection(B, d, rows, triangle)
-        cross = 0.0
-        for i in range(rows):
-            cross += B[c, i] * B[d, i]
-        for q in range(d + one, max(last, d + one) + one):
-            j = q if q < last else width
-            s, t = head_c * triangle[c, j], head_d * triangle[d, j]
-            for i in range(rows):
-                s += B[c, i] * B[j, i]
-                t += B[d, i] * B[j, i]
-            s *= factor_c
-            t = factor_d * (t - s * cross)
-            triangle[c, j] -= s * head_c
-            triangle[d, j] -= t * head_d
-            for i in range(rows):
-                B[j, i] -= s * B[c, i] + t * B[d, i]
-        c += one + one
+        count = min(last - c, np.uint64(PANEL))
+        for p in range(c, c + count):
+            h, f = _reflection(B, p, rows, triangle)
+            head[p - c], factor[p - c] = h, f
+            for k in range(p + one, c + count):
+                s = h * triangle[p, k]
+                for i in range(rows):
+                    s += B[p, i] * B[k, i]
+                s *= f
+                triangle[p, k] -= s * h
+                for i in range(rows):
+                    B[k, i] -= s * B[p, i]
+        if count == np.uint64(PANEL):
+            _reflect_four(B, c, last, rows, head, factor, triangle)
+        else:
+            for p in range(c, c + count):
+                h, f = head[p - c], factor[p - c]
+                s = h * triangle[p, width]
+                for i in range(rows):
+                    s += B[p, i] * B[width, i]
+                s *= f
+                triangle[p, width] -= s * h
+                for i in range(rows):
+                    B[width, i] -= s * B[p, i]
+        c += np.uint64(PANEL)
     for q in range(min(np.uint64(start), last), last + one):
         j = q if q < last else width
         for i in range(rows):
             B[j, i] = 0.0
+
+
+@kernel(fastmath=True)
+def _reflect_four(
+    B: NDArray[np.float64],
+    c: np.uint64,
+    last: np.uint64,
+    rows: np.uint64,
+    head: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    triangle: NDArray[np.float64],
+) -> None:
+    """Apply the four reflections whose vectors stand in columns c … of B to the columns after them and the residuals."""
+    width, one = np.uint64(triangle.shape[0]), np.uint64(1)
+    d, e, f = c + one, c + np.uint64(2), c + np.uint64(3)
+    hc, hd, he, hf = head[0], head[1], head[2], head[3]
+    cd, ce, cf, de, df, ef = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(rows):
+        cd += B[c, i] * B[d, i]
+        ce += B[c, i] * B[e, i]
+        cf += B[c, i] * B[f, i]
+        de += B[d, i] * B[e, i]
+        df += B[d, i] * B[f, i]
+        ef += B[e, i] * B[f, i]
+    for q in range(f + one, last + one):
+        j = q if q < last else width
+        s, t, u, v = hc * triangle[c, j], hd * triangle[d, j], he * triangle[e, j], hf * triangle[f, j]
+        for i in range(rows):
+            s += B[c, i] * B[j, i]
+            t += B[d, i] * B[j, i]
+            u += B[e, i] * B[j, i]
+            v += B[f, i] * B[j, i]
+        s *= factor[0]
+        t = factor[1] * (t - s * cd)
+        u = factor[2] * (u - s * ce - t * de)
+        v = factor[3] * (v - s * cf - t * df - u * ef)
+        triangle[c, j] -= s * hc
+        triangle[d, j] -= t * hd
+        triangle[e, j] -= u * he
+        triangle[f, j] -= v * hf
+        for i in range(rows):
+            B[j, i] -= s * B[c, i] + t * B[d, i] + u * B[e, i] + v * B[f, i]
 
 
 @kernel(fastmath=True)
@@ -224,7 +277,7 @@ def add_rows(
     place = np.full(width, -1)
     touched = np.empty(width, dtype=np.int64)
     lengths, order = np.empty(max(1, own.max())), np.empty(max(1, own.max()), dtype=np.int64)
-    shares, position = np.empty_like(lengths), np.empty_like(order)
+    shares, position, head = np.empty_like(lengths), np.empty_like(order), np.empty((2, len(lengths)))
     W = np.empty((TOGETHER, width + 1))
     B = np.zeros((STEPS, width + 1, BATCH + 8))  # columns apart by no power of two, which would share sets of the cache
     used = np.zeros(STEPS, dtype=np.int64)
@@ -288,7 +341,7 @@ def add_rows(
                     for i in range(kept, rows):
                         lengths[c] += A[c, i] * A[c, i]
                     shares[c] = math.sqrt(lengths[c])
-                rank = eliminate_columns(A, X, rows, reach, shares, least, order, W)
+                rank = eliminate_columns(A, X, rows, reach, shares, least, order, head, W)
                 for c in range(k):
                     shares[c] = lengths[order[c]]
                 lengths[:k] = shares[:k]

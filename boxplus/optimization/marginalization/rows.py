@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.group import Group
-from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, eliminate_columns
+from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, copy_rows, eliminate_columns
 from boxplus.optimization.removal import Masks
 from boxplus.optimization.variables import Variables
 from boxplus.sparse.counting_sort import order_by
@@ -32,6 +31,7 @@ class Columns:
         leaving: columns of the variables that leave together.
         width: of all columns.
         staying: for every block the rows of variables that stay, in the order of their columns.
+        has_landmarks: for every block whether any of its variables are landmarks.
     """
 
     place: Places
@@ -40,6 +40,7 @@ class Columns:
     leaving: int
     width: int
     staying: list[NDArray[np.intp]]
+    has_landmarks: list[bool]
 
     @classmethod
     def of(cls, blocks: Sequence[Variables], groups: Sequence[Group], touched: Masks, gone: Masks) -> Columns:
@@ -47,8 +48,9 @@ class Columns:
         met = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
         for group, chosen in zip(groups, touched, strict=True):
             if chosen.any():
+                every = chosen.all()
                 for c in group.connections:
-                    met[c.block.number][c.rows if chosen.all() else c.rows[chosen]] = True
+                    met[c.block.number][c.rows if every else c.rows[chosen]] = True
         for block in blocks:
             met[block.number] &= ~block.is_fixed
         alone = _independent(blocks, groups, touched, [m & g for m, g in zip(met, gone, strict=True)])
@@ -56,14 +58,16 @@ class Columns:
         landmark = [np.full(len(block), _NONE) for block in blocks]
         own, end = [np.zeros(0, dtype=np.int64)], 0
         count = 0
-        for block, single in zip(blocks, alone, strict=True):
-            rows = np.flatnonzero(single)
+        # The many first: what the few others leave, velocities among them, may reach further across the columns.
+        for block in sorted(blocks, key=lambda b: -int(np.count_nonzero(alone[b.number]))):
+            rows = np.flatnonzero(alone[block.number])
             place[block.number][rows] = OWN
             landmark[block.number][rows] = count + np.arange(len(rows))
             own.append(np.full(len(rows), block.manifold.dof))
             count += len(rows)
         leaving = 0
         staying = []
+        has_landmarks = [bool(single.any()) for single in alone]
         for leaves in (True, False):
             for block in blocks:
                 chosen = met[block.number] & (gone[block.number] == leaves) & ~alone[block.number]
@@ -73,80 +77,90 @@ class Columns:
                 if not leaves:
                     staying.append(rows)
             leaving = end if leaves else leaving
-        return cls(place, landmark, np.concatenate(own), leaving, end, staying)
+        return cls(place, landmark, np.concatenate(own), leaving, end, staying, has_landmarks)
 
 
 def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: Masks, leaving: Masks) -> Masks:
     """For every block which of its leaving variables share no residual with another such variable, most of them first."""
     alone = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
+    single = [False] * len(blocks)  # whether any of the block are candidates
     for block in sorted(blocks, key=lambda b: -int(leaving[b.number].sum()) * b.manifold.dof):
+        if not leaving[block.number].any():
+            continue
         candidates = leaving[block.number].copy()
         alone[block.number] = candidates
+        single[block.number] = True
         for group, chosen in zip(groups, touched, strict=True):
-            is_met = any(c.block is block for c in group.connections)
-            if is_met and len(group.connections) > 1 and candidates.any() and chosen.any():
-                hits = [alone[c.block.number][c.rows] for c in group.connections]
-                shared = (np.sum(hits, axis=0) > 1) & chosen
+            if not any(c.block is block for c in group.connections):
+                continue
+            hits = [alone[c.block.number][c.rows] for c in group.connections if single[c.block.number]]
+            if len(hits) > 1 and chosen.any():
+                before, shared = hits[0].copy(), np.zeros(len(chosen), dtype=np.bool_)
+                for hit in hits[1:]:
+                    shared |= before & hit
+                    before |= hit
+                shared &= chosen
                 for c in group.connections:
                     if c.block is block:
                         candidates[c.rows[shared]] = False
     return alone
 
 
-def _pack(group: Group, chosen: NDArray[np.bool_], columns: Columns, data: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """[J, r] of the chosen residuals into `data`; of each: dim, slots, size, landmark, first column, columns."""
+def _pack(
+    group: Group, chosen: NDArray[np.bool_], columns: Columns, data: NDArray[np.float64], column: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """[J, r] of the chosen residuals into `data` and the columns (n, slots) of their variables; (n,) their landmarks."""
+    every = len(column) == len(chosen)
     rows = np.flatnonzero(chosen)
-    count = len(rows)
-    dofs = np.array([c.block.manifold.dof for c in group.connections])
-    packed = data.reshape(count, group.residual.dim, -1)
+    packed = data.reshape(len(rows), group.residual.dim, -1)
     end = 0
     for J in group.jacobians:
-        packed[:, :, end : end + J.shape[2]] = J if count == len(chosen) else J[rows]
+        copy_rows(J, rows, end, packed)
         end += J.shape[2]
-    packed[:, :, end] = group.r if count == len(chosen) else group.r[rows]
-    at = [c.rows if count == len(chosen) else c.rows[rows] for c in group.connections]
-    column = np.stack([columns.place[c.block.number][k] for c, k in zip(group.connections, at, strict=True)], axis=1)
-    own = [columns.landmark[c.block.number][k] for c, k in zip(group.connections, at, strict=True) if len(columns.own)]
-    landmark = functools.reduce(np.maximum, own, np.full(count, _NONE))
-    first = np.where(column >= 0, column, columns.width).min(axis=1)
-    return [
-        np.full(count, group.residual.dim),
-        np.full(count, len(dofs)),
-        np.full(count, packed[0].size),
-        landmark,
-        first,
-        np.full(count, dofs.sum()),
-        column.reshape(-1),
-        np.tile(dofs, count),
-    ]
+    packed[:, :, end] = group.r if every else group.r[rows]
+    landmark = np.full(len(rows), _NONE)
+    for slot, c in enumerate(group.connections):
+        at = c.rows if every else c.rows[rows]
+        column[:, slot] = columns.place[c.block.number][at]
+        if columns.has_landmarks[c.block.number]:
+            np.maximum(landmark, columns.landmark[c.block.number][at], out=landmark)
+    return landmark
 
 
 def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """R (w, w + 1) of all rows without their landmarks, residuals in the last column, and (w,) the lengths of the columns."""
-    leaving = [(group, chosen) for group, chosen in zip(groups, touched, strict=True) if chosen.any()]
+    leaving = [(group, chosen, int(np.count_nonzero(chosen))) for group, chosen in zip(groups, touched, strict=True)]
+    leaving = [part for part in leaving if part[2]]
     triangle, squares = np.zeros((columns.width, columns.width + 1)), np.zeros(columns.width)
     if leaving and columns.width:
-        sizes = [int(chosen.sum()) * group.residual.dim * (group.tangents + 1) for group, chosen in leaving]
-        ends = np.cumsum(sizes)
-        data = np.empty(int(ends[-1]))
-        parts = [
-            _pack(group, chosen, columns, data[end - size : end])
-            for (group, chosen), size, end in zip(leaving, sizes, ends, strict=True)
-        ]
-        dim, slots, size, landmark, first, width, column, dof = (np.concatenate(a) for a in zip(*parts, strict=True))
+        count = np.array([n for *_, n in leaving])
+        dims = np.array([group.residual.dim for group, *_ in leaving])
+        dofs = [np.array([c.block.manifold.dof for c in group.connections]) for group, *_ in leaving]
+        widths = np.array([dof.sum() for dof in dofs])
+        dim, width, slots = np.repeat(dims, count), np.repeat(widths, count), np.repeat([len(dof) for dof in dofs], count)
+        size = dim * (width + 1)
+        at, slot = np.cumsum(size) - size, np.concatenate([[0], np.cumsum(slots)])
+        dof = np.concatenate([np.tile(own, n) for own, n in zip(dofs, count, strict=True)])
+        data, column = np.empty(int(size.sum())), np.empty(len(dof), dtype=np.int64)
+        landmark, first = np.empty(len(dim), dtype=np.int64), np.empty(len(dim), dtype=np.int64)
+        n = 0
+        for (group, chosen, own_count), own in zip(leaving, dofs, strict=True):
+            begin, n = n, n + own_count
+            place = column[slot[begin] : slot[n]].reshape(own_count, len(own))
+            landmark[begin:n] = _pack(group, chosen, columns, data[at[begin] : at[n - 1] + size[n - 1]], place)
+            first[begin:n] = columns.width
+            for slot_place in place.T.view(np.uint64):  # what has no column is negative, and without a sign larger than any
+                np.minimum(first[begin:n], slot_place, out=first[begin:n], casting="unsafe")
         # Residuals without a landmark follow the landmarks, each alone.
         single = np.flatnonzero(landmark < 0)
         landmark[single] = len(columns.own) + np.arange(len(single))
         own = np.concatenate([columns.own, np.zeros(len(single), dtype=np.int64)])
-        slot = np.concatenate([[0], np.cumsum(slots)])
         step = np.minimum(first * STEPS // columns.width, STEPS - 1)
-        residual = order_by(landmark * STEPS + (STEPS - 1 - step), len(own) * STEPS)[0].astype(np.int64)
-        begin = np.concatenate([[0], np.cumsum(np.bincount(landmark, minlength=len(own)))])
-        rows = np.bincount(landmark, weights=dim, minlength=len(own))
-        reach = np.bincount(landmark, weights=width, minlength=len(own))
+        residual, starts = order_by(landmark * STEPS + (STEPS - 1 - step), len(own) * STEPS)
+        order, begin_of = residual.astype(np.int64), starts[::STEPS]
+        rows, reach = (np.bincount(landmark, weights=w, minlength=len(own)) for w in (dim, width))
         work = np.empty(int((rows * (np.minimum(reach, columns.width) + own + 1)).max()))
-        at = np.cumsum(size) - size
-        add_rows(data, at, dim, slot, column, dof, step, residual, begin, own, _RANK, work, squares, triangle)
+        add_rows(data, at, dim, slot, column, dof, step, order, begin_of, own, _RANK, work, squares, triangle)
     return triangle, np.sqrt(squares)
 
 
@@ -156,11 +170,11 @@ def prior_of(
     """(J, r₀) of the staying columns after the first `leaving` are minimised over; as many rows as there is information."""
     W = np.empty((TOGETHER, len(lengths) + 1))
     A, X = np.ascontiguousarray(triangle[:, :leaving].T), triangle[:, leaving:].copy()
-    order = np.empty(len(lengths), dtype=np.int64)
-    rank = eliminate_columns(A, X, *X.shape, lengths[:leaving].copy(), _RANK, order, W)
+    order, head = np.empty(len(lengths), dtype=np.int64), np.empty((2, len(lengths)))
+    rank = eliminate_columns(A, X, *X.shape, lengths[:leaving].copy(), _RANK, order, head, W)
     A, r0 = np.ascontiguousarray(X[rank:, :-1].T), X[rank:, -1:].copy()
     # Against what was measured, so that what cancelled does not come back as information.
-    rank = eliminate_columns(A, r0, *r0.shape, lengths[leaving:].copy(), _RANK, order, W)
+    rank = eliminate_columns(A, r0, *r0.shape, lengths[leaving:].copy(), _RANK, order, head, W)
     J = np.zeros((rank, len(A)))
     J[:, order[: len(A)]] = np.triu(A[:, :rank].T)
     return J, r0[:rank, 0].copy()
