@@ -127,6 +127,26 @@ def test_scans_that_do_not_overlap_are_refused() -> None:
     assert refusal.startswith("the first scans do not overlap enough to see whether they move (gyro std ")
 
 
+def test_what_went_astray_at_first_does_not_forbid_a_start_from_the_newest_scans() -> None:
+    simulation = simulate("at_rest", duration_s=2.6, lidar=LIDAR)
+    seen = frames(simulation.events())
+    astray = [Scan.from_arrays(f.scan.p_lidar + np.float32(100.0 * k), f.scan.time_ns) for k, f in enumerate(seen[:10], 1)]
+    events = [replace(f, scan=scan) for f, scan in zip(seen[:10], astray, strict=True)] + seen[10:]
+    found = find_start(events, config(simulation))
+    assert isinstance(found, Start) and found.kind == "static"
+    begins = [f.scan.end_ns for f in events].index(found.time_ns)
+    assert 10 <= begins <= len(events) - 8
+    odometry = LidarInertialOdometry(config(simulation))
+    scans = [*astray, *(f.scan for f in seen[10:])]
+    estimates = odometry.push_imu(ImuSamples.joined(f.imu for f in seen))
+    for scan in scans:
+        estimates += odometry.push_scan(scan)
+    estimates += odometry.flush()
+    # Every scan has an estimate or is counted.
+    assert odometry.start is not None and estimates[0].time_ns == odometry.start.time_ns
+    assert odometry.counters["scan before a start could be found"] + len(estimates) == len(scans)
+
+
 def test_a_shaken_platform_is_at_rest_when_the_lidar_rests() -> None:
     simulation = room_walk(1.5)
     shaken = [_shaken(frame, seed) for seed, frame in enumerate(frames(simulation.events()))]
