@@ -192,12 +192,13 @@ def _broken(path: LidarPath) -> bool:
 
 
 def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
-    """Whether the gyroscope turns as the LiDAR does, but for a bias.
+    """Whether the gyroscope turns as the LiDAR does, but for a bias, about the axes where the scene shows how it does.
 
     At rest it is to show nothing; a LiDAR that sees little may turn on its own.
     """
     off = seen.imu.gyro.mean(axis=0) if rest.at_rest else gyro_bias(path, seen.imu, seen.extrinsic)
-    bias = float(np.linalg.norm(off))
+    not_shown = rest.open_turns @ seen.extrinsic.R_imu_lidar.T
+    bias = float(np.linalg.norm(off - not_shown.T @ (not_shown @ off)))
     if bias > _LARGEST_BIAS:
         raise _NotYet(
             f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: its unit, its "

@@ -95,12 +95,15 @@ def test_a_wall_at_arms_length_shows_rest(reach_m: float) -> None:
     assert isinstance(found, Start) and found.kind == "static"
 
 
-def test_a_turn_that_a_wall_does_not_show_is_no_rest() -> None:
-    """About the normal of the wall nothing but the gyroscope tells: at 4 deg/s it has no bias, it turns."""
+@pytest.mark.parametrize("rate", [0.07, 0.7])
+def test_a_turn_that_a_wall_does_not_show_is_no_rest(rate: float) -> None:
+    """About the normal of the wall nothing but the gyroscope tells: at 4 deg/s it turns, at 40 nothing is wrong with it."""
     first, settings = _before_a_wall(0.6)
-    turn = np.array([0.07, 0.0, 0.0])
+    turn = np.array([rate, 0.0, 0.0])
     turning = [replace(f, imu=ImuSamples(f.imu.time_ns, f.imu.gyro + turn, f.imu.accel)) for f in first]
-    assert isinstance(find_start(turning, settings), str)
+    refusal = find_start(turning, settings)
+    assert isinstance(refusal, str)
+    assert "the surroundings do not show how" in refusal
 
 
 def _shaken(frame: Frame, seed: int) -> Frame:
