@@ -30,7 +30,7 @@ _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
-_FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average: the bias of a gyroscope in order
+_FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
 _PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
 _MIN_MOVING_SCANS = 8
 _MUCH_SHORTER = 0.8
@@ -140,7 +140,8 @@ class _Beginning:
         if self.gyro_std >= _QUIET_GYRO or len(self.imu) < _FEWEST_QUIET_SAMPLES:
             return False
         turning = rest.open_turns @ self.extrinsic.R_imu_lidar.T @ self.imu.gyro.mean(axis=0)
-        return bool(np.linalg.norm(turning) < _QUIET_TURN) and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
+        turns = bool(np.linalg.norm(turning) > _QUIET_TURN * np.sqrt(len(turning)))
+        return not turns and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
 
     def not_moving(self, why: str) -> _NotYet:
         return _NotYet(f"not at rest ({self.evidence}), and {why}{_WAITING}")

@@ -89,19 +89,23 @@ def _before_a_wall(reach_m: float) -> tuple[list[Frame], LioConfig]:
     return first, config(simulation)
 
 
-@pytest.mark.parametrize("reach_m", [0.6, 0.9])
-def test_a_wall_at_arms_length_shows_rest(reach_m: float) -> None:
-    found = find_start(*_before_a_wall(reach_m))
+@pytest.mark.parametrize(("reach_m", "bias"), [(0.6, 0.0), (0.9, 0.0), (0.6, 0.015)])
+def test_a_wall_at_arms_length_shows_rest(reach_m: float, bias: float) -> None:
+    first, settings = _before_a_wall(reach_m)
+    found = find_start(_turning(first, np.full(3, bias)), settings)
     assert isinstance(found, Start) and found.kind == "static"
+
+
+def _turning(seen: list[Frame], rate: np.ndarray) -> list[Frame]:
+    """The frames with a gyroscope that turns by (3,) [rad/s] more."""
+    return [replace(f, imu=ImuSamples(f.imu.time_ns, f.imu.gyro + rate, f.imu.accel)) for f in seen]
 
 
 @pytest.mark.parametrize("rate", [0.07, 0.7])
 def test_a_turn_that_a_wall_does_not_show_is_no_rest(rate: float) -> None:
     """About the normal of the wall nothing but the gyroscope tells: at 4 deg/s it turns, at 40 nothing is wrong with it."""
     first, settings = _before_a_wall(0.6)
-    turn = np.array([rate, 0.0, 0.0])
-    turning = [replace(f, imu=ImuSamples(f.imu.time_ns, f.imu.gyro + turn, f.imu.accel)) for f in first]
-    refusal = find_start(turning, settings)
+    refusal = find_start(_turning(first, np.array([rate, 0.0, 0.0])), settings)
     assert isinstance(refusal, str)
     assert "the surroundings do not show how" in refusal
 
