@@ -199,6 +199,8 @@ def _summary(
     shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)
     refused = Counter(_kind(loop.refusal) for loop in slam.loops if not loop.is_accepted)
     warnings = [] if accepted else ["no loop was closed: trajectory and map are those of the odometry"]
+    if slam.doubt is not None:
+        warnings.append(slam.doubt)
     return SlamSummary(
         versions=versions("rosbags", "opencv-python-headless"),
         state=odometry.state,

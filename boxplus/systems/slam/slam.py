@@ -31,6 +31,7 @@ from boxplus.systems.slam.verification import verify
 Pair = tuple[int, int]
 """Numbers of two local maps, (query, place), the later one first."""
 
+_FAR, _SEVERAL = 3.0, 2  # limits of the innovation beyond which a loop is false rather than the odometry, loops for a doubt
 _KEPT_SURFACES = 12  # trees over local maps are built again where they are older
 
 
@@ -83,6 +84,26 @@ class Slam:
         if any(loop.refusal is None for loop in self.loops[first:]):
             self._close()
         return self.loops[first:]
+
+    @property
+    def doubt(self) -> str | None:
+        """A sentence where loops that pass every other test contradict the odometry; None where they do not."""
+        near = [
+            loop
+            for loop in self.loops
+            if loop.refusal is not None
+            and loop.measured >= self.config.least_measured
+            and min(loop.overlap) >= self.config.least_overlap
+            and loop.innovation_limit < loop.innovation < _FAR * loop.innovation_limit
+        ]
+        if len(near) < _SEVERAL:
+            return None
+        most = max(loop.innovation for loop in near)
+        return (
+            f"{len(near)} loops fit but lie up to {most:.1f} standard deviations from the odometry: it drifts more than claimed "
+            "and than local_maps.drift_rotation and drift_position allow for, or they are false; look at them before you believe "
+            "either"
+        )
 
     def correction(self) -> Correction:
         """What closing the loops changed; the identity where there was none.

@@ -78,6 +78,14 @@ def test_without_opencv_places_are_still_found(block: MappedDrive, monkeypatch: 
         closed(block)
 
 
+def test_an_odometry_that_claims_too_much_is_doubted(block: MappedDrive, slam: Slam) -> None:
+    assert slam.doubt is None
+    sure = Slam(SlamConfig(nearby=0.0))
+    for local_map in block.maps:
+        sure.add(replace(local_map, covariance=0.004 * local_map.covariance))
+    assert sure.doubt is not None and "standard deviations from the odometry: it drifts more" in sure.doubt
+
+
 def test_a_map_without_points_is_a_link_of_the_chain_only(block: MappedDrive) -> None:
     slam, none = Slam(SlamConfig(nearby=0.0)), np.zeros((0, 3), np.float32)
     for local_map in block.maps:
