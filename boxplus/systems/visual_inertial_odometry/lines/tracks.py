@@ -24,10 +24,5 @@ class LineTracks:
     segments: NDArray[np.float64]
     rejected: Mapping[str, int]
 
-    @classmethod
-    def none(cls, cameras: int) -> LineTracks:
-        """No line in any of these cameras."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, cameras, 4)), {})
-
     def __len__(self) -> int:
         return len(self.ids)
