@@ -23,7 +23,6 @@ MODES = {
     "refined": VioConfig(extrinsic_estimation=True, time_offset_estimation=True),  # type: ignore[call-arg]
 }
 REFINED = ("mh05_stereo",)
-BARS_CM = {("mh01", "stereo"): 0.8, ("v103_stereo", "stereo"): 0.8, ("mh05_stereo", "stereo"): 0.8}
 
 
 def measure(options: argparse.Namespace) -> list[Metric]:
@@ -39,7 +38,7 @@ def measure(options: argparse.Namespace) -> list[Metric]:
             flagged = sum(e.status != "ok" for e in known)
             title = f"vio_runs/{name}, {mode}"
             error = position_error(known, folder, name)
-            metrics.append(Metric(f"{title}: position error", error, "cm", bar=BARS_CM.get((name, mode)), tolerance=0.25))
+            metrics.append(Metric(f"{title}: position error", error, "cm", tolerance=0.25))
             metrics.append(Metric(f"{title}: flagged", 100.0 * flagged / len(known), "%", gated=False))
     return metrics
 
