@@ -96,7 +96,7 @@ def measure(options: argparse.Namespace) -> list[Metric]:
         metrics.append(Metric(f"{title}: all seconds", float(over_time[:, k].mean()), "NEES", tolerance=0.3))
     contradictions = sum(line["contradiction"] is not None for line in lines)
     metrics.append(Metric("vio_nees/false contradictions", contradictions, "flights", bar=0.0, tolerance=0.0))
-    metrics.append(Metric("vio_nees/flights without a start", len(lines) - len(started), "flights", bar=0.0, tolerance=0.0))
+    metrics.append(Metric("vio_nees/flights without a start", len(lines) - len(started), "flights", tolerance=0.0))
     return metrics
 
 
