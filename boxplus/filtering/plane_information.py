@@ -11,7 +11,7 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 
 # What became of a point.
-USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED, ONE_LINE = 0, 1, 2, 3, 4
+USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED, ONE_LINE, UNCONFIRMED = 0, 1, 2, 3, 4, 5
 MEASURED_DOF = 12
 # Variance of a map point as far as the tilt of a plane goes [m²]: five points of one or two scan lines are not independent,
 # and what they say beside these lines is worth less than their noise suggests.
@@ -22,7 +22,7 @@ _SURE_TILT = 0.1**2
 
 
 @kernel(inline=True)
-def _row(
+def pose_row(
     x: NDArray[np.float64],
     lidar: tuple[float, float, float],
     imu: tuple[float, float, float],
@@ -102,7 +102,7 @@ def accumulate_planes(
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
-        planes: (n, PLANE) records of `maps.plane_matching`, columns named there.
+        planes: (n, PLANE) records of `maps.plane_matching`, columns named there; the weights are written to the last one.
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
@@ -141,7 +141,8 @@ def accumulate_planes(
         for first in (5, 9):
             tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
         weight /= 1.0 + plane[13] * tilt / _SURE_TILT
-        _row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
+        plane[14] = weight
+        pose_row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
         for i in range(size):
             wh = weight * h[i]
             b[i] += wh * z

@@ -16,8 +16,9 @@ from boxplus.maps.plane_fit import fit_plane_into
 NEIGHBOURS = 5
 # A matched plane: unit normal u (0 to 2), offset uᵀq in the world (3), variance of its points about it (4), and twice a
 # vector g with its offset gᵀq (5 to 8, 9 to 12): the uncertainty of the normal, see `_normal_uncertainty`; and the variance of
-# a point that counts for that uncertainty (13), here the plane's own.
-PLANE = 14
+# a point that counts for that uncertainty (13), here the plane's own; the weight that it was given last (WEIGHT).
+WEIGHT = 14
+PLANE = 15
 # Where one ring of the LiDAR alone has seen a surface, the five points lie on a line, and range noise makes them span the
 # plane of the beams: it would tie the sensor to its own scan pattern. Far away, where such a plane has the longest lever and
 # the rings lie far apart, the neighbours must spread across their longest extent by this variance [m²].

@@ -17,11 +17,13 @@ from boxplus.filtering.plane_information import (
     MEASURED_DOF,
     NOT_A_PLANE,
     ONE_LINE,
+    UNCONFIRMED,
     USED,
     accumulate_planes,
 )
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
+from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
 from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, settle_normals
 from boxplus.maps.registration_config import RegistrationConfig
 
@@ -32,6 +34,7 @@ REASONS = {
     NOT_A_PLANE: "neighbours not on a plane",
     GATED: "too far from the plane",
     ONE_LINE: "neighbours along one scan line",
+    UNCONFIRMED: "much hangs on it, and its surroundings are no plane",
 }
 
 
@@ -44,6 +47,7 @@ class PlaneMeasurement:
         config: noise, gates and threads.
         with_extrinsic: whether the extrinsic is measured.
         weight: factor of the information, below 1 where the points are not where they seem.
+        confirm: whether planes on which a direction hangs have to be borne out by more of the map (`plane_confirmation`).
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class PlaneMeasurement:
         *,
         with_extrinsic: bool,
         weight: float = 1.0,
+        confirm: bool = False,
     ) -> None:
         n = len(p_lidar)
         self._p_lidar = p_lidar
@@ -61,6 +66,7 @@ class PlaneMeasurement:
         self._config = config
         self._with_extrinsic = with_extrinsic
         self._weight = weight
+        self._confirm = confirm
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
@@ -75,26 +81,10 @@ class PlaneMeasurement:
         matches = rematch or not self._matched
         if matches:
             self._match(x)
-        A = np.zeros((MEASURED_DOF, MEASURED_DOF))
-        b = np.zeros(MEASURED_DOF)
-        signal, noise = np.zeros((2, 6, 6))
-        sums = np.zeros(2)
+        A, b, signal, noise, sums = self._sums(x, criterion=matches)
+        if matches and self._confirm and self._refuse_unconfirmed(x, A[:6, :6], int(sums[0])):
+            A, b, signal, noise, sums = self._sums(x, criterion=True)
         config = self._config
-        accumulate_planes(
-            x,
-            self._p_lidar,
-            self._planes,
-            self._fate,
-            config.range_sigma**2,
-            config.map_sigma**2,
-            self._with_extrinsic,
-            matches,
-            A,
-            b,
-            signal,
-            noise,
-            sums,
-        )
         A += np.triu(A, 1).T
         if matches:  # in between the planes stay, and what they can tell
             signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
@@ -118,7 +108,7 @@ class PlaneMeasurement:
     @property
     def on_map_share(self) -> float:
         """Share of the points that lie on the map, those counted that lie among map points of one scan line only."""
-        on_map = np.count_nonzero(self._fate == USED) + np.count_nonzero(self._fate == ONE_LINE)
+        on_map = np.count_nonzero(self._fate == USED) + np.count_nonzero(self._fate >= ONE_LINE)
         return on_map / max(self.points, 1)
 
     @property
@@ -129,8 +119,59 @@ class PlaneMeasurement:
 
     def rejected(self) -> Mapping[str, int]:
         """Points that were not used, by reason."""
-        counts = np.bincount(self._fate, minlength=5)
+        counts = np.bincount(self._fate, minlength=6)
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
+
+    def _sums(self, x: NDArray[np.float64], *, criterion: bool) -> tuple[NDArray[np.float64], ...]:
+        """What `accumulate_planes` adds up over the planes in use: A, b, signal, noise and sums."""
+        A, b = np.zeros((MEASURED_DOF, MEASURED_DOF)), np.zeros(MEASURED_DOF)
+        signal, noise, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(2)
+        accumulate_planes(
+            x,
+            self._p_lidar,
+            self._planes,
+            self._fate,
+            self._config.range_sigma**2,
+            self._config.map_sigma**2,
+            self._with_extrinsic,
+            criterion,
+            A,
+            b,
+            signal,
+            noise,
+            sums,
+        )
+        return A, b, signal, noise, sums
+
+    def _refuse_unconfirmed(self, x: NDArray[np.float64], upper: NDArray[np.float64], used: int) -> bool:
+        """Whether planes were refused on which too much hangs (see `plane_confirmation`).
+
+        Args:
+            x: (36,) packed state.
+            upper: (6, 6) information about the pose, upper triangle.
+            used: number of planes behind it.
+        """
+        config = self._config
+        try:
+            covariance = np.linalg.inv(upper + np.triu(upper, 1).T)
+        except np.linalg.LinAlgError:  # nothing at all measures some direction
+            return False
+        refused: int = confirm_planes(
+            self._tree.view(),
+            self._tree.origin,
+            x,
+            self._p_lidar,
+            covariance,
+            LEVERAGE * 6.0 / max(used, 1),
+            config.max_neighbour_distance**2,
+            (DENSE_CELLS * config.map_cell) ** 2,
+            config.plane_threshold,
+            self._planes,
+            self._fate,
+            np.zeros(CONFIRMING, dtype=np.float32),
+            np.zeros(STACK_DEPTH + CONFIRMING, dtype=STACK),
+        )
+        return refused > 0
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config

@@ -70,7 +70,7 @@ class LidarInertialOdometry:
         self._excitation = RotationExcitation()
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
-        self._weak_spell = WeakSpell()
+        self._weak_spell = WeakSpell(self.config.weak_threshold)
         self._consistency = Consistency(self.config, self.config.T_declared)
         self._saturation = Saturation()
         self._warnings: list[str] = []
@@ -189,6 +189,7 @@ class LidarInertialOdometry:
         self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov), _SHARED_ERRORS)
         self._mounting = UnknownMounting(self._x, self.config)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
+        self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         (first, *rest), self._waiting = self._waiting, []
@@ -310,7 +311,7 @@ class LidarInertialOdometry:
             config.extrinsic_estimation == "gated" and self._excitation.sufficient
         )
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, config, with_extrinsic=with_extrinsic, weight=weight)
+        return PlaneMeasurement(points, self.map, config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap

@@ -8,16 +8,27 @@ from boxplus.filtering.iterated_update import Posterior
 from boxplus.systems.lidar_inertial_odometry.estimate import Status
 
 _WINDOW_NS = 500_000_000  # over which the IMU alone holds a pose to millimetres
+_CLEARLY = 2.0  # times the threshold: such a scan has measured every direction, whatever the ones before it left open
 
 
 class WeakSpell:
-    """Follows the scans of one run."""
+    """Follows the scans of one run.
 
-    def __init__(self) -> None:
+    Args:
+        weak_threshold: least ratio of a measured direction (`filtering.degeneracy`).
+        known_ns: time [ns] at which the pose and its velocity were known, the start of a run; None where no time is.
+    """
+
+    def __init__(self, weak_threshold: float, known_ns: int | None = None) -> None:
+        self._clear_ratio = _CLEARLY * weak_threshold
+        self._known_ns = known_ns
         self._scans: deque[tuple[int, bool]] = deque()
 
     def status(self, time_ns: int, posterior: Posterior, taken: bool) -> Status:
         """Of the scan that ends at `time_ns` [ns]: weak where half of the scans of the last half second left a direction open.
+
+        The part of that half second before a pose that was known counts as seen, and a scan that measures every direction
+        clearly is not weak itself, though it may be the first after many that were.
 
         Args:
             time_ns: end of the scan.
@@ -26,8 +37,17 @@ class WeakSpell:
         """
         if not taken:
             return "lost"
-        self._scans.append((time_ns, bool(posterior.last.directions.weak.any())))
+        directions = posterior.last.directions
+        self._scans.append((time_ns, bool(directions.weak.any())))
         while self._scans[0][0] < time_ns - _WINDOW_NS:
             self._scans.popleft()
+        if not directions.weak.any() and directions.ratios.min() >= self._clear_ratio:
+            return "ok"
         weak = sum(open_direction for _, open_direction in self._scans)
-        return "weak" if 2 * weak >= len(self._scans) else "ok"
+        return "weak" if 2 * weak >= len(self._scans) * self._share_unseen(time_ns) else "ok"
+
+    def _share_unseen(self, time_ns: int) -> float:
+        """The half second over what of it has passed since the pose was known; 1 where that is longer ago."""
+        if self._known_ns is None:
+            return 1.0
+        return max(1.0, _WINDOW_NS / max(time_ns - self._known_ns, 1))

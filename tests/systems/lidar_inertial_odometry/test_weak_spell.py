@@ -15,11 +15,16 @@ from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 PERIOD_NS = 100_000_000
 
 
-def statuses(is_open: list[bool], period_ns: int = PERIOD_NS) -> list[str]:
-    spell = WeakSpell()
+THRESHOLD = 1.3
+
+
+def statuses(is_open: list[bool], period_ns: int = PERIOD_NS, known_ns: int | None = None, shown: float = 1.5) -> list[str]:
+    """What a spell says scan by scan, the first one at 0; `shown` is the ratio of the weakest direction where none is open."""
+    spell = WeakSpell(THRESHOLD, known_ns)
 
     def posterior(weak: bool) -> Any:
-        return SimpleNamespace(last=SimpleNamespace(directions=SimpleNamespace(weak=np.array([False] * 5 + [weak]))))
+        ratios = np.array([9.0] * 5 + [1.0 if weak else shown])
+        return SimpleNamespace(last=SimpleNamespace(directions=SimpleNamespace(weak=ratios < THRESHOLD, ratios=ratios)))
 
     return [spell.status(number * period_ns, posterior(weak), True) for number, weak in enumerate(is_open)]
 
@@ -47,5 +52,25 @@ def test_a_run_that_begins_weak_says_so_and_every_second_scan_is_enough(is_open:
         assert (status == "weak") == (2 * sum(last) >= len(last))
 
 
+@given(st.lists(st.booleans(), min_size=1, max_size=60))
+def test_a_scan_that_measures_every_direction_clearly_is_not_weak(is_open: list[bool]) -> None:
+    barely, clearly = statuses(is_open, shown=1.99 * THRESHOLD), statuses(is_open, shown=2.01 * THRESHOLD)
+    for weak, before, now in zip(is_open, barely, clearly, strict=True):
+        assert now == (before if weak else "ok")
+
+
+@pytest.mark.parametrize("period_ns", [20_000_000, 50_000_000, PERIOD_NS])
+def test_the_time_before_a_known_pose_counts_as_seen(period_ns: int) -> None:
+    window = 500_000_000 // period_ns
+    begins_open = [True] * window + [False] * 2 * window
+    known = statuses(begins_open, period_ns, known_ns=-period_ns)
+    half = (window + 1) // 2
+    assert set(known[: half - 1]) == {"ok"} and set(known[half:window]) == {"weak"}
+    # A spell that ends within the first half of that time is none.
+    assert set(statuses([True] * (half - 1) + [False] * window, period_ns, known_ns=-period_ns)) == {"ok"}
+    # Later on it is as if nothing had been known.
+    assert known[window:] == statuses(begins_open, period_ns)[window:]
+
+
 def test_without_an_update_the_scan_is_lost() -> None:
-    assert WeakSpell().status(0, None, False) == "lost"  # type: ignore[arg-type]
+    assert WeakSpell(THRESHOLD).status(0, None, False) == "lost"  # type: ignore[arg-type]
