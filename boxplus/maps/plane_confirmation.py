@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import UNCONFIRMED, USED, pose_row
-from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn
+from boxplus.maps.ikd_tree.search import IkdView, copy_found, has_within, knn
 from boxplus.maps.plane_matching import WEIGHT
 
 CONFIRMING = 25
@@ -83,9 +83,9 @@ def confirm_planes(
         yx = np.float32(x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P] - origin[0])
         yy = np.float32(x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1])
         yz = np.float32(x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2])
-        found = knn(view, yx, yy, yz, np.float32(max_distance_sq), found_sq, stack)
-        if found == wanted and found_sq[wanted - 1] <= dense_sq:
+        if has_within(view, yx, yy, yz, np.float32(dense_sq), wanted, stack):
             continue
+        found = knn(view, yx, yy, yz, np.float32(max_distance_sq), found_sq, stack)
         copy_found(view, stack, wanted, found, near)
         offset = plane[3] - (u[0] * origin[0] + u[1] * origin[1] + u[2] * origin[2])
         for i in range(found):

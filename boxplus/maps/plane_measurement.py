@@ -81,16 +81,21 @@ class PlaneMeasurement:
         matches = rematch or not self._matched
         if matches:
             self._match(x)
-        A, b, signal, noise, sums = self._sums(x, criterion=matches)
+        A, b, signal, noise, sums = total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
         if matches and self._confirm and self._refuse_unconfirmed(x, A[:6, :6], int(sums[0])):
-            A, b, signal, noise, sums = self._sums(x, criterion=True)
+            refused = self._fate == UNCONFIRMED
+            as_used = np.full(np.count_nonzero(refused), USED, dtype=np.uint8)
+            for whole, part in zip(
+                total, self._sums(x, self._p_lidar[refused], self._planes[refused], as_used, criterion=True), strict=True
+            ):
+                whole -= part
         config = self._config
         A += np.triu(A, 1).T
         if matches:  # in between the planes stay, and what they can tell
             signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
             self._directions = pose_directions(signal, noise, self.lever_arm, config.weak_threshold)
         used = int(sums[0])
-        rms = float(np.sqrt(sums[1] / used)) if used else 0.0
+        rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         return Information(A * self._weight, b * self._weight, self._directions, used, rms)
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
@@ -122,25 +127,20 @@ class PlaneMeasurement:
         counts = np.bincount(self._fate, minlength=6)
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
 
-    def _sums(self, x: NDArray[np.float64], *, criterion: bool) -> tuple[NDArray[np.float64], ...]:
-        """What `accumulate_planes` adds up over the planes in use: A, b, signal, noise and sums."""
+    def _sums(
+        self,
+        x: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
+        planes: NDArray[np.float64],
+        fate: NDArray[np.uint8],
+        *,
+        criterion: bool,
+    ) -> tuple[NDArray[np.float64], ...]:
+        """What `accumulate_planes` adds up over planes: A, b, signal, noise and sums."""
         A, b = np.zeros((MEASURED_DOF, MEASURED_DOF)), np.zeros(MEASURED_DOF)
         signal, noise, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(2)
-        accumulate_planes(
-            x,
-            self._p_lidar,
-            self._planes,
-            self._fate,
-            self._config.range_sigma**2,
-            self._config.map_sigma**2,
-            self._with_extrinsic,
-            criterion,
-            A,
-            b,
-            signal,
-            noise,
-            sums,
-        )
+        point, stored = self._config.range_sigma**2, self._config.map_sigma**2
+        accumulate_planes(x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, signal, noise, sums)
         return A, b, signal, noise, sums
 
     def _refuse_unconfirmed(self, x: NDArray[np.float64], upper: NDArray[np.float64], used: int) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_tree.inner import boxes_sq
-from boxplus.maps.ikd_tree.leaf import BUCKET, lanes_within, trailing_zeros
+from boxplus.maps.ikd_tree.leaf import BUCKET, count_bits, lanes_within, trailing_zeros
 from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
@@ -206,6 +206,33 @@ def knn(
             stack[first + place]["ref"] = new
             worst = out_sq[last]
             found += 1
+        ref = NIL
+
+
+@kernel(borrow=True)
+def has_within(
+    view: IkdView, qx: np.float32, qy: np.float32, qz: np.float32, max_sq: np.float32, count: np.int64, stack: NDArray[np.void]
+) -> bool:
+    """Whether at least `count` (1 or more) live points lie within `max_sq` (inclusive) of a query: ends when so many are found.
+
+    Args:
+        view: the tree.
+        qx, qy, qz: query, float32, relative to the tree's origin [m].
+        max_sq: squared range [m²].
+        count: how many points are enough.
+        stack: (STACK_DEPTH,) of STACK, scratch of the calling thread.
+    """
+    inner, leaf = view
+    found = np.int64(0)
+    ref, live = enter(inner, qx, qy, qz, max_sq)
+    top = ZERO
+    while True:
+        ref, live, top = next_leaf(inner, ref, live, top, max_sq, qx, qy, qz, stack)
+        if ref == NIL:
+            return False
+        found += np.int64(count_bits(leaf_within(leaf, ref & INDEX_MASK, qx, qy, qz, max_sq, live)))
+        if found >= count:
+            return True
         ref = NIL
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from boxplus.errors import InputError
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.check import InvariantError
-from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, knn5
+from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, has_within, knn5
 from tests.maps.ikd_tree.brute_force_map import squares
 
 compiled = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
@@ -50,6 +50,20 @@ def test_warm_start_finds_the_same_neighbours() -> None:
             np.testing.assert_array_equal(sq, truth)
             np.testing.assert_array_equal(squares(xyz - query), truth)
         assert knn5(tree.view(), *query, truth[2], xyz, sq, stack) == 3
+
+
+def test_whether_enough_points_lie_within_a_distance() -> None:
+    rng = np.random.default_rng(2)
+    tree = IkdTree(rng.uniform(-2, 2, (400, 3)))
+    tree.delete_box(np.array([0.0, 0.0, 0.0]), np.array([2.0, 2.0, 1.0]))
+    stack = np.zeros(STACK_DEPTH, STACK)
+    for query in rng.uniform(-2, 2, (20, 3)).astype(np.float32):
+        ranked = np.sort(squares((tree.points() - tree.origin).astype(np.float32) - query))
+        for count in (1, 5, 25):
+            nearest, short = ranked[count - 1], np.nextafter(ranked[count - 1], np.float32(0))
+            assert has_within(tree.view(), *query, nearest, count, stack)
+            assert not has_within(tree.view(), *query, short, count, stack)
+    assert not has_within(IkdTree().view(), *query, np.float32(100.0), 1, stack)
 
 
 @settings(max_examples=50 if compiled else 3)
