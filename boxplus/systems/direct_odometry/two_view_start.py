@@ -29,6 +29,7 @@ from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, opencv
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.triangulation import inverse_depths
 
 Matrix = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ class TwoViewStart:
         if self._tracker is None:
             config = VioConfig(features=_CORNERS, cell_size=max(width // 24, 8))
             self._tracker = FeatureTracker(config, Rig.of([self._camera], [np.eye(4)], [(width, height)]))
-        tracks = self._tracker.track(time_ns, {0: _eight_bits(image)}, np.eye(3))
+        tracks = self._tracker.track(time_ns, {0: image.grey}, np.eye(3))
         if self._reference is not None:
             found = self._judge(time_ns, image, tracks)
             if found is not None or self._reference is not None:
@@ -131,13 +132,6 @@ class TwoViewStart:
         T_21[4:] /= unit
         low, high = np.quantile(rho * unit, [0.02, 0.98])
         return TwoViews((first_ns, time_ns), first, image, T_21, (float(low) / _BEYOND, float(high) * _BEYOND))
-
-
-def _eight_bits(image: Image) -> NDArray[np.uint8]:
-    """Grey values of any unit, those of full range being 1, 255 or 65535."""
-    full = next((full for full in (1.0, 255.0, 65535.0) if image.grey.max() <= full), float(image.grey.max()))
-    bits: NDArray[np.uint8] = np.clip(np.rint(image.grey * (255.0 / full)), 0.0, 255.0).astype(np.uint8)
-    return bits
 
 
 def _turn(m1: Matrix, m2: Matrix) -> Matrix:
@@ -192,7 +186,7 @@ def _essential(m1: Matrix, m2: Matrix, f: float, parallax: float) -> tuple[Matri
     if ahead[agrees].mean() < _LEAST_AHEAD:
         share = ahead[agrees].mean()
         return f"{share:.0%} of the corners lie in front of both cameras by their motion ({_LEAST_AHEAD:.0%} are needed)"
-    return R, t, _inverse_depths(R, t, m1, m2)[agrees & ahead]
+    return R, t, inverse_depths(m1 @ R.T, t, m2)[0][agrees & ahead]
 
 
 def _sampled(m1: Matrix, m2: Matrix, f: float) -> list[tuple[Matrix, Matrix]]:
@@ -256,14 +250,7 @@ def _unit(x: Matrix) -> Matrix:
     return np.asarray(x / np.linalg.norm(x))
 
 
-def _inverse_depths(R: Matrix, t: Matrix, m1: Matrix, m2: Matrix) -> Matrix:
-    """(n,) in camera 1: x₂ = (a_x + ρ t_x)/(a_z + ρ t_z), a = R m₁, and likewise y; least squares of both."""
-    a = m1 @ R.T
-    by_rho, left = t[:2] - m2[:, :2] * t[2], m2[:, :2] * a[:, 2:] - a[:, :2]
-    return np.asarray((by_rho * left).sum(axis=1) / np.maximum((by_rho**2).sum(axis=1), 1e-18))
-
-
 def _depths(R: Matrix, t: Matrix, m1: Matrix, m2: Matrix) -> NDArray[np.bool_]:
     """(n,) whether the points lie in front of both cameras."""
-    rho = _inverse_depths(R, t, m1, m2)
+    rho, _ = inverse_depths(m1 @ R.T, t, m2)
     return np.asarray((rho > 0.0) & ((m1 @ R.T + rho[:, None] * t)[:, 2] > 0.0))

@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corner_centres import centred
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.triangulation import inverse_depths
 
 _WINDOW = (21, 21)
 _LEVELS = 3
@@ -81,6 +83,7 @@ class FeatureTracker:
 
     def __init__(self, config: VioConfig, rig: Rig) -> None:
         self._cv2, self._config, self._rig = opencv(), config, rig
+        self._to_8_bits = EightBits()
         self._images: list[Grey | None] = [None] * len(rig.cameras)
         self._before: Grey | None = None
         self._ids = np.zeros(0, np.int64)
@@ -105,7 +108,7 @@ class FeatureTracker:
             p_before_now: (3,) its position there [m], where known.
         """
         self.opencv_s = 0.0
-        greys = [None if images.get(c) is None else grey_8_bit(images[c]) for c in range(len(self._rig.cameras))]
+        greys = self._in_8_bits(images)
         rejected: Counter[str] = Counter()
         motion = float("nan")
         before, now = self._images[0], greys[0]
@@ -176,6 +179,15 @@ class FeatureTracker:
             time_ns, self._ids.copy(), self._pixels.copy(), self._rays.copy(), fresh, counts, motion_px, brightness, contrast
         )
 
+    def _in_8_bits(self, images: Mapping[int, NDArray[Any]]) -> list[Grey | None]:
+        """The image of each camera; where one shows that the range is larger, those of the instant before follow."""
+        full = self._to_8_bits.full
+        greys = [None if images.get(c) is None else self._to_8_bits(images[c]) for c in range(len(self._rig.cameras))]
+        if 0.0 < full < self._to_8_bits.full:
+            share = full / self._to_8_bits.full
+            self._images = [None if image is None else np.rint(image * share).astype(np.uint8) for image in self._images]
+        return greys
+
     def _keep(self, kept: NDArray[np.bool_]) -> None:
         self._ids, self._rho = self._ids[kept], self._rho[kept]
         self._pixels, self._rays = self._pixels[kept], self._rays[kept]
@@ -231,8 +243,8 @@ class FeatureTracker:
             n = np.cross(T[:3, 3], turned)
             off = np.abs((n * rays).sum(axis=1)) / np.linalg.norm(n[:, :2], axis=1) * model.fx
             on_line = off < self._config.epipolar
-            rho, rho_sigma = _inverse_depth(turned, T[:3, 3], rays, 2.0 * self._config.pixel_sigma / model.fx)
-            before = rho > -rho_sigma
+            rho, information = inverse_depths(turned, T[:3, 3], rays)
+            before = rho > -2.0 * self._config.pixel_sigma / model.fx / np.sqrt(information)
             rejected["off its epipolar line"] += int((kept & ~on_line).sum())
             rejected["behind the camera by its disparity"] += int((kept & on_line & ~before).sum())
             kept &= on_line & before
@@ -251,19 +263,3 @@ class FeatureTracker:
         for u, v in np.rint(self._pixels[:, 0]).astype(np.int64):
             mask[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1] = 0
         return mask
-
-
-def _inverse_depth(turned: Floats, t: Floats, rays: Floats, sigma: float) -> tuple[Floats, Floats]:
-    """ρ (n,) in the first camera by which turned + ρ t points along the rays (n, 3) of the second, and its sigma."""
-    # Two equations, x: turned_x + ρ t_x = y_x (turned_z + ρ t_z), and likewise for y; least squares of both.
-    a = t[:2] - rays[:, :2] * t[2]
-    b = rays[:, :2] * turned[:, 2:3] - turned[:, :2]
-    square = np.maximum((a * a).sum(axis=1), 1e-12)
-    return (a * b).sum(axis=1) / square, sigma / np.sqrt(square)
-
-
-def grey_8_bit(grey: NDArray[Any]) -> Grey:
-    """Grey values in 8 bits; 16-bit ones lose their lower half."""
-    if grey.dtype == np.uint8:
-        return np.ascontiguousarray(grey)
-    return np.ascontiguousarray((grey >> 8).astype(np.uint8))

@@ -41,3 +41,9 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+
+def motion_px(before: Tracks, now: Tracks) -> NDArray[np.float64]:
+    """By how much each corner that both saw has moved in the first camera (n,) [px]."""
+    _, then, there = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    return np.asarray(np.linalg.norm(now.pixels[there, 0] - before.pixels[then, 0], axis=1))

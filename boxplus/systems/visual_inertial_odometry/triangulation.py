@@ -12,6 +12,7 @@ from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 _MOST_SIGMAS = 5.0  # by which a view may differ from the point found
 _RELATIVE, _ABSOLUTE = 0.3, 0.02  # of the standard deviation of ρ: of ρ, and in 1/m for points that are nearly at infinity
 _RANGE = (-0.02, 5.0)  # 1/m
+_LEAST_INFORMATION = 1e-18  # of a ray through the epipole
 
 Floats = NDArray[np.float64]
 
@@ -80,3 +81,21 @@ def mean_parallax(before: Tracks, now: Tracks, body_before: Floats, body_now: Fl
     turned = before.rays[then, 0] @ (R_now.T @ R_before).T
     shift = (now.rays[there, 0, :2] - turned[:, :2] / turned[:, 2:]) * [camera.model.fx, camera.model.fy]
     return float(np.linalg.norm(shift, axis=1).mean())
+
+
+def inverse_depths(turned: Floats, t: Floats, rays: Floats) -> tuple[Floats, Floats]:
+    """Inverse depths in one camera from what a second one sees, and what they are known by.
+
+    turned + ρ t points along y: turned_x + ρ t_x = y_x (turned_z + ρ t_z), and likewise for y; least squares of both.
+
+    Args:
+        turned: (n, 3) rays of the first camera in the axes of the second; t: (3,) the first one's place there.
+        rays: (n, 3) y of the second camera, [X/Z, Y/Z, 1].
+
+    Returns:
+        (n,) ρ, in units of 1/|t|'s; (n,) its information for equations of unit variance, where turned_z is 1.
+    """
+    a = t[:2] - rays[:, :2] * t[2]
+    b = rays[:, :2] * turned[:, 2:3] - turned[:, :2]
+    information = np.maximum((a * a).sum(axis=1), _LEAST_INFORMATION)
+    return (a * b).sum(axis=1) / information, information

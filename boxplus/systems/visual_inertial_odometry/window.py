@@ -28,12 +28,13 @@ from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corner_creep import CornerCreep
 from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, imu_noise
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.tracks import Tracks, motion_px
 from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax, triangulate
 
 _HUBER = 1.5  # standard deviations
@@ -97,6 +98,7 @@ class Window:
         self._imu_group: Group | None = None
         self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
         self._seen = Seen.none()
+        self._creep = CornerCreep()
         self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
         self._anchor: Ints = np.zeros(0, np.int64)
         self._founded = 0  # landmarks that the last keyframe saw
@@ -165,14 +167,9 @@ class Window:
         """Whether nothing has moved in the images since the last keyframe or longer, as far as corners can tell."""
         newest = self.frames[-1].tracks
         before = next((f for f in reversed(self.frames[:-1]) if newest.time_ns - f.time_ns > _REST_NS), None)
-        if before is None:
-            return False
-        _, then, now = np.intersect1d(before.tracks.ids, newest.ids, assume_unique=True, return_indices=True)
-        if len(now) < _REST_CORNERS:
-            return False
-        moved = np.linalg.norm(newest.pixels[now, 0] - before.tracks.pixels[then, 0], axis=1)
+        moved = np.zeros(0) if before is None else motion_px(before.tracks, newest)
         # All corners of a scene that turns or nears move; noise of a few does not make motion.
-        return float(np.quantile(moved, 0.8)) < _REST_PX
+        return len(moved) >= _REST_CORNERS and float(np.quantile(moved, 0.8)) < _REST_PX
 
     def hold_still(self) -> None:
         """The velocity of the newest frame is zero, as far as corners that stand still say."""
@@ -256,7 +253,7 @@ class Window:
         )
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        self.covariance = covariance_of(solution, self.bodies[number], self.states[number])
+        self.covariance = self._creep.factor * covariance_of(solution, self.bodies[number], self.states[number])
 
     def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""
@@ -266,7 +263,7 @@ class Window:
         if len(observations):
             rows = observations
             models = [mounted.model for mounted in self._rig.cameras]
-            camera, sigma = seen.camera[rows], self._config.pixel_sigma
+            camera, sigma = seen.camera[rows], self._config.pixel_sigma * self._creep.weight
             group = self.problem.add_residuals(
                 OnBody(InverseDepthReprojection(models, seen.pixel[rows], camera_of=camera, sigma=sigma)),
                 self.bodies[anchor[rows]],
@@ -274,7 +271,7 @@ class Window:
                 self.bodies[seen.frame[rows]],
                 self.mountings[camera],
                 self.points[seen.landmark[rows]],
-                loss=Huber(_HUBER),
+                loss=Huber(_HUBER / self._creep.weight),
                 name="corners",
             )
             self._views = (group, rows)
@@ -311,8 +308,10 @@ class Window:
         squares = np.zeros(len(seen.frame))
         if self._views is not None:
             group, rows = self._views
-            squares[rows] = group.squares(values)
+            squares[rows] = self._creep.weight**2 * group.squares(values)
         bad = squares > threshold**2
+        if self._views is not None and self.frames[-1].is_keyframe:
+            self._note_creep(group, rows[~bad[rows]], ~bad[rows])
         newest = seen.frame == self.frames[-1].number
         first = newest & (seen.camera == 0)
         # A landmark without what its anchor saw, with nothing but that, or behind the camera, is none.
@@ -328,7 +327,7 @@ class Window:
             not_agreed=int((first & bad).sum()),
             given_up=self._track[gone],
             reprojection_px=self._config.pixel_sigma * float(np.sqrt(spread / _MEDIAN_OF_TWO)),
-            imu_ratio=float(np.sqrt(imu[-_LAST_INTERVALS:].mean())) if len(imu) else 0.0,
+            imu_ratio=self._creep.weight * float(np.sqrt(imu[-_LAST_INTERVALS:].mean())) if len(imu) else 0.0,
             lines=self.lines.reject(values, self.frames[-1].number, threshold),
         )
         seen.keep(~bad)
@@ -336,13 +335,20 @@ class Window:
         self._remove_landmarks(gone)
         return fit
 
+    def _note_creep(self, group: Group, rows: NDArray[np.intp], fits: NDArray[np.bool_]) -> None:
+        """Take the residuals that fit, of the observations `rows`, for what they tell of the corners' walk."""
+        seen, keyframes = self._seen, [frame.number for frame in self.frames if frame.is_keyframe]
+        tells = (seen.camera[rows] == 0) & np.isin(seen.frame[rows], keyframes)
+        residuals, cameras = self._creep.weight * group.r[fits][tells], len(self._rig.cameras)
+        self._creep.note(residuals, seen.landmark[rows[tells]], seen.frame[rows[tells]], cameras)
+
     def _inverse_depth_sigmas(self) -> Floats:
         """(m,) of ρ of every landmark, from the information that the residuals just evaluated have about it."""
         information = np.zeros(len(self.points))
         if self._views is not None:
             group, _ = self._views
             np.add.at(information, group.connections[-1].rows, (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1))
-        return 1.0 / np.sqrt(np.maximum(information, 1e-12))
+        return self._creep.weight / np.sqrt(np.maximum(information, 1e-12))
 
     def _remove_landmarks(self, gone: NDArray[np.bool_]) -> None:
         """Landmarks (m,) that prove to be none, with all that was seen of them."""

@@ -10,7 +10,7 @@ import pytest
 from boxplus import InputError, Pinhole
 from boxplus.manifolds import so3
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, tracking
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, grey_8_bit
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker
 
 SIZE = (320, 240)
 CAMERA = Pinhole(220.0, 220.0, 159.5, 119.5)
@@ -125,8 +125,34 @@ def test_without_an_image_or_in_the_dark_corners_are_lost_and_counted() -> None:
     assert len(none) == 0 and none.rejected["no image of the first camera"] > 20 and np.isnan(none.brightness).all()
 
 
-def test_sixteen_bits_become_eight_and_opencv_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert grey_8_bit(np.array([[0, 256, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
+@pytest.mark.parametrize("bits", [12, 16])
+def test_images_of_more_bits_are_followed_as_those_of_eight(bits: int) -> None:
+    """The first ones are dark, so that the range is known later only."""
+    picture, trackers = wall(), [FeatureTracker(VioConfig(features=80, cell_size=30), stereo()) for _ in range(2)]
+    tracks = []
+    for tracker, shift in zip(trackers, (0, bits - 8), strict=True):
+        for k, light in enumerate((0.1, 0.2, 1.0, 1.0)):
+            images = pair(picture, np.eye(3), np.array([0.01 * k, 0.0, 0.0]))
+            dim = {c: (image * light).astype(np.uint16) << shift for c, image in images.items()}
+            deep = dim if shift else {c: image.astype(np.uint8) for c, image in dim.items()}
+            found = tracker.track(k, deep, np.eye(3))
+            found = tracker.detect(found) if k == 2 else found
+        tracks.append(found)
+    assert len(tracks[1]) > 40 and abs(len(tracks[1]) - len(tracks[0])) <= 3
+    assert tracks[1].brightness == pytest.approx(tracks[0].brightness, rel=0.02)
+    assert tracks[1].contrast == pytest.approx(tracks[0].contrast, rel=0.02)
+
+
+def test_the_range_that_grows_takes_the_image_before_along() -> None:
+    picture, tracker = wall(), FeatureTracker(VioConfig(features=80, cell_size=30), stereo())
+    first = {c: image.astype(np.uint16) * 4 for c, image in pair(picture, np.eye(3), np.zeros(3)).items()}
+    tracks = tracker.detect(tracker.track(0, first, np.eye(3)))
+    then = {c: image.copy() for c, image in first.items()}
+    then[0][0, 0] = 4000  # one bright pixel: twelve bits, not ten
+    assert len(tracker.track(1, then, np.eye(3))) > 0.9 * len(tracks) > 40
+
+
+def test_opencv_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(InputError, match=r"boxplus\[vision\]"):
         FeatureTracker(VioConfig(), stereo())

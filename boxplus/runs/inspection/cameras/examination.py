@@ -16,10 +16,11 @@ from boxplus.recordings.stream_checks import check_rate, check_rejected
 from boxplus.runs.inspection.cameras.readout import check_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration, check_synchronisation
-from boxplus.runs.inspection.cameras.tracking import Turned, follow, grey_8_bit, rotation_between
+from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
 from boxplus.runs.inspection.cameras.views import Views, check_blur, check_corners, check_views
 from boxplus.runs.inspection.imu_checks import check_finite, check_saturation
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
 _SLOW_IMU_HZ = 50.0
@@ -35,7 +36,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
     imu: list[ImuSamples] = []
     pictures = [camera for camera in info.cameras if camera.kind == "intensity"]
     turns = Turns(images=deque(maxlen=_APART))
-    corners = Corners()
+    corners, to_8_bits = Corners(), EightBits()
     last: dict[int, tuple[int, NDArray[np.uint8]]] = {}
     every = max(1, pictures[0].count // _STEREO_PAIRS) if pictures else 1
     found: list[Evidence] = []
@@ -45,7 +46,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
             if isinstance(event, ImuSamples):
                 imu.append(event)
                 continue
-            grey = None if event.is_depth else grey_8_bit(event.grey())
+            grey = None if event.is_depth else to_8_bits(event.grey())
             views[event.camera].note(event, grey)
             if grey is None:
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,6 @@ class Turned(NamedTuple):
     before: NDArray[np.float64]
     after: NDArray[np.float64]
     followed: int
-
-
-def grey_8_bit(grey: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey values in 8 bits; 16-bit ones are scaled by their largest."""
-    if grey.dtype == np.uint8:
-        return grey
-    scaled: NDArray[np.uint8] = (grey * (255.0 / max(float(grey.max()), 1.0))).astype(np.uint8)
-    return scaled
 
 
 def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -43,8 +43,8 @@ class Views:
         """Note one image; `grey` (H, W) is left out for depths."""
         self.time_ns.append(image.time_ns)
         self.size = image.shape[1], image.shape[0]
-        self.brightness.append(float(image.pixels[::4, ::4].mean()) / (257.0 if image.pixels.dtype == np.uint16 else 1.0))
         if grey is not None:
+            self.brightness.append(float(grey[::4, ::4].mean()))
             self.structure.append(_structure(grey))
             self.sharpness.append(_sharpness(grey))
 
