@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 _FEWEST = 5  # keyframes that saw a corner, for its residuals to tell
 _ENOUGH = 60  # pairs of residuals
 _MEMORY = 0.9  # of the sums, per keyframe
-_LEFT = 0.4
+_LEFT = 0.5
 
 Floats = NDArray[np.float64]
 

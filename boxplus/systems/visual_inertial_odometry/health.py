@@ -51,7 +51,7 @@ class Health:
         self._seen_ns = self._agreed_ns = time_ns
 
     def judge(
-        self, tracks: Tracks, fit: Fit, rests: bool, imu_gap_s: float, position_sigma: float
+        self, tracks: Tracks, fit: Fit, rests: bool, imu_gap_s: float, position_sigma: float, apart: str | None = None
     ) -> tuple[Status, tuple[str, ...]]:
         """The status of a frame, and why it is not "ok".
 
@@ -59,6 +59,7 @@ class Health:
             rests: the images stand still, so that the pose is held without landmarks.
             imu_gap_s: longest time between IMU samples before the frame [s].
             position_sigma: standard deviation of the position, all axes together [m].
+            apart: how the way of the cameras and the IMU's contradict each other; None where they do not.
         """
         time_ns, reasons = tracks.time_ns, []
         agreed = fit.agreed + fit.lines.agreed
@@ -82,7 +83,7 @@ class Health:
             reasons.append(
                 f"the IMU was silent for {imu_gap_s:.2f} s, of {self.config.max_imu_gap:g} s at most: only images tell the motion"
             )
-        contradictions = self._contradictions(tracks, fit)
+        contradictions = self._contradictions(tracks, fit) + ([] if apart is None else [apart])
         if not contradictions:
             self._agreed_ns = time_ns
         elif (time_ns - self._agreed_ns) * 1e-9 > _SUSTAINED_S and self.contradiction is None:

@@ -25,6 +25,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
+from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
@@ -73,6 +74,7 @@ class VisualInertialOdometry:
         self._time_ns = 0  # of the frame before
         self._next_try_ns = 0
         self._health = Health(self.config)
+        self._watch = InertialWatch(self.config.gravity)
         self._counters: Counter[str] = Counter()
 
     @overload
@@ -251,7 +253,9 @@ class VisualInertialOdometry:
         line_ids, line_ends = self.window.lines.ends(self.window.bodies, self.window.mountings.values)
         lines = tracks.lines
         covariance = self.window.covariance
-        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, position_sigma(covariance))
+        self._watch.add(pose, state, covariance, self.window.last_step)
+        sigma, apart = position_sigma(covariance), self._watch.contradiction
+        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart)
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,

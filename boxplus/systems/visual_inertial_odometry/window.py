@@ -62,6 +62,7 @@ class Window:
         lines: landmarks that are lines.
         offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
         gap_s: longest time between IMU samples before the newest frame [s].
+        last_step: what the IMU measured from the frame before to the newest one; None where it was silent.
         frames: in order of time.
         covariance: (15, 15) of the newest frame, [θ, p, v, b_ω, b_a].
         leak: what the last prior claims to know of position and yaw.
@@ -94,6 +95,7 @@ class Window:
         self.covariance = np.zeros((15, 15))
         self.frames: list[Frame] = []
         self._imu: Preintegration | None = None
+        self.last_step: Preintegration | None = None
         self._next: tuple[int, Preintegration] | None = None  # the step from the newest frame that `predict` took, and its end
         self._imu_group: Group | None = None
         self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
@@ -159,6 +161,7 @@ class Window:
             self.gap_s = float(step.longest_gap_s[0])
             if self.gap_s > self._config.max_imu_gap:  # such an interval is never made one with another
                 self.frames[-1].is_keyframe = is_keyframe = True
+            self.last_step = step if self.gap_s <= self._config.max_imu_gap else None
         number = int(self.problem.extend(self.bodies, pose).ids[0])
         self.problem.extend(self.states, state)
         self.frames.append(Frame(number, tracks.time_ns, tracks, is_keyframe))

@@ -36,7 +36,7 @@ def test_independent_errors_of_any_size_count_as_they_are(seed: int, white: floa
     creep, rng = CornerCreep(), np.random.default_rng(seed)
     for _ in range(20):
         note(creep, rng, 0.0, white)
-    # Sixty thousand differences err by a percent of their variance, which counts 13 / 0.4 times.
+    # Sixty thousand differences err by a percent of their variance, which counts 13 / 0.5 times.
     assert 1.0 <= creep.factor**2 < 1.0 + 0.7 * white**2
     assert creep.weight**2 == pytest.approx(creep.factor)
 
@@ -49,7 +49,7 @@ def test_a_walk_grows_the_factor_by_what_it_is_and_by_how_many_cameras_share_it(
             note(creep, rng, walk, 0.2, cameras)
         factors.append(creep.factor**2 - 1.0)
     # q = walk² over what residuals keep of it, n = 8; the mean that was taken off moves no difference.
-    assert factors[0] == pytest.approx(65.0 / 10.0 * 0.3**2 / 0.4, rel=0.1)
+    assert factors[0] == pytest.approx(65.0 / 10.0 * 0.3**2 / 0.5, rel=0.1)
     assert factors[1] == pytest.approx(2.0 * factors[0]) and factors[2] == pytest.approx(4.0 * factors[1], rel=0.1)
 
 

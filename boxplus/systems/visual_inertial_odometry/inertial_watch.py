@@ -1,0 +1,98 @@
+"""Whether cameras and IMU agree on the way: where the IMU alone comes to in some seconds, and where the cameras say it is.
+
+A baseline that is stated too long or too short makes every length of the cameras wrong by one factor, and the estimator finds a
+compromise that looks well in every single frame. Over seconds it does not: from an estimate (R, p, v, b) on, with its covariance
+P, the IMU alone is integrated for a time T,
+
+    p̂ = p + v T + ½ g T² + R α
+
+and compared with the place p_T that the window has found by then. What is not known of it has the covariance
+
+    S = J P Jᵀ + R Σ_α Rᵀ + P_p(T) − P_p
+
+of the begin, of the IMU's noise, and of the cameras' way. The normalised square (p_T − p̂)ᵀ S⁻¹ (p_T − p̂) / 3 is 1 in the mean. As
+p_T is drawn to p̂ by the window, which believes the IMU as well, it is smaller in sound runs. A motion without acceleration tells
+nothing of lengths, and does no harm.
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation, 2001, 5.4 (tests of innovations).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, so3
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
+
+_SEGMENT_S = 2.5
+_SEGMENTS, _FEWEST = 3, 2  # that are averaged, and at least
+_LEAST_WAY = 0.005  # m, of what is not known of the cameras' way
+_MOST = 3.0  # times as far as what is known explains
+
+Floats = NDArray[np.float64]
+
+
+class InertialWatch:
+    """Compares the way that the window finds with that of the IMU alone, every few seconds.
+
+    Args:
+        gravity: magnitude [m/s²].
+
+    Attributes:
+        ratio: distance between the two, by what is known of both, over the last segments; 1 is exact, 0 before there is one.
+    """
+
+    def __init__(self, gravity: float) -> None:
+        self._down = np.array([0.0, 0.0, -gravity])
+        self._squares: deque[float] = deque(maxlen=_SEGMENTS)
+        self._off = 0.0
+        self._begin: tuple[Floats, Floats, Floats] | None = None
+        self._imu: Preintegration | None = None
+
+    @property
+    def ratio(self) -> float:
+        """See the class."""
+        return float(np.sqrt(np.mean(self._squares))) if len(self._squares) >= _FEWEST else 0.0
+
+    @property
+    def contradiction(self) -> str | None:
+        """What contradicts, in a sentence; None where nothing does."""
+        if self.ratio < _MOST:
+            return None
+        return (
+            f"in {_SEGMENT_S:g} s the way by the cameras and the IMU's alone come apart by {self._off:.2f} m, {self.ratio:.0f} "
+            "times what is known of both: check the scale, which is the baseline of the cameras in T_imu_camera, and the IMU's "
+            "clock"
+        )
+
+    def add(self, pose: Floats, state: Floats, covariance: Floats, step: Preintegration | None) -> None:
+        """The newest frame.
+
+        Args:
+            pose: (7,) T_world_imu; state: (9,) [v, b_a, b_g]; covariance: (15, 15) of [θ, p, v, b_ω, b_a].
+            step: what the IMU measured since the frame before, one interval; None where that is not to be relied on.
+        """
+        if self._begin is not None and step is not None:
+            self._imu = step if self._imu is None else self._imu.append(step).merge(0)
+            if 1e-9 * float(self._imu.intervals_ns[0, 1] - self._imu.intervals_ns[0, 0]) < _SEGMENT_S:
+                return
+            self._compare(*self._begin, self._imu, pose, covariance)
+        self._begin, self._imu = (pose.copy(), state.copy(), covariance.copy()), None
+
+    def _compare(self, pose_0: Floats, state_0: Floats, P: Floats, imu: Preintegration, pose: Floats, covariance: Floats) -> None:
+        """Note how far the end of a segment is from where the IMU comes to."""
+        R, T = quaternion.to_matrix(pose_0[:4]), 1e-9 * float(imu.intervals_ns[0, 1] - imu.intervals_ns[0, 0])
+        by_bias = imu.bias_jacobian[0, :3]
+        alpha = imu.alpha[0] + by_bias @ (state_0[3:] - np.concatenate([imu.bias_accel[0], imu.bias_gyro[0]]))
+        off = pose[4:] - pose_0[4:] - state_0[:3] * T - 0.5 * self._down * T**2 - R @ alpha
+        J = np.zeros((3, 15))
+        J[:, :3], J[:, 6:9] = -R @ so3.hat(alpha), T * np.eye(3)
+        J[:, 9:12], J[:, 12:] = R @ by_bias[:, 3:], R @ by_bias[:, :3]
+        way = covariance[3:6, 3:6] - P[3:6, 3:6]
+        value, axes = np.linalg.eigh(0.5 * (way + way.T))
+        S = J @ P @ J.T + R @ imu.covariance[0, :3, :3] @ R.T + axes * np.maximum(value, _LEAST_WAY**2) @ axes.T
+        self._squares.append(float(off @ np.linalg.solve(S, off)) / 3.0)
+        self._off = float(np.linalg.norm(off))

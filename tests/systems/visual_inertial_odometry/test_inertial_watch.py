@@ -1,0 +1,70 @@
+"""The way by the cameras against that of the IMU alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from boxplus.manifolds import quaternion, so3
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
+from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
+from tests.systems.visual_inertial_odometry.simulated_rays import (
+    IMAGE_EVERY,
+    NOISE,
+    PIXEL_SIGMA,
+    Flight,
+    SimulatedTracker,
+    rig,
+    run,
+)
+
+SIGMAS = np.repeat([5e-4, 0.005, 0.005, 2e-4, 5e-3], 3)  # θ, p, v, b_ω, b_a, as after some seconds
+
+
+def watched(seed: int, scale: float, silent: int = -1) -> InertialWatch:
+    """Estimates that err as their covariance says, but for lengths; the frame `silent` comes after a silence."""
+    flight, watch, rng = Flight(seed, 12.0), InertialWatch(9.81), np.random.default_rng([seed, 5])
+    for number, k in enumerate(range(300, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY)):
+        ends = flight.time_ns[[k - IMAGE_EVERY, k]]
+        step = Preintegration.integrate(flight.time_ns, flight.gyro, flight.accel, noise=NOISE, intervals_ns=[ends])
+        off = rng.normal(size=15) * SIGMAS
+        turn = quaternion.from_matrix(flight.R[k] @ so3.exp(off[:3]))
+        pose = np.concatenate([turn, scale * flight.p[k] + off[3:6]])
+        biases = flight.bias_accel[k] + off[12:], flight.bias_gyro[k] + off[9:12]
+        state = np.concatenate([scale * flight.v[k] + off[6:9], *biases])
+        watch.add(pose, state, np.diag(SIGMAS**2), None if number == silent else step)
+    return watch
+
+
+def test_estimates_as_good_as_they_say_are_believed() -> None:
+    ratios = [watched(seed, 1.0).ratio for seed in range(6)]
+    assert 0.3 < np.mean(ratios) < 1.5 and max(ratios) < 3.0
+    assert all(watched(seed, 1.0).contradiction is None for seed in range(3))
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+def test_lengths_that_are_not_the_accelerometers_are_named(scale: float) -> None:
+    said = [watched(seed, scale).contradiction for seed in range(3)]
+    assert all(sentence is not None and "baseline" in sentence and "scale" in sentence for sentence in said)
+
+
+def test_little_time_and_silence_say_nothing() -> None:
+    watch = InertialWatch(9.81)
+    assert watch.ratio == 0.0 and watch.contradiction is None
+    sound, silent = watched(1, 1.25), watched(1, 1.25, silent=100)
+    assert silent.ratio > 0.0 and silent.ratio != sound.ratio
+
+
+def stretched(its: Rig, scale: float) -> Rig:
+    """The rig with another distance between its cameras."""
+    mountings = [camera.T_imu_camera.copy() for camera in its.cameras]
+    mountings[1][:3, 3] = mountings[0][:3, 3] + scale * (mountings[1][:3, 3] - mountings[0][:3, 3])
+    return Rig.of([c.model for c in its.cameras], mountings, [(c.width, c.height) for c in its.cameras], its.noise)
+
+
+@pytest.mark.parametrize(("scale", "is_named"), [(1.0, False), (1.25, True), (0.8, True)])
+def test_a_wrong_baseline_is_contradicted(scale: float, is_named: bool) -> None:
+    flight, true = Flight(3, 10.0), rig()
+    vio, _ = run(flight, stretched(true, scale), VioConfig(pixel_sigma=PIXEL_SIGMA), SimulatedTracker(flight, true))
+    assert (vio.contradiction is not None) == is_named
