@@ -25,7 +25,12 @@ if TYPE_CHECKING:
         """Runs over an opened recording."""
 
         def __call__(
-            self, recording: CameraRecording, *, progress: Callable[[Progress], None], should_stop: Callable[[], bool]
+            self,
+            recording: CameraRecording,
+            *,
+            resume: bool,
+            progress: Callable[[Progress], None],
+            should_stop: Callable[[], bool],
         ) -> SummaryT_co: ...
 
 
@@ -41,6 +46,7 @@ def run_cameras(
     alignment: Callable[[SummaryT], AlignmentKind],
     *,
     overwrite: bool,
+    resume: bool,
     ground_truth: Path | None,
     report: bool,
 ) -> SummaryT:
@@ -64,13 +70,13 @@ def run_cameras(
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_camera_recording(recording, options) as opened,
-        claim_camera_folder(folder, overwrite=overwrite),
+        claim_camera_folder(folder, overwrite=overwrite, resume=resume),
     ):
         info = opened.info
         facts = f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
         terminal.print_evidence(info.path, facts, info.evidence)
         with terminal.progress() as progress:
-            summary = odometry(opened, progress=progress, should_stop=should_stop)
+            summary = odometry(opened, resume=resume, progress=progress, should_stop=should_stop)
         shown, frames = list(rows(summary)), summary.estimates[0]
         if truth is not None and frames:
             shown.append(("against --gt", _compare(folder, truth, alignment(summary))))

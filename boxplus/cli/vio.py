@@ -39,6 +39,7 @@ def vio(
     view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
     *,
     options: CameraRecordingOptions,
 ) -> None:
@@ -73,6 +74,7 @@ def vio(
         _rows,
         lambda _: "yaw",  # position and yaw are what an estimator with gravity leaves open
         overwrite=overwrite,
+        resume=resume,
         ground_truth=ground_truth,
         report=not no_report,
     )

@@ -33,6 +33,7 @@ def vo(
     ] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
     *,
     options: CameraRecordingOptions,
 ) -> None:
@@ -62,6 +63,7 @@ def vo(
         _rows,
         lambda summary: "se3" if summary.scale == "metric" else "sim3",
         overwrite=overwrite,
+        resume=resume,
         ground_truth=ground_truth,
         report=not no_report,
     )

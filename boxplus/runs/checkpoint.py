@@ -9,10 +9,11 @@ from typing import Any
 
 from boxplus.errors import InputError
 from boxplus.formats.output import output_error
+from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.info import RecordingInfo
-from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.estimate_statistics import EstimateStatistics
+from boxplus.runs.run_folder import OdometryFolder
 from boxplus.runs.state_codec import read_state, write_state
-from boxplus.runs.statistics import RunStatistics
 
 _EVERY_S = 5.0
 _LARGEST_SHARE = 0.05  # of the time of the run: with a large map, checkpoints come less often
@@ -26,17 +27,17 @@ class Checkpoint:
         identity: of the recording and the settings, see `run_identity`.
         events: of the recording that were taken.
         resumed: how often the run had been resumed.
-        registered: points handed to the map.
         statistics: what was counted.
-        odometry: of `LidarInertialOdometry.snapshot`.
+        odometry: what the estimator's `snapshot` gives.
+        run: what this kind of run holds beside it.
     """
 
     identity: dict[str, str]
     events: int
     resumed: int
-    registered: int
-    statistics: RunStatistics
+    statistics: EstimateStatistics
     odometry: dict[str, object]
+    run: dict[str, object]
 
 
 class CheckpointWriter:
@@ -63,15 +64,19 @@ class CheckpointWriter:
         self._due = now + max(_EVERY_S, (now - began) / _LARGEST_SHARE)
 
 
-def run_identity(info: RecordingInfo, config: str) -> dict[str, str]:
-    """What has to be the same for a run to go on: the recording, wherever it lies, and the text of `config.yaml`."""
+def run_identity(info: RecordingInfo | CameraRecordingInfo, config: str, streams: str) -> dict[str, str]:
+    """What has to be the same for a run to go on: the recording, wherever it lies, and the text of `config.yaml`.
+
+    Args:
+        streams: of the recording that are read.
+    """
     files = [info.path] if info.path.is_file() else sorted(file for file in info.path.rglob("*") if file.is_file())
     size = sum(file.stat().st_size for file in files)
     recording = f"{info.format}, {size} bytes, {info.message_count} messages in {info.duration_s:.9f} s"
-    return {"recording": f"{recording}, {info.lidar_topic} and {info.imu_topic}", "config": config}
+    return {"recording": f"{recording}, {streams}", "config": config}
 
 
-def read_checkpoint(folder: RunFolder, identity: dict[str, str]) -> Checkpoint:
+def read_checkpoint(folder: OdometryFolder, identity: dict[str, str]) -> Checkpoint:
     """The checkpoint of a run over the same recording with the same settings.
 
     Raises:
@@ -100,21 +105,25 @@ def read_checkpoint(folder: RunFolder, identity: dict[str, str]) -> Checkpoint:
     return Checkpoint(**state)
 
 
-def cut_to_whole_rows(folder: RunFolder, fewest: int) -> int | None:
-    """Cut trajectory and scan log to the rows that all of them hold whole; returns the time of the last one [ns].
+def cut_to_whole_rows(folder: OdometryFolder, log: Path, fewest: int) -> int | None:
+    """Cut trajectory and log to the rows that all of them hold whole; returns the time of the last one [ns].
+
+    Args:
+        log: with one row for each pose, such as `scans.csv`.
+        fewest: rows that have to be there, those of the checkpoint.
 
     Raises:
-        InputError: fewer than `fewest`, those of the checkpoint.
+        InputError: there are fewer.
         OutputError: a file cannot be changed.
     """
     trajectory = folder.trajectory
-    headers = {trajectory: 1, trajectory.with_suffix(".tum"): 0, trajectory.with_suffix(".kitti.txt"): 0, folder.scans: 1}
+    headers = {trajectory: 1, trajectory.with_suffix(".tum"): 0, trajectory.with_suffix(".kitti.txt"): 0, log: 1}
     try:
         lines = {path: [line for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")] for path in headers}
         rows = min(len(lines[path]) - header for path, header in headers.items())
         if rows < fewest:
             raise InputError(
-                f"the {fewest} scans of the checkpoint in trajectory and scan log",
+                f"the {fewest} rows of the checkpoint in trajectory and {log.name}",
                 f"{max(rows, 0)} ({folder.path})",
                 "start the run anew",
             )

@@ -8,19 +8,20 @@ from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 from boxplus.errors import InputError, printable
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.store import TileStore, merge
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.recording import Recording
-from boxplus.runs.checkpoint import Checkpoint, CheckpointWriter, cut_to_whole_rows, read_checkpoint, run_identity
+from boxplus.runs.checkpoint import run_identity
 from boxplus.runs.config import RunConfig, dump_run_config
 from boxplus.runs.extrinsic import Extrinsic, choose_extrinsic
+from boxplus.runs.resumable_run import ResumableRun
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_folder import RunFolder, claim_run_folder
-from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.run_loop import Progress, peak_memory_mb, versions
 from boxplus.runs.run_summary import ExtrinsicFacts, MapFacts, RecordingFacts, RunSummary, TimingFacts
 from boxplus.runs.scan_log import ScanLogWriter
 from boxplus.runs.statistics import RunStatistics
@@ -88,7 +89,7 @@ def run_odometry(
         return run.execute(should_stop or (lambda: False))
 
 
-class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
+class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
     """One run of LiDAR-inertial odometry: its writers, its map and its checkpoints."""
 
     def __init__(
@@ -100,9 +101,10 @@ class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
         progress: Callable[[Progress], None],
         view: View | None,
     ) -> None:
-        self._identity = run_identity(recording.info, dump_run_config(config, recording.info))
+        info = recording.info
+        identity = run_identity(info, dump_run_config(config, info), f"{info.lidar_topic} and {info.imu_topic}")
         self._statistics = RunStatistics()
-        super().__init__(recording, folder.summary, folder.config, self._identity["config"], self._statistics, progress)
+        super().__init__(recording, folder, identity, folder.scans, self._statistics, progress)
         self._recording = recording
         self._folder = folder
         self._config = config
@@ -112,50 +114,30 @@ class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
         self._tiles: TileWriter | None = None
         if extrinsic.warning:
             self._statistics.warnings.add(extrinsic.warning)
-        self._resumed = 0
-        self._written_until_ns: int | None = None
         self.seconds["merging"] = 0.0
         self._registered = 0
         self._merged: int | None = None
 
-    def resume(self) -> None:
-        """Go on from the checkpoint in the folder.
+    def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
+        """See `ResumableRun.snapshot`."""
+        return self._odometry.snapshot(), {"registered": self._registered}
 
-        Scans that came after it are estimated again, and written where their rows are not there yet.
-        """
-        checkpoint = read_checkpoint(self._folder, self._identity)
-        self._written_until_ns = cut_to_whole_rows(self._folder, checkpoint.statistics.count)
-        self._odometry.restore(checkpoint.odometry)
-        self._statistics = self.counts = checkpoint.statistics
-        self._registered = checkpoint.registered
-        self.events, self._resumed = checkpoint.events, checkpoint.resumed + 1
+    def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
+        """See `ResumableRun.restore`."""
+        self._odometry.restore(odometry)
+        self._statistics = cast(RunStatistics, self.counts)
+        self._registered = run["registered"]
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
-        map_config, after_ns = self._config.map, self._written_until_ns
+        super().open(stack)
+        map_config, after_ns = self._config.map, self.written_until_ns
         self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path, after_ns=after_ns))
         self._scan_log = stack.enter_context(ScanLogWriter(self._folder.scans, go_on=after_ns is not None))
-        self._checkpoints = CheckpointWriter(self._folder.checkpoint)
         if map_config.save:
             tiles = TileWriter(self._folder.tiles, tile_size=map_config.tile_size, voxel=map_config.voxel)
             self._tiles = stack.enter_context(tiles)
-            tiles.stored = TileStore.open(self._folder.tiles).point_count if self._resumed else 0
-
-    def between_events(self) -> None:
-        """See `RunLoop.between_events`."""
-        if self._checkpoints.is_due:
-            self._checkpoints.write(self._checkpoint())
-
-    def at_end(self, state: State) -> None:
-        """See `RunLoop.at_end`."""
-        if state == "finished":
-            self._folder.checkpoint.unlink(missing_ok=True)
-        else:
-            self._checkpoints.write(self._checkpoint())
-
-    def _checkpoint(self) -> Checkpoint:
-        odometry = self._odometry.snapshot()
-        return Checkpoint(self._identity, self.events, self._resumed, self._registered, self._statistics, odometry)
+            tiles.stored = TileStore.open(self._folder.tiles).point_count if self.resumed else 0
 
     def push(self, event: Scan | ImuSamples) -> list[Estimate]:
         """See `RunLoop.push`."""
@@ -170,7 +152,7 @@ class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
         """Write one estimate. Points of a lost scan do not enter the map: nobody knows where they belong."""
         began = time.perf_counter()
         state = estimate.state
-        is_new = self._written_until_ns is None or estimate.time_ns > self._written_until_ns
+        is_new = self.is_new(estimate.time_ns)
         if is_new:
             pose = state.R_world_imu, state.p_world_imu
             self._trajectory.append(estimate.time_ns, *pose, estimate.pose_covariance, estimate.status)
@@ -220,7 +202,7 @@ class _Run(RunLoop[Scan | ImuSamples, Estimate, RunSummary]):
             state=state,
             error=error,
             process=os.getpid(),
-            resumed=self._resumed,
+            resumed=self.resumed,
             started=self.started,
             updated=datetime.now(UTC),
             recording=RecordingFacts(

@@ -43,6 +43,11 @@ class OdometryFolder:
         return self.path / "trajectory.csv"
 
     @property
+    def checkpoint(self) -> Path:
+        """From where a killed run can go on; gone when it has come to its end."""
+        return self.path / "checkpoint.npz"
+
+    @property
     def report(self) -> Path:
         """The report."""
         return self.path / "report.html"
@@ -54,11 +59,28 @@ class OdometryFolder:
 
     def existing(self, more: Iterable[Path], pictures: Iterable[str]) -> Iterator[Path]:
         """Of the files that every run writes, `more` and `pictures`, those that are there, half-written ones too."""
-        top = [self.summary, self.config, self.report, *more]
+        top = [self.summary, self.config, self.report, self.checkpoint, *more]
         top += [self.trajectory.with_name(f"trajectory.{ending}") for ending in ("tum", "kitti.txt", "csv")]
         top += [self.plots / name for name in pictures]
         for path in top:
             yield from (candidate for candidate in (path, path.with_name(path.name + TEMPORARY_SUFFIX)) if candidate.is_file())
+
+    @contextmanager
+    def locked_to_resume(self, program: str) -> Iterator[None]:
+        """The folder as it is, locked while the block runs, for a run that goes on.
+
+        Raises:
+            InputError: no run to resume; another process is writing there.
+        """
+        if not self.checkpoint.is_file():
+            raise InputError(
+                "the folder of a run that did not come to its end, with a checkpoint",
+                f"none in {self.path}",
+                "start the run without --resume; a checkpoint is written every few seconds",
+            )
+        with locked_folder(self.path, program) as lock:
+            lock.keep_file = False
+            yield
 
     def holds_estimates(self) -> bool:
         """Whether the trajectory has a single row; a killed run may have written rows that its `run.json` does not count."""
@@ -79,11 +101,6 @@ class RunFolder(OdometryFolder):
         return self.path / "scans.csv"
 
     @property
-    def checkpoint(self) -> Path:
-        """From where a killed run can go on; gone when it has come to its end."""
-        return self.path / "checkpoint.npz"
-
-    @property
     def tiles(self) -> Path:
         """The map in tiles."""
         return self.path / "map"
@@ -100,7 +117,7 @@ class RunFolder(OdometryFolder):
 
     def own_files(self) -> Iterator[Path]:
         """The files in the folder that a run writes."""
-        yield from self.existing([self.scans, self.map_ply, self.map_pcd, self.checkpoint], PLOTS)
+        yield from self.existing([self.scans, self.map_ply, self.map_pcd], PLOTS)
         for path in self.tiles.rglob("*"):
             inside = path.relative_to(self.tiles).as_posix().removesuffix(TEMPORARY_SUFFIX)
             if path.is_file() and _MAP_FILE.fullmatch(inside):
@@ -126,14 +143,7 @@ def claim_run_folder(folder: str | Path, *, overwrite: bool = False, resume: boo
     """
     run = RunFolder(Path(folder))
     if resume:
-        if not run.checkpoint.is_file():
-            raise InputError(
-                "the folder of a run that did not come to its end, with a checkpoint",
-                f"none in {run.path}",
-                "start the run without --resume; a checkpoint is written every few seconds",
-            )
-        with locked_folder(run.path, "boxplus lio") as lock:
-            lock.keep_file = False
+        with run.locked_to_resume("boxplus lio"):
             yield run
         return
     with output_folder(

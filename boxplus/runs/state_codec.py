@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import threading
 from array import array
 from collections import Counter, deque
 from concurrent.futures import Executor, Future
@@ -21,12 +22,13 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 
 _PLAIN = (bool, int, float, str, type(None))
+_LOCK = type(threading.Lock())
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
     """Write `state` in one step: numbers, text, containers, arrays, and objects of boxplus made of these.
 
-    What runs on another thread becomes None: whoever began it has to begin it again.
+    What runs on another thread becomes None: whoever began it has to begin it again. A lock is read as a new one that is open.
 
     Raises:
         OutputError: the disk is full; the file before stays.
@@ -83,6 +85,10 @@ class _Encoder:
             return {type(value).__name__: [self.encode(entry) for entry in value]}
         if isinstance(value, deque):
             return {"deque": [self.encode(entry) for entry in value], "maxlen": value.maxlen}
+        if isinstance(value, slice):
+            return {"slice": [self.encode(entry) for entry in (value.start, value.stop, value.step)]}
+        if isinstance(value, _LOCK):
+            return {"lock": None}
         if isinstance(value, array):
             return {"numbers": value.tolist(), "typecode": value.typecode}
         if isinstance(value, dict):
@@ -123,6 +129,10 @@ class _Decoder:
             return self._objects[content]
         if kind in ("model", "object"):
             return self._decode_object(content, tree)
+        if kind == "lock":
+            return threading.Lock()
+        if kind == "slice":
+            return slice(*map(self.decode, content))
         if kind == "numbers":
             return array(tree["typecode"], content)
         if kind in ("dict", "counter"):

@@ -17,15 +17,17 @@ from boxplus.runs.cameras.facts import evidence_warnings, frame_timing, recordin
 from boxplus.runs.cameras.folder import CameraRunFolder
 from boxplus.runs.cameras.landmark_file import LandmarkFile
 from boxplus.runs.cameras.summary import CameraSummary
+from boxplus.runs.checkpoint import run_identity
 from boxplus.runs.estimate_statistics import EstimateStatistics
+from boxplus.runs.resumable_run import ResumableRun
 from boxplus.runs.run_facts import State
-from boxplus.runs.run_loop import Progress, RunLoop, peak_memory_mb, versions
+from boxplus.runs.run_loop import Progress, peak_memory_mb, versions
 
 EstimateT = TypeVar("EstimateT")
 SummaryT = TypeVar("SummaryT", bound=CameraSummary)
 
 
-class CameraRun(RunLoop[CameraEvent, EstimateT, SummaryT]):
+class CameraRun(ResumableRun[CameraEvent, EstimateT, SummaryT]):
     """One run with cameras.
 
     Args:
@@ -43,21 +45,27 @@ class CameraRun(RunLoop[CameraEvent, EstimateT, SummaryT]):
         progress: Callable[[Progress], None],
         landmarks: Callable[[], NDArray[np.float32]],
     ) -> None:
-        super().__init__(recording, folder.summary, folder.config, config, EstimateStatistics("frames"), progress)
-        self._info, self._folder = recording.info, folder
+        info = recording.info
+        streams = [camera.source for camera in info.cameras] + ([] if info.imu is None else [info.imu.source])
+        identity = run_identity(info, config, " and ".join(streams))
+        super().__init__(recording, folder, identity, folder.frames, EstimateStatistics("frames"), progress)
+        self._info, self._folder = info, folder
         self._landmark_file = LandmarkFile(folder.landmarks, landmarks)
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
-        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path))
+        super().open(stack)
+        self._trajectory = stack.enter_context(TrajectoryWriter(self._folder.path, after_ns=self.written_until_ns))
 
     def between_events(self) -> None:
         """See `RunLoop.between_events`."""
+        super().between_events()
         self.seconds["writing"] += self._landmark_file.write_if_due()
 
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
         self.seconds["writing"] += self._landmark_file.write()
+        super().at_end(state)
 
     def shared_facts(self, state: State, error: str | None, *, with_imu: bool) -> dict[str, Any]:
         """What the summaries of all of these runs state."""
@@ -67,6 +75,7 @@ class CameraRun(RunLoop[CameraEvent, EstimateT, SummaryT]):
             "state": state,
             "error": error,
             "process": os.getpid(),
+            "resumed": self.resumed,
             "started": self.started,
             "updated": datetime.now(UTC),
             "recording": recording_facts(self._info, self.recording.progress, with_imu=with_imu),

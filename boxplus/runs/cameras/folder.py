@@ -89,14 +89,18 @@ FolderT = TypeVar("FolderT", bound=CameraRunFolder)
 
 
 @contextmanager
-def claim_camera_folder(run: FolderT, *, overwrite: bool = False) -> Iterator[FolderT]:
-    """A folder to write a run into, locked while the block runs; see `output_folder`.
+def claim_camera_folder(run: FolderT, *, overwrite: bool = False, resume: bool = False) -> Iterator[FolderT]:
+    """A folder to write a run into, locked while the block runs; see `output_folder`. To `resume` a run, all of it stays.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
-            set.
+            set; no run to resume.
         OutputError: it cannot be created or cleared.
     """
+    if resume:
+        with run.locked_to_resume(run.program):
+            yield run
+        return
     with output_folder(
         run.path, run.program, run.own_files, lambda: [run.plots], overwrite=overwrite, holds_results=run.holds_estimates
     ):

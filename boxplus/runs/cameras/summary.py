@@ -11,6 +11,7 @@ from boxplus.runs.run_facts import RunFacts
 class CameraSummary(RunFacts):
     """What the contents of `run.json` share."""
 
+    resumed: int = Field(0, description="how often the run went on after it had been killed or interrupted")
     recording: CameraRecordingFacts
     frames: int = Field(0, description="with a pose or lost; those before the start have none")
     keyframes: int = 0

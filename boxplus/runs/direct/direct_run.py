@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from boxplus.runs.run_loop import Progress
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
+from boxplus.systems.direct_odometry.snapshot import restore as restore_odometry
+from boxplus.systems.direct_odometry.snapshot import snapshot_of
 
 _NO_SCALE = (
     "one camera alone does not tell the scale: all lengths are in units of about the median depth of the first view, and the "
@@ -37,6 +40,7 @@ def run_direct_odometry(
     config: DirectRunConfig | None = None,
     *,
     overwrite: bool = False,
+    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> DirectSummary:
@@ -50,6 +54,7 @@ def run_direct_odometry(
         folder: created; see docs/output_folder.md for what it holds. Or what `claim_camera_folder` yields.
         config: settings; each has a default.
         overwrite: replace the results of an earlier run in the folder.
+        resume: go on with a run that was killed or interrupted, from its last checkpoint.
         progress: called after every event that was read.
         should_stop: asked between events; True ends the run in good order, with the state "interrupted".
 
@@ -59,7 +64,7 @@ def run_direct_odometry(
     Raises:
         RecordingError: no camera of intensities, unknown calibration, depths that are not registered, nothing to read.
         InputError: no frame could be used, or one camera alone never saw parallax; the folder holds something else, or another
-            process is writing there.
+            process is writing there; nothing to resume, or a run over another recording or with other settings.
         OutputError: the folder cannot be written; what was written before is intact.
 
     Example:
@@ -69,9 +74,12 @@ def run_direct_odometry(
     """
     config = config or DirectRunConfig()
     run = folder if isinstance(folder, DirectFolder) else DirectFolder(Path(folder))
-    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite)
+    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite, resume=resume)
     with claimed as direct_folder:
-        return _Run(recording, direct_folder, config, progress or (lambda _: None)).execute(should_stop or (lambda: False))
+        run_of_recording = _Run(recording, direct_folder, config, progress or (lambda _: None))
+        if resume:
+            run_of_recording.resume()
+        return run_of_recording.execute(should_stop or (lambda: False))
 
 
 class _Run(CameraRun[Estimate, DirectSummary]):
@@ -96,7 +104,18 @@ class _Run(CameraRun[Estimate, DirectSummary]):
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
         super().open(stack)
-        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
+        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames, go_on=self.written_until_ns is not None))
+
+    def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
+        """See `ResumableRun.snapshot`."""
+        own = {name: getattr(self, name) for name in ("_images", "_before_start", "_start_problem", "_landmarks")}
+        return snapshot_of(self._odometry), {"own": own, "pairs": self._pairs.snapshot()}
+
+    def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
+        """See `ResumableRun.restore`."""
+        restore_odometry(self._odometry, odometry)
+        self._pairs.restore(run["pairs"])
+        vars(self).update(run["own"])
 
     def push(self, event: CameraEvent) -> list[Estimate]:
         """See `RunLoop.push`."""
@@ -129,8 +148,9 @@ class _Run(CameraRun[Estimate, DirectSummary]):
         self.status = estimate.status
         began = time.perf_counter()
         T, p = estimate.R_world_camera, estimate.p_world_camera
-        self._trajectory.append(estimate.time_ns, T, p, estimate.pose_covariance, estimate.status)
-        self._frames.append(estimate)
+        if self.is_new(estimate.time_ns):
+            self._trajectory.append(estimate.time_ns, T, p, estimate.pose_covariance, estimate.status)
+            self._frames.append(estimate)
         trouble = f"began with: {'; '.join(estimate.reasons)}"
         self.counts.add_estimate(estimate.time_ns, p, estimate.status, estimate.timing_s, trouble)
         for reason in estimate.reasons:

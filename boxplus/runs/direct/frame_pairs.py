@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -116,6 +116,14 @@ class FramePairs:
         self._first: deque[CameraImage] = deque()
         self._second: deque[CameraImage] = deque()
         self.rejected: Counter[str] = Counter()
+
+    def snapshot(self) -> dict[str, object]:
+        """The images that wait, and what was rejected; only to be read."""
+        return {name: value for name, value in vars(self).items() if name != "_cameras"}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a `snapshot`."""
+        vars(self).update(snapshot)
 
     def push(self, image: CameraImage) -> list[Frame]:
         """Take an image of one of the streams; returns the frames that are complete."""

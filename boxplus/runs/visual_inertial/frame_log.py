@@ -29,10 +29,11 @@ class FrameLogWriter(RowLogWriter):
 
     Args:
         path: the file.
+        go_on: after the rows of an earlier writer.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, FRAME_COLUMNS)
+    def __init__(self, path: Path, *, go_on: bool = False) -> None:
+        super().__init__(path, FRAME_COLUMNS, go_on=go_on)
 
     def append(self, estimate: VioEstimate, timing_s: Mapping[str, float]) -> None:
         """Write one row.

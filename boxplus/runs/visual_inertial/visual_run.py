@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -36,6 +36,7 @@ _TOLD = {
     "gravity, deviation [deg]": "gravity is known to {:.2f} deg",
     "scale, deviation [%]": "scale to {:.1f} %",
 }  # of the tests of a start; `run.json` has all of them
+_OWN_STATE = ("_images", "_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s")
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -51,6 +52,7 @@ def run_visual_odometry(
     config: VioRunConfig | None = None,
     *,
     overwrite: bool = False,
+    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     view: View | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -65,6 +67,7 @@ def run_visual_odometry(
         folder: created; see docs/output_folder.md for what it holds. Or what `claim_camera_folder` yields.
         config: settings; each has a default.
         overwrite: replace the results of an earlier run in the folder.
+        resume: go on with a run that was killed or interrupted, from its last checkpoint.
         progress: called after every event that was read.
         view: shown every frame, those before the start too.
         should_stop: asked between events; True ends the run in good order, with the state "interrupted".
@@ -74,7 +77,8 @@ def run_visual_odometry(
 
     Raises:
         InputError: the calibration or the IMU's noise is not known; the folder holds something else, or another process is
-            writing there; no start was found in the whole recording.
+            writing there; no start was found in the whole recording; nothing to resume, or a run over another recording or with
+            other settings.
         OutputError: the folder cannot be written or the disk is full; what was written before is intact.
         RecordingError: nothing could be read.
 
@@ -85,9 +89,11 @@ def run_visual_odometry(
     """
     config = config or VioRunConfig()
     run = folder if isinstance(folder, VioFolder) else VioFolder(Path(folder))
-    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite)
+    claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite, resume=resume)
     with claimed as vio_folder:
         run_of_recording = _Run(recording, vio_folder, config, progress or (lambda _: None), view)
+        if resume:
+            run_of_recording.resume()
         return run_of_recording.execute(should_stop or (lambda: False))
 
 
@@ -120,7 +126,18 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
         super().open(stack)
-        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames))
+        self._frames = stack.enter_context(FrameLogWriter(self._folder.frames, go_on=self.written_until_ns is not None))
+
+    def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
+        """See `ResumableRun.snapshot`."""
+        own = {name: getattr(self, name) for name in _OWN_STATE}
+        return self._odometry.snapshot(), {"own": own, "landmarks": vars(self._landmarks)}
+
+    def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
+        """See `ResumableRun.restore`."""
+        self._odometry.restore(odometry)
+        vars(self._landmarks).update(run["landmarks"])
+        vars(self).update(run["own"])
 
     def between_events(self) -> None:
         """See `RunLoop.between_events`."""
@@ -162,8 +179,9 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             return
         began = time.perf_counter()
         T, covariance = estimate.T_world_imu, estimate.covariance[:6, :6]
-        self._trajectory.append(estimate.time_ns, T[:3, :3], T[:3, 3], covariance, estimate.status)
-        self._frames.append(estimate, stages)
+        if self.is_new(estimate.time_ns):
+            self._trajectory.append(estimate.time_ns, T[:3, :3], T[:3, 3], covariance, estimate.status)
+            self._frames.append(estimate, stages)
         trouble = f"began with: {'; '.join(estimate.reasons)}"
         self.counts.add_estimate(estimate.time_ns, T[:3, 3], estimate.status, stages, trouble)
         if estimate.is_keyframe:

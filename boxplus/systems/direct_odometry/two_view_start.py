@@ -16,7 +16,8 @@ Zisserman, Multiple view geometry, 2nd edition, 11.4.3 (Sampson distance) and 9.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,14 +82,13 @@ class TwoViewStart:
     def __init__(self, camera: Pinhole) -> None:
         self._camera, self._tracker = camera, None  # type: tuple[Pinhole, FeatureTracker | None]
         self._reference: tuple[int, Image, Tracks] | None = None
+        self._shape: tuple[int, int] | None = None
         self.problem = "one image so far"
 
     def push(self, time_ns: int, image: Image) -> TwoViews | None:
         """The next image; returns a start when there is one."""
-        height, width = image.shape
         if self._tracker is None:
-            config = VioConfig(features=_CORNERS, cell_size=max(width // 24, 8))
-            self._tracker = FeatureTracker(config, Rig.of([self._camera], [np.eye(4)], [(width, height)]))
+            self._tracker = self._new_tracker(image.shape)
         tracks = self._tracker.track(time_ns, {0: image.grey}, np.eye(3))
         if self._reference is not None:
             found = self._judge(time_ns, image, tracks)
@@ -100,6 +100,23 @@ class TwoViewStart:
         else:
             self._reference = time_ns, image, tracks
         return None
+
+    def _new_tracker(self, shape: tuple[int, int]) -> FeatureTracker:
+        height, width = self._shape = shape
+        config = VioConfig(features=_CORNERS, cell_size=max(width // 24, 8))
+        return FeatureTracker(config, Rig.of([self._camera], [np.eye(4)], [(width, height)]))
+
+    def snapshot(self) -> dict[str, object]:
+        """All that `push` depends on beside the camera; only to be read."""
+        tracker = None if self._tracker is None else self._tracker.snapshot()
+        return {"problem": self.problem, "reference": self._reference, "shape": self._shape, "tracker": tracker}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a `snapshot`."""
+        self.problem, self._reference = snapshot["problem"], snapshot["reference"]
+        if snapshot["shape"] is not None:
+            self._tracker = self._new_tracker(snapshot["shape"])
+            self._tracker.restore(snapshot["tracker"])
 
     def _judge(self, time_ns: int, image: Image, tracks: Tracks) -> TwoViews | None:
         """Against the reference, which is forgotten when too little of it is left."""

@@ -121,6 +121,17 @@ class VisualInertialOdometry:
         """No more data will come: process what still waits."""
         return self._advance(final=True)
 
+    def snapshot(self) -> dict[str, object]:
+        """All that later estimates depend on beside config and rig, for `restore`; only to be read, before anything is pushed."""
+        own = {name: value for name, value in vars(self).items() if name not in ("config", "rig", "window", "_tracker")}
+        return {"own": own, "window": self.window.snapshot(), "tracker": self._tracker.snapshot()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from where another odometry with the same config and rig was: estimates are the same to the bit."""
+        vars(self).update(snapshot["own"])
+        vars(self.window).update(snapshot["window"])
+        self._tracker.restore(snapshot["tracker"])
+
     @property
     def counters(self) -> Mapping[str, int]:
         """What could not be used before it reached the window, by reason."""

@@ -34,6 +34,7 @@ _TEXTURED = 0.5  # share of the corners asked for; where fewer are found, noise 
 _BORDER = 8  # px within which no corner is kept
 _LEAST_SPREAD = 4.0  # grey values; an image with a smaller standard deviation shows nothing
 _FAR = 1e-3  # 1/m
+_GIVEN = ("_cv2", "_config", "_rig")
 _GUESSED = 4  # cv2.OPTFLOW_USE_INITIAL_FLOW
 
 Floats = NDArray[np.float64]
@@ -64,6 +65,10 @@ class Tracker(Protocol):
     def detect(self, tracks: Tracks) -> Tracks: ...
 
     def forget(self, ids: NDArray[np.int64]) -> None: ...
+
+    def snapshot(self) -> dict[str, object]: ...
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None: ...
 
 
 class FeatureTracker:
@@ -167,6 +172,14 @@ class FeatureTracker:
     def forget(self, ids: NDArray[np.int64]) -> None:
         """Follow these corners no longer: they move on their own, or were never corners."""
         self._keep(~np.isin(self._ids, ids))
+
+    def snapshot(self) -> dict[str, object]:
+        """All that `track` depends on beside config and rig; only to be read."""
+        return {name: value for name, value in vars(self).items() if name not in _GIVEN}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a `snapshot`."""
+        vars(self).update(snapshot)
 
     def _tracks(self, time_ns: int, fresh: NDArray[np.bool_], rejected: Counter[str], motion_px: float) -> Tracks:
         brightness, contrast = np.full((2, len(self._images)), np.nan)

@@ -50,6 +50,7 @@ _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
 _LEAST_RHO = 0.1  # 1/m, for what is not known to be nearer
 _RECUT_NS = 1_000_000
 SPARE_NS = 20_000_000  # of IMU samples on both sides of the intervals, where these follow the clocks' offset
+_GIVEN = ("_config", "_rig", "_noise", "_gravity", "_gauge")
 _BEHIND = -0.02  # 1/m, of a landmark that is not only far
 
 
@@ -115,6 +116,11 @@ class Window:
         self.problem.add_residuals(beginning(start), self.bodies[0], self.states[0], name="beginning")
         self._found_landmarks()
         self._founded = len(self._track)
+
+    def snapshot(self) -> dict[str, object]:
+        """All that the next frames depend on beside config and rig, for `vars` of another window; only to be read."""
+        self._disconnect()  # what `solve` connects anew
+        return {name: value for name, value in vars(self).items() if name not in _GIVEN}
 
     def predict(self, time_ns: int, imu: ImuSamples) -> tuple[Floats, Floats]:
         """Pose (7,) and [v, b_a, b_g] (9,) at a time, from the newest frame and the IMU."""
@@ -313,9 +319,12 @@ class Window:
             group, rows = self._views
             squares[rows] = self._creep.weight**2 * group.squares(values)
         bad = squares > threshold**2
-        if self._views is not None and self.frames[-1].is_keyframe:
-            self._note_creep(group, rows[~bad[rows]], ~bad[rows])
         newest = seen.frame == self.frames[-1].number
+        if self._views is not None and self.frames[-1].is_keyframe:
+            of_keyframes = np.isin(seen.frame[rows], [frame.number for frame in self.frames if frame.is_keyframe])
+            tells = of_keyframes & ~bad[rows] & (seen.camera[rows] == 0)
+            residuals, which = self._creep.weight * group.r[tells], rows[tells]
+            self._creep.note(residuals, seen.landmark[which], seen.frame[which], len(self._rig.cameras))
         first = newest & (seen.camera == 0)
         # A landmark without what its anchor saw, with nothing but that, or behind the camera, is none.
         row = self.points.rows_of(seen.landmark)
@@ -337,13 +346,6 @@ class Window:
         self._rho_sigma = self._inverse_depth_sigmas()
         self._remove_landmarks(gone)
         return fit
-
-    def _note_creep(self, group: Group, rows: NDArray[np.intp], fits: NDArray[np.bool_]) -> None:
-        """Take the residuals that fit, of the observations `rows`, for what they tell of the corners' walk."""
-        seen, keyframes = self._seen, [frame.number for frame in self.frames if frame.is_keyframe]
-        tells = (seen.camera[rows] == 0) & np.isin(seen.frame[rows], keyframes)
-        residuals, cameras = self._creep.weight * group.r[fits][tells], len(self._rig.cameras)
-        self._creep.note(residuals, seen.landmark[rows[tells]], seen.frame[rows[tells]], cameras)
 
     def _inverse_depth_sigmas(self) -> Floats:
         """(m,) of ρ of every landmark, from the information that the residuals just evaluated have about it."""
