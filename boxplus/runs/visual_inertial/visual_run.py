@@ -36,7 +36,7 @@ _TOLD = {
     "gravity, deviation [deg]": "gravity is known to {:.2f} deg",
     "scale, deviation [%]": "scale to {:.1f} %",
 }  # of the tests of a start; `run.json` has all of them
-_OWN_STATE = ("_images", "_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s")
+_OWN_STATE = ("_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s")
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -131,12 +131,13 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
     def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
         """See `ResumableRun.snapshot`."""
         own = {name: getattr(self, name) for name in _OWN_STATE}
-        return self._odometry.snapshot(), {"own": own, "landmarks": vars(self._landmarks)}
+        return self._odometry.snapshot(), {"own": own, "landmarks": vars(self._landmarks), "lines": vars(self._lines)}
 
     def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
         """See `ResumableRun.restore`."""
         self._odometry.restore(odometry)
         vars(self._landmarks).update(run["landmarks"])
+        vars(self._lines).update(run["lines"])
         vars(self).update(run["own"])
 
     def between_events(self) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
@@ -30,13 +31,14 @@ from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker, grey_8_bit, opencv
+from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker, opencv
 from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
 _TRY_EVERY_NS = 150_000_000  # a start in motion takes longer to look for than a frame lasts
 _OUTLIER = 4.0  # standard deviations
+_GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
 _LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
 
 
@@ -65,6 +67,7 @@ class VisualInertialOdometry:
         self.start_problem: str | None = None
         self.window = Window(self.config, self.rig)
         self._tracker = FeatureTracker(self.config, self.rig) if tracker is None else tracker
+        self._to_8_bits = EightBits()  # for lines; corners have their own
         self._line_tracker = line_tracker
         if self.config.lines and line_tracker is None:
             self._line_tracker = LineTracker(opencv(), self.rig, self.config.max_lines)
@@ -123,14 +126,17 @@ class VisualInertialOdometry:
 
     def snapshot(self) -> dict[str, object]:
         """All that later estimates depend on beside config and rig, for `restore`; only to be read, before anything is pushed."""
-        own = {name: value for name, value in vars(self).items() if name not in ("config", "rig", "window", "_tracker")}
-        return {"own": own, "window": self.window.snapshot(), "tracker": self._tracker.snapshot()}
+        own = {name: value for name, value in vars(self).items() if name not in _GIVEN}
+        lines = None if self._line_tracker is None else self._line_tracker.snapshot()
+        return {"own": own, "window": self.window.snapshot(), "tracker": self._tracker.snapshot(), "lines": lines}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from where another odometry with the same config and rig was: estimates are the same to the bit."""
         vars(self).update(snapshot["own"])
         vars(self.window).update(snapshot["window"])
         self._tracker.restore(snapshot["tracker"])
+        if self._line_tracker is not None:
+            self._line_tracker.restore(snapshot["lines"])
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -179,7 +185,7 @@ class VisualInertialOdometry:
         if is_keyframe:
             tracks = self._tracker.detect(tracks)
         if self._line_tracker is not None:
-            greys = {camera: grey_8_bit(image) for camera, image in images.items()}
+            greys = {camera: self._to_8_bits(image) for camera, image in images.items()}
             tracks = replace(tracks, lines=self._line_tracker.track(greys, R_before_now, p_before_now, wants_new=is_keyframe))
         self.window.add(tracks, pose, state, is_keyframe, self._imu)
         rests = self.window.rests()

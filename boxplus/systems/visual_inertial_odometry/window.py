@@ -9,6 +9,8 @@ Source: Demmel et al., Square root marginalization, ICCV 2021; Qin, Li and Shen,
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,10 +41,9 @@ from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax
 
 _HUBER = 1.5  # standard deviations
 _LEAVING = 2  # keyframes at most, for every one that is new
-_COST_TOLERANCE = 1e-3
 # A tilt of the whole window against the accelerometer's bias is 1e-8 of what the IMU knows from frame to frame, and decides
 # where it goes: more damping than that would hold it where it is, while the covariance says it is known.
-_DAMPING = 1e-10
+_SOLVER: dict[str, Any] = {"cost_tolerance": 1e-3, "initial_damping": 1e-10, "examine": False}
 
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
@@ -85,12 +86,10 @@ class Window:
             self.problem.fix(self.mountings)
         self.offset = self.problem.add_variables(Euclidean(1), [0.0], name="time offset")
         if config.time_offset_estimation:
-            clock = Prior(Euclidean(1), [0.0], sigma=config.time_offset_sigma)
-            self.problem.add_residuals(clock, self.offset, name="clock")
+            self.problem.add_residuals(Prior(Euclidean(1), [0.0], sigma=config.time_offset_sigma), self.offset, name="clock")
         else:
             self.problem.fix(self.offset)
-        self.cut_ns = 0
-        self.gap_s = 0.0
+        self.cut_ns, self.gap_s = 0, 0.0
         self._gauge = world_gauge({self.bodies: "world_from_body", self.states: "velocity_first"}, rotation="yaw")
         self.leak: Leak | None = None
         self.covariance = np.zeros((15, 15))
@@ -119,7 +118,8 @@ class Window:
 
     def snapshot(self) -> dict[str, object]:
         """All that the next frames depend on beside config and rig, for `vars` of another window; only to be read."""
-        self._disconnect()  # what `solve` connects anew
+        self._disconnect()
+        self.lines.disconnect()
         return {name: value for name, value in vars(self).items() if name not in _GIVEN}
 
     def predict(self, time_ns: int, imu: ImuSamples) -> tuple[Floats, Floats]:
@@ -160,8 +160,8 @@ class Window:
 
     def _add(self, tracks: Tracks, pose: Floats, state: Floats, is_keyframe: bool, imu: ImuSamples) -> None:
         if self.frames:
-            is_known = self._next is not None and self._next[0] == tracks.time_ns
-            step = self._next[1] if is_known and self._next is not None else self._step(tracks.time_ns, imu)
+            known = self._next if self._next is not None and self._next[0] == tracks.time_ns else None
+            step = self._step(tracks.time_ns, imu) if known is None else known[1]
             self._next = None
             self._imu = step if self._imu is None else self._imu.append(step)
             self.gap_s = float(step.longest_gap_s[0])
@@ -184,10 +184,8 @@ class Window:
         """The velocity of the newest frame is zero, as far as corners that stand still say."""
         depth = float(np.median(1.0 / np.maximum(self.points.values[:, 2], _LEAST_RHO))) if len(self.points) else 1.0 / _LEAST_RHO
         sigma = _REST_PX / self._rig.cameras[0].model.fx * depth / (1e-9 * _REST_NS)
-        information = np.zeros((9, 9))
-        information[range(3), range(3)] = 1.0 / sigma**2
+        zero = Prior(Euclidean(9), np.zeros(9), information=np.diag(np.repeat([sigma**-2, 0.0], [3, 6])))
         number = self.frames[-1].number
-        zero = Prior(Euclidean(9), np.zeros(9), information=information)
         self.problem.add_residuals(zero, self.states[number], name=f"rest {number}")
 
     def _found_landmarks(self) -> None:
@@ -256,21 +254,17 @@ class Window:
         self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
         self.lines.connect(self.bodies, self.mountings)
-        most = self._config.max_iterations if max_iterations is None else max_iterations
-        solution = self.problem.solve(
-            max_iterations=most, cost_tolerance=_COST_TOLERANCE, initial_damping=_DAMPING, examine=False
-        )
+        solution = self.problem.solve(max_iterations=max_iterations or self._config.max_iterations, **_SOLVER)
         self.problem.set_values(solution)
         number = self.frames[-1].number
         self.covariance = self._creep.factor * covariance_of(solution, self.bodies[number], self.states[number])
 
-    def _connect(self, observations: NDArray[np.intp], intervals: int) -> None:
+    def _connect(self, rows: NDArray[np.intp], intervals: int) -> None:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""
         self._disconnect()
         seen = self._seen
         anchor = self._anchor[self.points.rows_of(seen.landmark)]
-        if len(observations):
-            rows = observations
+        if len(rows):
             models = [mounted.model for mounted in self._rig.cameras]
             camera, sigma = seen.camera[rows], self._config.pixel_sigma * self._creep.weight
             group = self.problem.add_residuals(

@@ -23,6 +23,7 @@ from boxplus.simulation.cameras import make_rig, simulate_cameras, write_camera_
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
 VIO = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})
 VO = DirectRunConfig.model_validate({"odometry": {"patches": 200}})
+LINES = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100, "lines": True}})
 MONO = DirectRunConfig.model_validate({"odometry": {"patches": 200}, "streams": {"mono": True}})
 Runner = Callable[..., Any]
 
@@ -45,6 +46,7 @@ def run(runner: Runner, config: Any, recorded: Path, folder: Path, events: int |
     ("runner", "config", "stops"),
     [
         (run_visual_odometry, VIO, (15, 50)),  # before the start was found, and after it
+        (run_visual_odometry, LINES, (75,)),
         (run_direct_odometry, VO, (60,)),
         (run_direct_odometry, MONO, (72, 17)),  # while the first two views are looked for, and from them on
     ],

@@ -44,6 +44,10 @@ class LineFollower(Protocol):
 
     def forget(self, ids: NDArray[np.int64]) -> None: ...
 
+    def snapshot(self) -> dict[str, object]: ...
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None: ...
+
 
 class LineTracker:
     """Follows lines through the images of a rig.
@@ -134,6 +138,14 @@ class LineTracker:
         self._sign, self._steepness = np.append(self._sign, sign), np.append(self._steepness, steepness)
         self._profiles = np.concatenate([self._profiles, np.zeros((count, *self._profiles.shape[1:]))])
         self._see(grey, fresh)
+
+    def snapshot(self) -> dict[str, object]:
+        """All that `track` depends on beside the rig; only to be read."""
+        return {name: value for name, value in vars(self).items() if name not in ("_cv2", "_rig", "_detector")}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a `snapshot`."""
+        vars(self).update(snapshot)
 
     def forget(self, ids: NDArray[np.int64]) -> None:
         """Follow these lines no longer."""
