@@ -70,5 +70,8 @@ class CornerCreep:
         self._most = _MEMORY * self._most + [(n * n + 1.0).sum(), len(n)]
         one, pairs, two, others = self._sums
         if min(pairs, others) >= 2 * _ENOUGH:
-            q = max(two / others - one / pairs, 0.0) / _LEFT
+            near, far = one / pairs, two / others
+            # Less twice what chance gives: independent errors are not to be taken for a walk by what one window happens to show.
+            by_chance = 2.0 * float(np.sqrt(2.0 * near**2 / max(sums[1], 1) + 2.0 * far**2 / max(sums[3], 1)))
+            q = max(far - near - by_chance, 0.0) / _LEFT
             self.factor = float(np.sqrt(1.0 + cameras * self._most[0] / self._most[1] / 10.0 * q))
