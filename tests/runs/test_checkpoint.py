@@ -123,7 +123,7 @@ def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected the settings that the run began with \(.*: 0.15.*– got .*scan_voxel: 0.3"):
         run_odometry(walk(), out, load_run_config(settings=["scan_voxel=0.3"]), resume=True)
     (out / "trajectory.tum").write_text("")
-    with pytest.raises(InputError, match=r"expected the \d+ scans of the checkpoint in trajectory and scan log – got 0"):
+    with pytest.raises(InputError, match=r"expected the \d+ rows of the checkpoint in trajectory and scans.csv – got 0"):
         run_odometry(walk(), out, resume=True)
     (out / "checkpoint.npz").write_bytes((out / "checkpoint.npz").read_bytes()[:-100])
     with pytest.raises(InputError, match="expected the checkpoint of a run, of this version of boxplus"):
@@ -142,7 +142,7 @@ def test_checkpoints_come_less_often_where_they_take_long(tmp_path: Path, monkey
     monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: next(now))
     monkeypatch.setattr(checkpoint, "write_state", lambda path, state: None)
     writer = checkpoint.CheckpointWriter(tmp_path / "checkpoint.npz")
-    writer.write(checkpoint.Checkpoint({}, 0, 0, 0, RunStatistics(), {}))
+    writer.write(checkpoint.Checkpoint({}, 0, 0, RunStatistics(), {}, {}))
     assert not writer.is_due  # 38 s after one that took 2 s
     assert writer.is_due
 
