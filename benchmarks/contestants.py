@@ -22,6 +22,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 
 Event = Scan | ImuSamples
 MAX_RANGE = 200.0
@@ -51,7 +52,7 @@ class Boxplus:
     """Ours; a scan's seconds are those of every call since the estimate before, IMU samples included."""
 
     def __init__(self, config: LioConfig, clock: Callable[[], float] = time.process_time) -> None:
-        self.odometry = LidarInertialOdometry(config)
+        self.odometry: LidarInertialOdometry | LidarOdometry = LidarInertialOdometry(config)
         self._clock = clock
         self.seconds: list[float] = []
         self.time_ns: list[int] = []
@@ -79,6 +80,21 @@ class Boxplus:
             self.time_ns.append(estimate.time_ns)
             self.T_world_imu.append(estimate.T_world_imu)
             self.status.append(estimate.status)
+        return estimates
+
+
+class BoxplusAlone(Boxplus):
+    """Ours without an IMU; what it finds is the pose of the LiDAR."""
+
+    def __init__(self, T_imu_lidar: NDArray[np.float64], clock: Callable[[], float] = time.process_time) -> None:
+        super().__init__(LioConfig(), clock)
+        self.odometry = LidarOdometry()
+        self._T_lidar_imu = np.linalg.inv(T_imu_lidar)
+
+    def _note(self, estimates: list[Estimate]) -> list[Estimate]:
+        super()._note(estimates)
+        for k in range(len(self.T_world_imu) - len(estimates), len(self.T_world_imu)):
+            self.T_world_imu[k] = self.T_world_imu[k] @ self._T_lidar_imu
         return estimates
 
 

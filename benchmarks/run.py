@@ -82,6 +82,7 @@ BENCHMARKS = {
     "map_dynamic": Benchmark(("--batches", "100"), map_dynamic_metrics, ("--modes", "incremental")),
     "scan": Benchmark(("--rounds", "1", "--duration", "8")),
     "recordings": Benchmark(("--rounds", "1", "--only", "v103_velodyne")),
+    "lidar_alone": Benchmark(("--only", "v103_velodyne")),
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
     "memory": Benchmark(("--minutes", "3")),
     "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),

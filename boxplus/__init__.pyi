@@ -76,6 +76,7 @@ from .systems.direct_odometry.direct_odometry import DirectOdometry as DirectOdo
 from .systems.lidar_inertial_odometry.config import LioConfig as LioConfig
 from .systems.lidar_inertial_odometry.estimate import Estimate as Estimate
 from .systems.lidar_inertial_odometry.odometry import LidarInertialOdometry as LidarInertialOdometry
+from .systems.lidar_odometry.odometry import LidarOdometry as LidarOdometry
 from .systems.pose_graph.pose_graph import PoseGraphConfig as PoseGraphConfig
 from .systems.pose_graph.pose_graph import optimize_pose_graph as optimize_pose_graph
 from .systems.visual_inertial_odometry.config import VioConfig as VioConfig

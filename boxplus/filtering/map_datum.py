@@ -20,6 +20,7 @@ The local map is what has been taken in within about one lever arm of the points
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,34 @@ from boxplus.filtering.nav_state import MEASURED, P, R
 
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What a scan has done to the pose.
+
+    Attributes:
+        gain: (6, 6) G, how the pose follows a shift of the scan against the map.
+        noise: (6, 6) covariance of the pose from the noise of the points.
+        alone: (6, 6) covariance of the pose from the points alone, zero along directions they do not determine.
+        lever_arm: root mean square distance of the points [m].
+    """
+
+    gain: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    alone: NDArray[np.float64]
+    lever_arm: float
+
+    @classmethod
+    def of(cls, cov: NDArray[np.float64], A: NDArray[np.float64], directions: PoseDirections) -> Correction:
+        """Of a filter.
+
+        Args:
+            cov: (24, 24) after the scan.
+            A: (12, 12) information of the scan as the filter took it, with the directions of the pose it determines.
+        """
+        gain = cov[_POSE][:, MEASURED] @ A
+        return cls(gain[:, _POSE], gain @ cov[MEASURED][:, _POSE], strong_covariance(A, directions), directions.lever_arm)
 
 
 class MapDatum:
@@ -53,15 +82,13 @@ class MapDatum:
         x: NDArray[np.float64],
         cov_prior: NDArray[np.float64],
         cov: NDArray[np.float64],
-        A: NDArray[np.float64] | None = None,
-        directions: PoseDirections | None = None,
+        correction: Correction | None = None,
     ) -> None:
         """The filter has gone on by a scan.
 
         Args:
-            x: (36,) posterior; cov_prior, cov: (24, 24), covariance of the filter before and after the scan.
-            A: (12, 12) information of the scan as the filter took it, with the directions of the pose it determines; None if
-                the filter took none.
+            x: (36,) posterior; cov_prior, cov: (n, n), covariance of the filter before and after the scan, the pose first.
+            correction: by the scan; None if the filter took none.
         """
         shift = x[P : P + 3] - self._p_world_imu
         move = np.eye(6)  # a small motion about the last position, as one about this position
@@ -70,16 +97,15 @@ class MapDatum:
         joint = both @ self._joint @ both.T
         prior = _along_world(cov_prior[_POSE, _POSE], x)
         joint[_POSE, _POSE] += _positive(prior - move @ self._filter @ move.T)
-        if A is not None and directions is not None:
-            joint[_MAP, _MAP] += self._shared * self._new_share * _along_world(strong_covariance(A, directions), x)
+        if correction is not None:
+            joint[_MAP, _MAP] += self._shared * self._new_share * _along_world(correction.alone, x)
             self._new_share = 0.0
-            self._local_points *= math.exp(-float(np.linalg.norm(shift)) / directions.lever_arm)
-            gain = cov[_POSE][:, MEASURED] @ A
+            self._local_points *= math.exp(-float(np.linalg.norm(shift)) / correction.lever_arm)
             step = np.eye(12)
-            step[_POSE, _MAP] = _along_world(gain[:, _POSE], x)
+            step[_POSE, _MAP] = _along_world(correction.gain, x)
             step[_POSE, _POSE] -= step[_POSE, _MAP]
             joint = step @ joint @ step.T
-            joint[_POSE, _POSE] += self._shared * _along_world(gain @ cov[MEASURED][:, _POSE], x)
+            joint[_POSE, _POSE] += self._shared * _along_world(correction.noise, x)
         self._joint, self._filter, self._p_world_imu = joint, _along_world(cov[_POSE, _POSE], x), x[P : P + 3].copy()
 
     def insert(self, points: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class PlaneMeasurement:
     """One scan against one map; keeps neighbours and planes from iteration to iteration.
 
     Args:
-        p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame.
+        p_lidar: (n, 3) float32, motion-compensated points, LiDAR frame; who knows the motion better moves them in place.
         tree: the map, which must not change while the measurement lives.
         config: noise, gates and threads.
         with_extrinsic: whether the extrinsic is measured.
@@ -97,6 +97,23 @@ class PlaneMeasurement:
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         return Information(A * self._weight, b * self._weight, self._directions, used, rms)
+
+    def in_parts(
+        self, x: NDArray[np.float64], bounds: Sequence[int], *, rematch: bool
+    ) -> tuple[Information, NDArray[np.float64], NDArray[np.float64]]:
+        """The same, with what each of successive parts of the points says: A (m, 12, 12) and b (m, 12).
+
+        Args:
+            bounds: (m + 1,) the first point of each part, and the number of points.
+        """
+        whole = self.at(x, rematch=rematch)
+        sums = [
+            self._sums(x, self._p_lidar[begin:end], self._planes[begin:end], self._fate[begin:end], criterion=False)
+            for begin, end in zip(bounds[:-1], bounds[1:], strict=True)
+        ]
+        A, b = np.array([part[0] for part in sums]), np.array([part[1] for part in sums])
+        A += np.swapaxes(np.triu(A, 1), 1, 2)
+        return whole, A * self._weight, b * self._weight
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""

@@ -12,7 +12,7 @@ from boxplus.recordings import point_time
 from boxplus.recordings.clouds import cloud_layout, view_points
 from boxplus.recordings.container import Channel, Container, interval, share
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
-from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
+from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
 from boxplus.recordings.messages import (
     CloudMessage,
     MalformedMessageError,
@@ -21,7 +21,7 @@ from boxplus.recordings.messages import (
     parse_point_cloud,
     parse_transforms,
 )
-from boxplus.recordings.options import RecordingOptions, check_start
+from boxplus.recordings.options import NO_IMU, AccelUnit, GyroUnit, RecordingOptions, check_start
 from boxplus.recordings.transforms import Transform, chain
 
 CLOUD_PARSERS = {
@@ -73,7 +73,10 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
     lidar = _choose_lidar(clouds, cloud_probes, options)
     probe = cloud_probes[lidar.topic]
     evidence.append(_chosen("lidar_topic", lidar, [c for c in channels if c.type in CLOUD_PARSERS], options.lidar_topic))
-    evidence.append(_chosen("imu_topic", imu, [c for c in channels if c.type == IMU_TYPE], options.imu_topic))
+    if imu is None:
+        evidence.append(no_imu(options.imu_topic is not None))
+    else:
+        evidence.append(_chosen("imu_topic", imu, [c for c in channels if c.type == IMU_TYPE], options.imu_topic))
 
     if not probe.seen:
         raise RecordingError(
@@ -81,12 +84,15 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
             f"none that can be read in the first seconds{f' ({probe.complaint})' if probe.complaint else ''}",
             "choose another --lidar-topic or convert the recording to sensor_msgs/PointCloud2",
         )
-    if not imu_probe.time_ns:
-        raise RecordingError(
-            f"IMU messages on {imu.topic}", "none that can be read in the first seconds", "choose another --imu-topic"
-        )
-    delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns)
-    evidence.append(_clocks(_delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns) - delay))
+    lidar_delay = _delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns)
+    delay: float | None = None
+    if imu is not None:
+        if not imu_probe.time_ns:
+            raise RecordingError(
+                f"IMU messages on {imu.topic}", "none that can be read in the first seconds", "choose another --imu-topic"
+            )
+        delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns)
+        evidence.append(_clocks(lidar_delay - delay))
     reading = PointTimeReading(None, "ns", "scan_start", "stamp")
     name = point_time.choose_time_field(probe.fields, probe.time_fields, options)
     if name is not None:
@@ -95,20 +101,25 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
     else:
         text = "every point is taken at the stamp of its scan, as asked for: motion within a scan is not corrected"
         evidence.append(Evidence("point_time_field", "none", "warning", text))
-    gyro, accel = np.array(imu_probe.gyro), np.array(imu_probe.accel)
-    accel_unit, accel_evidence = read_accel_unit(accel, options)
-    gyro_unit, gyro_evidence = read_gyro_unit(gyro, options)
-    evidence += [gyro_evidence, accel_evidence]
-    T_imu_lidar, source, found_extrinsic = _extrinsic(container, transforms, imu_probe.frame, probe.frame)
-    evidence.append(found_extrinsic)
+    gyro_unit: GyroUnit = "rad/s"
+    accel_unit: AccelUnit = "m/s2"
+    T_imu_lidar, source = None, ""
+    if imu is not None:
+        gyro, accel = np.array(imu_probe.gyro), np.array(imu_probe.accel)
+        accel_unit, accel_evidence = read_accel_unit(accel, options)
+        gyro_unit, gyro_evidence = read_gyro_unit(gyro, options)
+        evidence += [gyro_evidence, accel_evidence]
+        T_imu_lidar, source, found_extrinsic = _extrinsic(container, transforms, imu_probe.frame, probe.frame)
+        evidence.append(found_extrinsic)
+    messages = lidar.count + (0 if imu is None else imu.count)
     return RecordingInfo(
         path=path,
         format=container.format,
         topics=[Topic(channel.topic, channel.type, channel.count) for channel in container.channels],
         duration_s=(container.end_ns - container.start_ns) * 1e-9,
-        message_count=round((lidar.count + imu.count) * share(container, options.start_s, options.duration_s)),
+        message_count=round(messages * share(container, options.start_s, options.duration_s)),
         lidar_topic=lidar.topic,
-        imu_topic=imu.topic,
+        imu_topic=imu.topic if imu is not None else "",
         lidar_frame=probe.frame,
         imu_frame=imu_probe.frame,
         point_time=reading,
@@ -145,7 +156,10 @@ def _listed(channels: list[Channel]) -> str:
     return ", ".join(f"{channel.topic} [{channel.type}, {channel.count}]" for channel in channels) or "none"
 
 
-def _choose_imu(channels: list[Channel], options: RecordingOptions) -> Channel:
+def _choose_imu(channels: list[Channel], options: RecordingOptions) -> Channel | None:
+    """The IMU in use; None where there is none, or none is wanted."""
+    if options.imu_topic == NO_IMU:
+        return None
     found = [channel for channel in channels if channel.type == IMU_TYPE]
     if options.imu_topic is not None:
         found = [channel for channel in found if channel.topic == options.imu_topic]
@@ -153,13 +167,9 @@ def _choose_imu(channels: list[Channel], options: RecordingOptions) -> Channel:
             raise RecordingError(
                 f"IMU messages ({IMU_TYPE}) on {options.imu_topic}", f"topics {_listed(channels)}", "choose another --imu-topic"
             )
-    if not found:
-        raise RecordingError(
-            f"an IMU topic ({IMU_TYPE})", f"topics {_listed(channels)}", "record the IMU too: LiDAR-inertial odometry needs both"
-        )
     if len(found) > 1:
         raise AmbiguityError("one IMU topic", f"several: {_listed(found)}", "choose one with --imu-topic")
-    return found[0]
+    return found[0] if found else None
 
 
 def _cloud_candidates(channels: list[Channel], options: RecordingOptions) -> list[Channel]:
@@ -202,7 +212,7 @@ def _chosen(key: str, chosen: Channel, candidates: list[Channel], given: str | N
 
 
 def _probe(
-    container: Container, clouds: list[Channel], imu: Channel, options: RecordingOptions
+    container: Container, clouds: list[Channel], imu: Channel | None, options: RecordingOptions
 ) -> tuple[dict[str, _CloudProbe], _ImuProbe, list[Transform]]:
     """Read the first seconds: extents of the point times, IMU samples, static transforms."""
     probes = {channel.topic: _CloudProbe() for channel in clouds}
@@ -210,16 +220,17 @@ def _probe(
     transforms: list[Transform] = []
     static = frozenset(c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static"))
     start_ns, stop_ns = interval(container, options.start_s, options.duration_s)
+    topics = {*probes, *static, *([] if imu is None else [imu.topic])}
     first_ns: int | None = None
-    for channel, received_ns, data in container.messages(frozenset(probes) | {imu.topic} | static, start_ns, stop_ns):
+    for channel, received_ns, data in container.messages(frozenset(topics), start_ns, stop_ns):
         first_ns = received_ns if first_ns is None else first_ns
-        enough = samples.time_ns and all(probe.seen >= 3 or probe.complaint for probe in probes.values())
+        enough = (imu is None or samples.time_ns) and all(probe.seen >= 3 or probe.complaint for probe in probes.values())
         if received_ns - first_ns > (_PROBE_NS if enough else 10 * _PROBE_NS):
             break
         try:
             if channel.type in TRANSFORM_TYPES:
                 transforms += parse_transforms(data, channel.encoding)
-            elif channel.topic == imu.topic:
+            elif imu is not None and channel.topic == imu.topic:
                 stamp_ns, frame, gyro, accel = parse_imu(data, channel.encoding)
                 samples.time_ns.append(stamp_ns)
                 samples.received_ns.append(received_ns)

@@ -65,6 +65,13 @@ class PointTimeReading:
     anchor: Literal["stamp", "first", "last", "clock"]
 
 
+def no_imu(given: bool) -> Evidence:
+    """What is said of a recording without an IMU, or one that is to be read without it."""
+    why = "left out, as asked for" if given else "the recording holds none"
+    text = f"{why}: odometry of the LiDAR alone, in a world that does not know where down is"
+    return Evidence("imu_topic", "none", "ok" if given else "warning", text)
+
+
 @dataclass(slots=True)
 class RecordingInfo:
     """What a recording contains and how it is read.
@@ -75,7 +82,7 @@ class RecordingInfo:
         topics: all streams found.
         duration_s: time between the first and the last message [s].
         message_count: messages that will be read (LiDAR and IMU).
-        lidar_topic, imu_topic: the streams in use.
+        lidar_topic, imu_topic: the streams in use; no IMU takes part where the latter is empty.
         lidar_frame, imu_frame: the names of their frames, empty when the format has none.
         point_time: how point times are read.
         gyro_unit, accel_unit: units in the recording (samples are delivered in SI units).

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, Verdict
-from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions, check_start
+from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, Verdict, no_imu
+from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -42,37 +42,34 @@ class SensorFiles:
 
 
 def open_kitti(path: Path, options: RecordingOptions) -> Recording:
-    """Open a KITTI raw drive: the folder that holds `velodyne_points` and `oxts`.
+    """Open a KITTI raw drive: the folder that holds `velodyne_points` and, with an IMU, `oxts`.
 
     Raises:
         RecordingError: a sensor or its times are missing, or the times cannot be read.
     """
     scans = _scan_files(path / "velodyne_points", options)
-    imu = sensor_files(path / "oxts", ".txt")
-    first = int(min(scans.start_ns.min(), imu.time_ns.min()))
-    last = int(max(scans.end_ns.max(), imu.time_ns.max()))
+    imu = None if options.imu_topic == NO_IMU or not (path / "oxts").is_dir() else sensor_files(path / "oxts", ".txt")
+    times = np.concatenate([scans.start_ns, scans.end_ns, *([] if imu is None else [imu.time_ns])])
+    first, last = int(times.min()), int(times.max())
     check_start(options.start_s, (last - first) * 1e-9)
-    T_imu_lidar, source = _calibration(path)
+    T_imu_lidar, source = (None, "") if imu is None else _calibration(path)
     evidence = [_point_time_evidence(scans, options, path / "velodyne_points")]
     for name, files in (("velodyne_points", scans), ("oxts", imu)):
-        if files.missing:
+        if files is not None and files.missing:
             text = f"{files.missing} of the {files.missing + len(files.paths)} times in {name} have no data file: these are gaps"
             evidence.append(Evidence("file", "incomplete", "warning", text))
-    rate = (len(imu.time_ns) - 1) / max((imu.time_ns.max() - imu.time_ns.min()) * 1e-9, 1e-9)
-    if rate < 50:
-        text = f"{rate:.1f} Hz (a synchronised drive): the unsynchronised 'extract' drives have 100 Hz"
-        evidence.append(Evidence("imu_rate", f"{rate:.1f} Hz", "warning", text))
-    found: Verdict = "ok" if source else "warning"
-    text = f"from {source}" if source else f"no {_CALIBRATION} in, beside or above the drive: give --T-imu-lidar"
-    evidence.append(Evidence("T_imu_lidar", source or "unknown", found, text))
+    if imu is None:
+        evidence.append(no_imu(options.imu_topic == NO_IMU))
+    else:
+        evidence += _imu_evidence(imu, source)
     info = RecordingInfo(
         path=path,
         format="KITTI raw folder",
-        topics=[Topic("velodyne_points", "Velodyne HDL-64E", len(scans.paths)), Topic("oxts", "OXTS RT3003", len(imu.paths))],
+        topics=[Topic("velodyne_points", "Velodyne HDL-64E", len(scans.paths)), *_imu_topic(imu)],
         duration_s=(last - first) * 1e-9,
-        message_count=len(scans.paths) + len(imu.paths),
+        message_count=len(scans.paths) + (len(imu.paths) if imu is not None else 0),
         lidar_topic="velodyne_points",
-        imu_topic="oxts",
+        imu_topic="" if imu is None else "oxts",
         lidar_frame="velodyne",
         imu_frame="imu",
         point_time=PointTimeReading(None if options.point_time_field == NO_POINT_TIME else "azimuth", "ns", "absolute", "clock"),
@@ -89,6 +86,22 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
         return _events(scans, imu, options, start_ns, stop_ns, tally)
 
     return Recording(info, read, lambda: None)
+
+
+def _imu_topic(imu: SensorFiles | None) -> list[Topic]:
+    return [] if imu is None else [Topic("oxts", "OXTS RT3003", len(imu.paths))]
+
+
+def _imu_evidence(imu: SensorFiles, source: str) -> list[Evidence]:
+    """The IMU's rate where it is low, and where its mounting comes from."""
+    evidence = []
+    rate = (len(imu.time_ns) - 1) / max((imu.time_ns.max() - imu.time_ns.min()) * 1e-9, 1e-9)
+    if rate < 50:
+        text = f"{rate:.1f} Hz (a synchronised drive): the unsynchronised 'extract' drives have 100 Hz"
+        evidence.append(Evidence("imu_rate", f"{rate:.1f} Hz", "warning", text))
+    found: Verdict = "ok" if source else "warning"
+    text = f"from {source}" if source else f"no {_CALIBRATION} in, beside or above the drive: give --T-imu-lidar"
+    return [*evidence, Evidence("T_imu_lidar", source or "unknown", found, text)]
 
 
 def read_times(file: Path) -> NDArray[np.int64]:
@@ -231,15 +244,19 @@ def rigid_transform(values: dict[str, NDArray[np.float64]], file: Path, R: str =
 
 
 def _events(
-    scans: SensorFiles, imu: SensorFiles, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally
+    scans: SensorFiles, imu: SensorFiles | None, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally
 ) -> Iterator[Event]:
     lidar_order = ((int(end), 1, index) for index, end in enumerate(scans.end_ns))
-    imu_order = ((int(time), 0, index) for index, time in enumerate(imu.time_ns))
+    imu_order = ((int(time), 0, index) for index, time in enumerate(imu.time_ns if imu is not None else ()))
     for received_ns, is_scan, index in heapq.merge(imu_order, lidar_order):
         tally.done += 1
         if not start_ns <= received_ns < stop_ns:
             continue
-        event = _read_scan(scans, index, options, tally) if is_scan else _read_imu(imu, index, tally)
+        event: Event | None = None
+        if is_scan:
+            event = _read_scan(scans, index, options, tally)
+        elif imu is not None:
+            event = _read_imu(imu, index, tally)
         if event is not None:
             yield event
 

@@ -16,6 +16,9 @@ AccelUnit = Literal["m/s2", "g"]
 NO_POINT_TIME = "none"
 """Value of `point_time_field` for scans without point times: every point is taken at the stamp of its message."""
 
+NO_IMU = "none"
+"""Value of `imu_topic` for a LiDAR alone: samples of an IMU are left out."""
+
 
 class RecordingOptions(BaseModel):
     """How to read a recording. None means: find it from the data, and refuse when two readings fit.
@@ -26,7 +29,7 @@ class RecordingOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     lidar_topic: str | None = Field(default=None, description="topic of the LiDAR (bags only)")
-    imu_topic: str | None = Field(default=None, description="topic of the IMU (bags only)")
+    imu_topic: str | None = Field(default=None, description="topic of the IMU (bags only); 'none': the LiDAR alone, without one")
     point_time_field: str | None = Field(
         default=None,
         description="name of the cloud's field with the time of each point; 'none' takes all points at the message's stamp",

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.container import READ_ERRORS
-from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
-from boxplus.recordings.options import RecordingOptions, check_start
+from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
+from boxplus.recordings.options import NO_IMU, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -131,8 +131,9 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
         Evidence("point_time_reference", "absolute", "ok", "times of the columns in the sensor's clock, shared with its IMU"),
         Evidence("T_imu_lidar", source, "ok", "points are in the sensor's frame; imu_to_sensor_transform gives the IMU in it"),
     ]
-    if not counts["imu"]:
-        evidence.append(Evidence("imu_topic", "none", "error", "no IMU packets: capture the sensor's IMU port (7503) too"))
+    with_imu = counts["imu"] > 0 and options.imu_topic != NO_IMU
+    if not with_imu:
+        evidence.append(no_imu(options.imu_topic == NO_IMU))
     info = RecordingInfo(
         path=path,
         format=f"Ouster pcap ({sensor.prod_line})",
@@ -140,7 +141,7 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
         duration_s=(last_ns - first_ns) * 1e-9,
         message_count=sum(counts.values()),
         lidar_topic="lidar packets",
-        imu_topic="imu packets" if counts["imu"] else "",
+        imu_topic="imu packets" if with_imu else "",
         lidar_frame="os_sensor",
         imu_frame="os_imu",
         point_time=_IN_THE_SENSOR,
@@ -159,7 +160,8 @@ def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recor
             tally.done += 1
             received_ns = int(packet.host_timestamp)
             if isinstance(packet, core.ImuPacket):
-                yield received_ns, _ouster_imu(packet)
+                if with_imu:
+                    yield received_ns, _ouster_imu(packet)
             elif batcher.batch(packet, frame):
                 yield received_ns, _ouster_scan(frame, table, options)
                 frame = core.LidarFrame(sensor)
@@ -210,11 +212,10 @@ def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
         )
     check_start(options.start_s, stamps[1] - stamps[0])
     evidence = [
-        Evidence("imu_topic", "none", "error", "a Velodyne capture holds no IMU: for odometry, record both in one bag"),
+        no_imu(options.imu_topic == NO_IMU),
         Evidence(
             "point_time_reference", "scan_start", "ok", "firing times of the packets, from the reception of the first of a scan"
         ),
-        Evidence("T_imu_lidar", "unknown", "warning", "the capture says nothing about an IMU: give --T-imu-lidar"),
     ]
     info = RecordingInfo(
         path=path,

@@ -47,12 +47,13 @@ def _body(data: RunData) -> str:
         )
     )
     parts.append(figure_section("Timing", _timing_text(data), figures.timing(data), _stage_table(data)))
-    parts.append(figure_section("Velocity", "Of the IMU, along the world's axes.", figures.velocity(data)))
+    body = "IMU" if data.summary.has_imu else "LiDAR"
+    parts.append(figure_section("Velocity", f"Of the {body}, along the world's axes.", figures.velocity(data)))
     parts.append(figure_section("Uncertainty", "Standard deviations of the pose.", figures.sigmas(data)))
-    parts.append(figure_section("Biases", "With one standard deviation.", figures.biases(data)))
-    parts.append(
-        figure_section("Gravity", "Magnitude, and the change of its direction since the first estimate.", figures.gravity(data))
-    )
+    if data.summary.has_imu:
+        text = "Magnitude, and the change of its direction since the first estimate."
+        parts.append(figure_section("Biases", "With one standard deviation.", figures.biases(data)))
+        parts.append(figure_section("Gravity", text, figures.gravity(data)))
     parts.append(_extrinsic(data))
     text = "Points of a scan after the voxel filter, and the root mean square distance of the used ones from their planes."
     parts.append(figure_section("Points", text, figures.points(data)))
@@ -132,6 +133,8 @@ def _stage_table(data: RunData) -> str:
 
 def _extrinsic(data: RunData) -> str:
     facts = data.summary.extrinsic
+    if not data.summary.has_imu:
+        return f"<section><h2>Extrinsic</h2><p>{escape(facts.text)}.</p></section>"
     estimation = {"off": "kept as it was", "on": "refined throughout", "gated": "refined while the motion made it observable"}
     matrices = f"<td><pre>{matrix_text(facts.T_imu_lidar_start)}</pre></td>"
     if facts.T_imu_lidar_end is not None and facts.estimation != "off":

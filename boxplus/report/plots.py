@@ -25,14 +25,16 @@ _HEADROOM_M = 1.0
 
 
 def write_plots(data: RunData) -> None:
-    """Write the pictures to `plots/` in the run's folder: trajectory, status, timing, biases.
+    """Write the pictures to `plots/` in the run's folder: trajectory, status, timing, biases where there is an IMU.
 
     Raises:
         OutputError: they cannot be written.
     """
     way = f"{data.summary.path_length_m:.1f} m in {data.summary.duration_s:.1f} s, from above"
-    pictures = (trajectory_picture(data, way), _status(data), _timing(data), biases_picture(data))
-    write_pictures(data.folder.plots, dict(zip(PLOTS, pictures, strict=True)))
+    pictures = [trajectory_picture(data, way), _status(data), _timing(data)]
+    if data.summary.has_imu:
+        pictures.append(biases_picture(data))
+    write_pictures(data.folder.plots, dict(zip(PLOTS, pictures, strict=False)))
 
 
 def write_pictures(folder: Path, pictures: Mapping[str, Figure]) -> None:

@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.recordings.info import RecordingInfo
-from boxplus.recordings.options import NO_POINT_TIME, RecordingOptions
+from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions
 from boxplus.runs.settings_file import load_settings
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
@@ -59,7 +59,7 @@ def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
     found = used["recording"]
     is_bag = bool(info.lidar_topic) and any(topic.name == info.lidar_topic for topic in info.topics)
     if is_bag:
-        found["lidar_topic"], found["imu_topic"] = info.lidar_topic, info.imu_topic
+        found["lidar_topic"], found["imu_topic"] = info.lidar_topic, info.imu_topic or NO_IMU
         found["point_time_field"] = info.point_time.field or NO_POINT_TIME
         if info.point_time.field is not None:
             found["point_time_unit"], found["point_time_reference"] = info.point_time.unit, info.point_time.reference

@@ -19,7 +19,7 @@ from boxplus.systems.lidar_inertial_agreement.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.translation import ARM
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
-Source = Literal["given", "recording", "estimated", "identity"]
+Source = Literal["given", "recording", "estimated", "identity", "none"]
 
 _TURNING_RAD_S = 0.15
 _ESTIMATE = 12.0, 120.0  # length of the stretch, and how far it is looked for [s]
@@ -38,7 +38,8 @@ class Extrinsic:
 
     Attributes:
         T_imu_lidar: (4, 4) float64: p_imu = T_imu_lidar p_lidar.
-        source: "given" (option or configuration), "recording" (its static transforms), "estimated" or "identity".
+        source: "given" (option or configuration), "recording" (its static transforms), "estimated", "identity", or "none":
+            there is no IMU.
         text: one sentence.
         refine: it is a guess, to be refined while running wherever the motion allows.
         warning: what the user should do about it; empty when it is given and nothing contradicts it.
@@ -56,6 +57,8 @@ class Extrinsic:
 
     def applied_to(self, config: LioConfig) -> LioConfig:
         """The configuration with this extrinsic; a guess is refined online unless the configuration decides."""
+        if self.source == "none":
+            return config
         changes: dict[str, object] = {"T_imu_lidar": tuple(map(tuple, self.T_imu_lidar.tolist()))}
         if self.refine and "extrinsic_estimation" not in config.model_fields_set:
             changes["extrinsic_estimation"] = "gated"
@@ -76,6 +79,8 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
         RecordingError: nothing at all could be read.
         InputError: the LiDAR shows that the gyroscope is in another unit than it is read in.
     """
+    if not recording.info.imu_topic:
+        return Extrinsic(np.eye(4), "none", "no IMU takes part: poses are those of the LiDAR", False, "")
     known = _known_extrinsic(recording, config)
     stretch = _turning_stretch(recording, *(_CHECK if known is not None else _ESTIMATE))
     agreement = None

@@ -1,4 +1,4 @@
-"""LiDAR-inertial odometry over a whole recording, with every result on disk as soon as it is known."""
+"""LiDAR-inertial odometry, or that of a LiDAR alone, over a whole recording, with every result on disk as soon as it is known."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 
 
 class View(Protocol):
@@ -50,7 +51,9 @@ def run_odometry(
     view: View | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> RunSummary:
-    """Run LiDAR-inertial odometry over a recording and write trajectory, map and facts to a folder.
+    """Run odometry over a recording and write trajectory, map and facts to a folder.
+
+    With an IMU it is `LidarInertialOdometry`, without one `LidarOdometry`.
 
     Memory stays constant: every estimate goes to disk at once and is forgotten. A run that is killed leaves everything up
     to its last scan; `run.json` then says so. The report is drawn from the folder, by `boxplus.report.write_report`.
@@ -110,7 +113,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         self._config = config
         self._extrinsic = extrinsic
         self._view = view
-        self._odometry = LidarInertialOdometry(config.odometry)
+        alone = not recording.info.imu_topic
+        self._odometry = LidarOdometry(config.odometry) if alone else LidarInertialOdometry(config.odometry)
         self._tiles: TileWriter | None = None
         if extrinsic.warning:
             self._statistics.warnings.add(extrinsic.warning)

@@ -78,6 +78,11 @@ class RunSummary(RunFacts):
         return self.scans, "scans"
 
     @property
+    def has_imu(self) -> bool:
+        """Whether an IMU took part."""
+        return self.extrinsic.source != "none"
+
+    @property
     def progress(self) -> float:
         """See `RunFacts.progress`."""
         return self.recording.progress

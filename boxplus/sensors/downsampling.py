@@ -116,6 +116,15 @@ def _collect(
             representatives[k, axis] = points[i + axis]
 
 
+@kernel
+def _add_up(voxel_of: NDArray[np.uint32], values: NDArray[np.float64], sums: NDArray[np.float64]) -> None:
+    """sums (m, k) += values (n, k) of the points of each voxel."""
+    for n in range(np.uint64(values.shape[0])):
+        voxel = voxel_of[n]
+        for axis in range(np.uint64(values.shape[1])):
+            sums[voxel, axis] += values[n, axis]
+
+
 class VoxelFilter:
     """Thins scans; keeps its scratch memory from scan to scan.
 
@@ -136,6 +145,8 @@ class VoxelFilter:
         self.voxel_size = voxel_size
         self._least = voxel_size
         self._max_points = max_points
+        self._used = 0
+        self._points = 0
         self._set_table_bits(13)
         self._reserve(1024)
 
@@ -166,6 +177,19 @@ class VoxelFilter:
             # Surfaces fill voxels with the square of their size.
             fitting = self.voxel_size * (used / self._max_points) ** 0.5
             self.voxel_size = max(self._least, 0.5 * (self.voxel_size + fitting))
+        self._used, self._points = used, len(points)
         centroids, representatives = np.empty((used, 3), np.float32), np.empty((used, 3), np.float32)
         _collect(flat, self._voxels, centroids, representatives)
         return centroids, representatives
+
+    @property
+    def representatives(self) -> NDArray[np.int64]:
+        """(m,) which points of the last call the representatives were."""
+        return (self._voxels["nearest"][: self._used] & _INDEX).astype(np.int64)
+
+    def means(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Means (m, k) over the voxels of the last call of something (n, k) else that its points have."""
+        sums = np.zeros((self._used, values.shape[1]))
+        _add_up(self._voxel_of[: self._points], values, sums)
+        sums /= self._voxels["count"][: self._used, None]
+        return sums

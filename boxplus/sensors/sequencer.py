@@ -188,6 +188,12 @@ class Sequencer:
                 ready.append(frame)
         return ready
 
+    def take_scans(self) -> list[Scan]:
+        """The scans so far, whatever the IMU covers: for who estimates without one."""
+        scans = list(self._scans)
+        self._scans.clear()
+        return scans
+
     def imu_since(self, time_ns: int) -> ImuSamples:
         """Samples from the last one at or before `time_ns` on; they stay in the sequencer."""
         block = self._joined()

@@ -188,3 +188,17 @@ def test_warmup_says_what_it_did() -> None:
     code, out, err = call("warmup")
     assert code == 0, err
     assert re.search(r"(\d+ kernels compiled|nothing to compile, all kernels were ready) in \d+\.\d s, kept in ", out)
+
+
+def test_lio_of_a_lidar_alone(bag: Path, tmp_path: Path) -> None:
+    code, out, err = call("lio", bag, "-o", tmp_path / "out", "--imu-topic", "none")
+    assert code == 0, err
+    assert "imu_topic none ok left out, as asked for: odometry of the LiDAR alone" in out
+    assert "T_imu_lidar none ok no IMU takes part: poses are those of the LiDAR" in out
+    assert "finished: 29 scans" in out
+    code, out, err = call("lio", bag, "-o", tmp_path / "again", "--config", tmp_path / "out" / "config.yaml", "--no-report")
+    assert code == 0, err
+    first, second = (read_trajectory(tmp_path / name / "trajectory.csv") for name in ("out", "again"))
+    assert (first.p == second.p).all()
+    code, _, err = call("lio", bag, "-o", tmp_path / "no", "--imu-topic", "none", "--T-imu-lidar", "xyz_rpy_deg: 0 0 0 0 0 90")
+    assert code == 2 and "settings of a LiDAR alone – got T_imu_lidar" in err

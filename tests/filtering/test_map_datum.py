@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.filtering.degeneracy import pose_directions
-from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import MEASURED, NavState
 from boxplus.manifolds import so3
 
@@ -39,7 +39,7 @@ def _scan(datum: MapDatum, random: np.random.Generator, x: np.ndarray, cov: np.n
     cov_prior = cov + noise**2 * np.eye(24)
     A = _information(random)
     posterior = _updated(cov_prior, A)
-    datum.follow(x, cov_prior, posterior, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0))
+    datum.follow(x, cov_prior, posterior, Correction.of(posterior, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0)))
     return posterior
 
 
@@ -89,7 +89,7 @@ def test_sampled_errors_spread_as_it_says() -> None:
         A, cov_prior = _information(random), cov + 1e-4 * np.eye(24)
         cov = _updated(cov_prior, A)
         points += 100.0
-        datum.follow(x, cov_prior, cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0))
+        datum.follow(x, cov_prior, cov, Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0)))
         noise = np.linalg.cholesky(turn @ np.linalg.inv(A[:6, :6]) @ turn.T)
         if points > 100.0:
             d += np.sqrt(share_new) * random.normal(size=(runs, 6)) @ noise.T

@@ -95,6 +95,18 @@ def test_reusing_the_neighbours_where_nothing_moved() -> None:
         assert other.residual_rms == first.residual_rms
 
 
+def test_the_parts_add_up() -> None:
+    random = np.random.default_rng(2)
+    tree, x = IkdTree(_faces(random, 4000)), _pose(random)
+    measurement = _measure(_look(_faces(random, 300), x), tree)
+    whole = measurement.at(x.pack(), rematch=True)
+    said, A, b = measurement.in_parts(x.pack(), (0, 40, 40, measurement.points), rematch=True)
+    assert said.used == whole.used and not A[1].any()
+    np.testing.assert_allclose(A.sum(axis=0), whole.A, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(b.sum(axis=0), whole.b, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(said.directions.ratios, whole.directions.ratios, rtol=1e-9)
+
+
 @settings(max_examples=10)
 @given(seeds)
 def test_aligning_finds_the_pose(seed: int) -> None:

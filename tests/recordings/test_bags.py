@@ -147,9 +147,24 @@ def test_constant_point_times(tmp_path: Path) -> None:
         open_recording(path)
 
 
-def test_no_imu(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"an IMU topic \(sensor_msgs/Imu\) – got topics /points"):
-        open_recording(write_bag(tmp_path, "ros1", Content(with_imu=False)))
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_no_imu(tmp_path: Path, container: str) -> None:
+    with open_recording(write_bag(tmp_path, container, Content(with_imu=False))) as recording:
+        events = list(recording)
+        said = {evidence.key: evidence for evidence in recording.info.evidence}
+    assert recording.info.imu_topic == "" and recording.info.message_count == len(events) == Content().scans
+    assert all(isinstance(event, Scan) for event in events)
+    assert said["imu_topic"].verdict == "warning" and "the recording holds none" in said["imu_topic"].text
+    assert not {"T_imu_lidar", "gyro_unit", "accel_unit", "clocks"} & set(said)
+
+
+def test_an_imu_can_be_left_out(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap")
+    with open_recording(path, RecordingOptions(imu_topic="none")) as recording:
+        assert all(isinstance(event, Scan) for event in recording)
+        assert recording.progress == 1.0
+        said = {evidence.key: evidence for evidence in recording.info.evidence}
+    assert said["imu_topic"].verdict == "ok" and "left out, as asked for" in said["imu_topic"].text
 
 
 def test_early_reception_is_ambiguous(tmp_path: Path) -> None:

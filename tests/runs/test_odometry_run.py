@@ -23,6 +23,7 @@ from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.maps.tiles.store import TileStore
 from boxplus.recordings.recording import Event, Recording
+from boxplus.report import write_report
 from boxplus.runs import odometry_run
 from boxplus.runs.config import load_run_config
 from boxplus.runs.extrinsic import choose_extrinsic
@@ -344,3 +345,19 @@ def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
         r"the times of the LiDAR step back by 3599\.9\d* s after \d+\.\d+ s and go on from there: 1\.\d s of it", lidar
     )
     assert re.match(r"the times of the IMU step back by (3600\.0|3599\.9)\d* s after", imu)
+
+
+def test_a_lidar_alone(tmp_path: Path) -> None:
+    recording = walk(4.0)
+    recording.info.imu_topic = ""  # its samples still come: none may take part
+    summary = run_odometry(recording, tmp_path / "out")
+    assert summary.state == "finished" and summary.scans > 35 and summary.contradiction is None
+    assert (summary.extrinsic.source, summary.start and summary.start.kind) == ("none", "lidar")
+    assert summary.rejected["odometry"] == {"IMU sample, which takes no part": summary.imu_samples_read}
+    folder = RunFolder(tmp_path / "out")
+    assert len(read_trajectory(folder.trajectory)) == summary.scans
+    write_report(folder.path)
+    page = folder.report.read_text(encoding="utf-8")
+    assert "no IMU takes part: poses are those of the LiDAR" in page
+    config = load_run_config(folder.config).odometry
+    assert config.T_imu_lidar is None

@@ -76,3 +76,14 @@ def test_with_a_limit_the_voxels_adapt_to_the_surroundings() -> None:
 def test_a_voxel_has_a_size(size: float) -> None:
     with pytest.raises(InputError, match=r"expected voxel_size as a positive length in metres – got .* – typical values"):
         VoxelFilter(size)
+
+
+@settings(max_examples=20)
+@given(seeds, st.integers(0, 300))
+def test_means_of_what_else_the_points_have(seed: int, count: int) -> None:
+    points, values = _points(seed, count, 3.0), np.random.default_rng(seed).normal(size=(count, 2))
+    voxel_filter = VoxelFilter(0.5)
+    _, representatives = voxel_filter(points)
+    assert np.array_equal(points[voxel_filter.representatives], representatives)
+    expected = [values[rows].mean(axis=0) for rows in _voxels(points, 0.5)]
+    np.testing.assert_allclose(voxel_filter.means(values), np.reshape(expected, (-1, 2)), atol=1e-6)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.nav_state import NavState
 
 Status = Literal["ok", "weak", "lost"]
@@ -30,6 +31,12 @@ class WeakDirection:
     rotation_imu: NDArray[np.float64]
     translation_world: NDArray[np.float64]
     information_ratio: float
+
+    @classmethod
+    def all_of(cls, directions: PoseDirections) -> tuple[WeakDirection, ...]:
+        """Those of a scan."""
+        found, ratios = directions.vectors[:, directions.weak].T, directions.ratios[directions.weak]
+        return tuple(cls(vector[:3], vector[3:], float(ratio)) for vector, ratio in zip(found, ratios, strict=True))
 
     def __str__(self) -> str:
         parts = []

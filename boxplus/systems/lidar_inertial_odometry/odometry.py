@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.iterated_update import Posterior, iterated_update
-from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
@@ -226,7 +226,8 @@ class LidarInertialOdometry:
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-        self._datum.follow(self._x, cov_prior, self._cov, *((posterior.A, posterior.last.directions) if taken else ()))
+        correction = Correction.of(self._cov, posterior.A, posterior.last.directions) if taken else None
+        self._datum.follow(self._x, cov_prior, self._cov, correction)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
         state = NavState.unpack(self._x)
         map_points_world = state.to_world(map_points)
@@ -236,7 +237,7 @@ class LidarInertialOdometry:
         if taken or len(self.map) == 0 or self._consistency.lost:
             self._insert(map_points_world)
         clock.lap("map insertion")
-        status = self._weak_spell.status(frame.scan.end_ns, posterior, taken)
+        status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
         return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior, status), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:
@@ -375,11 +376,7 @@ class _Outcome:
 
     @property
     def weak_directions(self) -> tuple[WeakDirection, ...]:
-        directions = self.posterior.last.directions
-        return tuple(
-            WeakDirection(directions.vectors[:3, i], directions.vectors[3:, i], float(directions.ratios[i]))
-            for i in np.flatnonzero(directions.weak if self.taken else [])
-        )
+        return WeakDirection.all_of(self.posterior.last.directions) if self.taken else ()
 
     @property
     def points_used(self) -> int:

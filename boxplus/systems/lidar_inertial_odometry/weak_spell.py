@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from boxplus.filtering.iterated_update import Posterior
+from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.systems.lidar_inertial_odometry.estimate import Status
 
 _WINDOW_NS = 500_000_000  # over which the IMU alone holds a pose to millimetres
@@ -24,7 +24,7 @@ class WeakSpell:
         self._known_ns = known_ns
         self._scans: deque[tuple[int, bool]] = deque()
 
-    def status(self, time_ns: int, posterior: Posterior, taken: bool) -> Status:
+    def status(self, time_ns: int, directions: PoseDirections, taken: bool) -> Status:
         """Of the scan that ends at `time_ns` [ns]: weak where half of the scans of the last half second left a direction open.
 
         The part of that half second before a pose that was known counts as seen, and a scan that measures every direction
@@ -32,12 +32,11 @@ class WeakSpell:
 
         Args:
             time_ns: end of the scan.
-            posterior: its update.
-            taken: whether it became the state.
+            directions: what it determines.
+            taken: whether it was taken in.
         """
         if not taken:
             return "lost"
-        directions = posterior.last.directions
         self._scans.append((time_ns, bool(directions.weak.any())))
         while self._scans[0][0] < time_ns - _WINDOW_NS:
             self._scans.popleft()

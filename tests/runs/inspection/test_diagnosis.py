@@ -162,10 +162,15 @@ def test_gaps_and_missing_returns(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_opened_becomes_a_finding(tmp_path: Path) -> None:
-    diagnosis = diagnose(write_bag(tmp_path, "ros1", Content(with_imu=False)))
-    assert diagnosis.verdict == "error" and "an IMU topic" in diagnosis.evidence[0].text
     diagnosis = diagnose(tmp_path / "nothing.bag")
     assert [e.verdict for e in diagnosis.evidence] == ["error"]
+
+
+def test_a_lidar_alone(tmp_path: Path) -> None:
+    diagnosis = diagnose(write_bag(tmp_path, "ros1", Content(with_imu=False)))
+    found = {evidence.key: evidence for evidence in diagnosis.evidence}
+    assert found["imu_topic"].verdict == "warning" and "odometry of the LiDAR alone" in found["imu_topic"].text
+    assert "lidar_rate" in found and "imu_rate" not in found
 
 
 def test_order_of_times() -> None:

@@ -22,11 +22,11 @@ def statuses(is_open: list[bool], period_ns: int = PERIOD_NS, known_ns: int | No
     """What a spell says scan by scan, the first one at 0; `shown` is the ratio of the weakest direction where none is open."""
     spell = WeakSpell(THRESHOLD, known_ns)
 
-    def posterior(weak: bool) -> Any:
+    def directions(weak: bool) -> Any:
         ratios = np.array([9.0] * 5 + [1.0 if weak else shown])
-        return SimpleNamespace(last=SimpleNamespace(directions=SimpleNamespace(weak=ratios < THRESHOLD, ratios=ratios)))
+        return SimpleNamespace(weak=ratios < THRESHOLD, ratios=ratios)
 
-    return [spell.status(number * period_ns, posterior(weak), True) for number, weak in enumerate(is_open)]
+    return [spell.status(number * period_ns, directions(weak), True) for number, weak in enumerate(is_open)]
 
 
 def test_single_scans_are_passed_over() -> None:

@@ -1,0 +1,1 @@
+from .odometry import LidarOdometry as LidarOdometry

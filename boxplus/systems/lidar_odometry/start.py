@@ -1,0 +1,72 @@
+"""The first state of a LiDAR without an IMU: how it moves, from its first scans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import so3
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_odometry.motion import MotionBetween, MotionState
+
+_LEAST_SCANS = 4
+_POSE_SIGMA = 1e-4  # rad, m: the first pose defines the world
+_RATE_SIGMA, _SPEED_SIGMA = 0.5, 1.0  # rad/s, m/s: a registration of neighbouring scans, and what changes between them
+_UNSEEN_SPEED_SIGMA = 15.0  # m/s, where a scan left a direction open
+_SHORTEST_SCAN_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LidarStart:
+    """How the odometry began.
+
+    Attributes:
+        kind: "lidar".
+        motion: through the first scan, to the first state.
+        covariance: (12, 12) of the first state.
+        duration_s: how long the start was observed.
+        text: one sentence with the evidence.
+        warning: what could not be decided; empty when all was.
+    """
+
+    kind: Literal["lidar"]
+    motion: MotionBetween
+    covariance: NDArray[np.float64]
+    duration_s: float
+    text: str
+    warning: str = ""
+
+
+def find_lidar_start(scans: Sequence[Scan], config: RegistrationConfig) -> LidarStart | str:
+    """The first state from the motion between the first scans; a sentence where these do not fit each other.
+
+    The world is the LiDAR's frame at the end of its first scan: without an IMU nothing says where down is.
+    """
+    path = lidar_path(scans, config, unbroken=True)
+    if path.failed or len(path) < _LEAST_SCANS or (path.segment != path.segment[0]).any():
+        return f"of the first {len(scans)} scans, {path.failed} cannot be registered to those before"
+    seconds = float(path.time_ns[1] - path.time_ns[0]) * 1e-9
+    rate = so3.log(path.R_path_lidar[0].T @ path.R_path_lidar[1]) / seconds
+    velocity_path = (path.p_path_lidar[1] - path.p_path_lidar[0]) / seconds
+    first = scans[0]
+    begin_ns = min(first.start_ns, first.end_ns - _SHORTEST_SCAN_NS)
+    half = (first.end_ns - int(path.time_ns[0])) * 1e-9
+    velocity = so3.exp(rate * half).T @ velocity_path  # along the axes at the end of the scan, which are the world's
+    last = MotionState(first.end_ns, np.eye(3), np.zeros(3), rate, velocity)
+    duration = (first.end_ns - begin_ns) * 1e-9
+    begin = MotionState(begin_ns, so3.exp(-rate * duration), -velocity * duration, rate, velocity)
+    weak = bool(path.weak[1:].any())
+    sigma = [_POSE_SIGMA, _POSE_SIGMA, _RATE_SIGMA, _UNSEEN_SPEED_SIGMA if weak else _SPEED_SIGMA]
+    text = f"{np.linalg.norm(velocity):.2f} m/s and {np.degrees(np.linalg.norm(rate)):.0f} deg/s, from {len(path)} scans"
+    warning = ""
+    if weak:
+        warning = "the first scans leave a direction of the motion open: the speed along it is not known"
+    observed = (scans[-1].end_ns - begin_ns) * 1e-9
+    covariance = np.diag(np.repeat(np.square(sigma), 3))
+    return LidarStart("lidar", MotionBetween(begin, last), covariance, observed, text, warning)
