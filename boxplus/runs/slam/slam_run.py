@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import printable
+from boxplus.errors import InputError, printable
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.formats.trajectory_writer import TrajectoryWriter
@@ -86,11 +86,16 @@ def run_slam(
         extrinsic, overwrite, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
-        InputError: OpenCV, the extra `vision`, is not installed and density images are wanted; what `run_odometry` and `Slam`
-            refuse.
+        InputError: the recording has no IMU; OpenCV, the extra `vision`, is not installed and density images are wanted; what
+            `run_odometry` and `Slam` refuse.
         OutputError: the folder cannot be written or the disk is full.
         RecordingError: nothing could be read.
     """
+    if not recording.info.imu_topic:
+        raise InputError(
+            "a recording with an IMU, which tells where down is", f"a LiDAR alone in {recording.info.path.name}",
+            "run 'boxplus lio': it closes no loops, and needs no IMU",
+        )  # fmt: skip
     config = config or SlamRunConfig()
     slam = Slam(config.slam, forbidden=forbidden or (), forced=forced or ())
     claimed = nullcontext(folder) if isinstance(folder, SlamFolder) else claim_slam_folder(folder, overwrite=overwrite)

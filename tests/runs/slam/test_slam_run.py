@@ -145,3 +145,10 @@ def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path
         assert set(map(tuple, got.p_body.tolist())) <= set(map(tuple, put.p_body.tolist()))
         assert (got.intensity is None) == (put.intensity is None)
     assert not (tmp_path / "spool").exists()
+
+
+def test_a_lidar_alone_is_refused(tmp_path: Path) -> None:
+    recording = block()
+    recording.info.imu_topic = ""
+    with pytest.raises(InputError, match="which tells where down is – got a LiDAR alone"):
+        run_slam(recording, tmp_path / "out")
