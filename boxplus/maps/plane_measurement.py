@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ class PlaneMeasurement:
         whole = self.at(x, rematch=rematch)
         sums = [
             self._sums(x, self._p_lidar[begin:end], self._planes[begin:end], self._fate[begin:end], criterion=False)
-            for begin, end in zip(bounds[:-1], bounds[1:], strict=True)
+            for begin, end in pairwise(bounds)
         ]
         A, b = np.array([part[0] for part in sums]), np.array([part[1] for part in sums])
         A += np.swapaxes(np.triu(A, 1), 1, 2)
