@@ -178,7 +178,7 @@ def _write_trajectory(folder: SlamFolder, correction: Correction) -> None:
 
 
 def _write_map(folder: SlamFolder, config: SlamRunConfig, spool: ScanSpool, correction: Correction) -> int:
-    """Tiles and merged files of the scans where closed loops put them; written apart and moved into place when complete."""
+    """Tiles and merged files of the scans where closed loops put them; the odometry's own map stays as it is."""
     settings = config.map
     with TileWriter(folder.tiles, tile_size=settings.tile_size, voxel=settings.voxel) as tiles:
         for scan in spool.scans():

@@ -60,3 +60,8 @@ class VioConfig(BaseModel):
     time_offset_estimation: bool = Field(False, description="refine the offset of the cameras' clock while running")
     time_offset_sigma: float = Field(0.005, gt=0, description="standard deviation of the clocks' offset beforehand [s]")
     start_duration: float = Field(1.0, gt=0, description="time over which the start is observed, at rest or moving [s]")
+
+    @property
+    def refines_mounting(self) -> bool:
+        """Whether mountings or the clock of the cameras are refined while running."""
+        return self.extrinsic_estimation or self.time_offset_estimation

@@ -14,7 +14,8 @@ different than those one keyframe apart; a walk adds q for each step. Landmark a
     q = (E[(r_{k+2} − r_k)²] − E[(r_{k+1} − r_k)²]) / _LEFT
 
 What neighbouring keyframes say of each other a walk leaves nearly as sharp as it was, and σ · factor would distrust it beside the
-IMU. So the window counts with σ · √factor, and the covariance that comes out is taken times factor.
+IMU. So the window counts with σ · √factor, and the covariance that comes out is taken times factor. Where mountings are refined
+it counts with σ, and the covariance is taken times factor².
 
 Source: docs/visual_inertial_odometry.md, "What corners err by".
 """
@@ -35,11 +36,15 @@ Floats = NDArray[np.float64]
 class CornerCreep:
     """Tells from residuals how much more than `pixel_sigma` a sighting has to count with.
 
+    Args:
+        weigh: whether the window counts with it; not where mountings are refined, which corners that count less leave to drift.
+
     Attributes:
         factor: 1 or more, of the standard deviation of what the window finds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, weigh: bool = True) -> None:
+        self._weigh = weigh
         self.factor = 1.0
         self._sums = np.zeros(4)  # of squares one and two keyframes apart, and how many
         self._most = np.zeros(2)  # sums of n² + 1, and of how many corners
@@ -47,7 +52,12 @@ class CornerCreep:
     @property
     def weight(self) -> float:
         """By what `pixel_sigma` is multiplied in the window."""
-        return float(np.sqrt(self.factor))
+        return float(np.sqrt(self.factor)) if self._weigh else 1.0
+
+    @property
+    def spread(self) -> float:
+        """By what the window's covariance is multiplied: factor² less what the weight has done."""
+        return (self.factor / self.weight) ** 2
 
     def note(self, residuals: Floats, landmark: NDArray[np.int64], keyframe: NDArray[np.int64], cameras: int) -> None:
         """Take the window's residuals of the first camera, all keyframes of it.

@@ -233,7 +233,8 @@ class VisualInertialOdometry:
         self.window.solve(_START_ITERATIONS)
         fit = self.window.reject(_OUTLIER)
         self._tracker.forget(fit.given_up)
-        self.window.solve()  # with the weight that the corners' residuals show
+        if not self.config.refines_mounting:
+            self.window.solve()  # with the weight that the corners' residuals show
         self._health.begin(tracks.time_ns)
         return self._estimate(tracks, True, fit, start.kind == "at rest")
 

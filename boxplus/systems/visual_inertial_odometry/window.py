@@ -100,7 +100,7 @@ class Window:
         self._imu_group: Group | None = None
         self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
         self._seen = Seen.none()
-        self._creep = CornerCreep()
+        self._creep = CornerCreep(weigh=not config.refines_mounting)
         self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
         self._anchor: Ints = np.zeros(0, np.int64)
         self._founded = 0  # landmarks that the last keyframe saw
@@ -257,7 +257,7 @@ class Window:
         solution = self.problem.solve(max_iterations=max_iterations or self._config.max_iterations, **_SOLVER)
         self.problem.set_values(solution)
         number = self.frames[-1].number
-        self.covariance = self._creep.factor * covariance_of(solution, self.bodies[number], self.states[number])
+        self.covariance = self._creep.spread * covariance_of(solution, self.bodies[number], self.states[number])
 
     def _connect(self, rows: NDArray[np.intp], intervals: int) -> None:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""

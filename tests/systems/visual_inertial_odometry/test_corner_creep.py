@@ -41,6 +41,15 @@ def test_independent_errors_of_any_size_count_as_they_are(seed: int, white: floa
     assert creep.weight**2 == pytest.approx(creep.factor)
 
 
+def test_where_the_window_does_not_count_with_it_the_covariance_takes_all() -> None:
+    weighing, plain = CornerCreep(), CornerCreep(weigh=False)
+    for creep in (weighing, plain):
+        note(creep, np.random.default_rng(2), 0.3, 0.2)
+    assert weighing.factor == plain.factor > 1.5
+    assert (plain.weight, plain.spread) == (1.0, plain.factor**2)
+    assert weighing.weight**2 * weighing.spread == pytest.approx(plain.spread)
+
+
 def test_a_walk_grows_the_factor_by_what_it_is_and_by_how_many_cameras_share_it() -> None:
     factors = []
     for cameras, walk in ((1, 0.3), (2, 0.3), (2, 0.6)):
