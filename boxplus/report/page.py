@@ -36,18 +36,18 @@ def _body(data: RunData) -> str:
             figures.map_and_trajectory(data),
         )
     )
+    body = "IMU" if data.summary.has_imu else "LiDAR"
     parts.append(
         figure_section(
             "Status and information",
-            "ok: all six axes measured; weak: some directions only predicted from the IMU; lost: no update. Below, for every "
-            "axis of the pose (rotation about the IMU's axes, position along the world's), the share of its information that "
-            "came from the LiDAR.",
+            "ok: all six axes measured; weak: some directions only predicted; lost: no update. Below, for every axis of "
+            f"the pose (rotation about the {body}'s axes, position along the world's), the share of its information that came "
+            "from the scan.",
             figures.status_and_axes(data),
             weak_table(data.summary.weak_intervals, "scans"),
         )
     )
     parts.append(figure_section("Timing", _timing_text(data), figures.timing(data), _stage_table(data)))
-    body = "IMU" if data.summary.has_imu else "LiDAR"
     parts.append(figure_section("Velocity", f"Of the {body}, along the world's axes.", figures.velocity(data)))
     parts.append(figure_section("Uncertainty", "Standard deviations of the pose.", figures.sigmas(data)))
     if data.summary.has_imu:

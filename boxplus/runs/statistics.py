@@ -47,6 +47,6 @@ class RunStatistics(EstimateStatistics):
 
 def _trouble(estimate: Estimate) -> str:
     if estimate.status == "lost":
-        return "had too few points on known planes for an update: the motion is predicted from the IMU alone"
+        return "had too few points on known planes for an update: the motion is only predicted"
     directions = (f"{d} ({d.information_ratio:.1f} times the information of noise)" for d in estimate.weak_directions)
     return f"was not determined by the LiDAR in its {'; '.join(directions)}"
