@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_m
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
+from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
@@ -44,10 +44,9 @@ _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # sha
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
-_NOT_IN_SNAPSHOT = ("config", "map", "_voxel_filter")
 
 
-class LidarInertialOdometry:
+class LidarInertialOdometry(Snapshots):
     """Estimates the pose of an IMU from its samples and the scans of a LiDAR rigidly attached to it.
 
     Push IMU samples and scans in the order in which they arrive; each call returns the estimates that have become ready
@@ -130,20 +129,6 @@ class LidarInertialOdometry:
         if newest > self._time_ns:
             self._carry(x, cov, imu, newest, self._noise.density)
         return Prediction(newest, NavState.unpack(x), self._unshown.widened(cov, newest))
-
-    def snapshot(self) -> dict[str, object]:
-        """Everything the next estimates depend on, but for the settings: to be written at once, as it goes on changing."""
-        state = {name: value for name, value in vars(self).items() if name not in _NOT_IN_SNAPSHOT}
-        return state | {"map": (self.map.points(), self.map.origin), "scan_voxel": self._voxel_filter.voxel_size}
-
-    def restore(self, state: dict[str, object]) -> None:
-        """Go on where `snapshot` was taken, in an odometry of the same settings that has not begun."""
-        for name, value in state.items():
-            if name not in ("map", "scan_voxel"):
-                setattr(self, name, value)
-        points, origin = cast(tuple[NDArray[np.float64], NDArray[np.float64]], state["map"])
-        self.map.build(points, origin=origin if len(points) else None)
-        self._voxel_filter.voxel_size = cast(float, state["scan_voxel"])
 
     def _advance(self, frames: list[Frame]) -> list[Estimate]:
         estimates: list[Estimate] = []

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection
+from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 from boxplus.systems.lidar_odometry.alignment import Alignment, ScanPoints, align
 from boxplus.systems.lidar_odometry.motion import DOF, VELOCITY, MotionBetween, MotionState, joint_prior, nav_state
@@ -55,10 +55,9 @@ _SHOWN = 2.0  # times the threshold at which a direction that was open counts as
 _INDEPENDENT_M = 0.2  # between points whose errors are independent
 _LONGEST_WEAK_S = 2.0  # an open direction may be predicted, as steady as the platform moves
 _NODES = 13  # within a scan
-_NOT_IN_SNAPSHOT = ("config", "map", "_voxel_filter", "_until_shown")
 
 
-class LidarOdometry:
+class LidarOdometry(Snapshots):
     """Estimates the pose of a LiDAR from its scans alone.
 
     Push scans in the order in which they arrive; each call returns the estimates that have become ready (the first scans wait
@@ -133,20 +132,6 @@ class LidarOdometry:
     def flush(self) -> list[Estimate]:
         """No more data will come: process what still waits for a start."""
         return self._try_start(final=True) if self.start is None and self._waiting else []
-
-    def snapshot(self) -> dict[str, object]:
-        """Everything the next estimates depend on, but for the settings: to be written at once, as it goes on changing."""
-        state = {name: value for name, value in vars(self).items() if name not in _NOT_IN_SNAPSHOT}
-        return state | {"map": (self.map.points(), self.map.origin), "scan_voxel": self._voxel_filter.voxel_size}
-
-    def restore(self, state: dict[str, object]) -> None:
-        """Go on where `snapshot` was taken, in an odometry of the same settings that has not begun."""
-        for name, value in state.items():
-            if name not in ("map", "scan_voxel"):
-                setattr(self, name, value)
-        points, origin = cast(tuple[NDArray[np.float64], NDArray[np.float64]], state["map"])
-        self.map.build(points, origin=origin if len(points) else None)
-        self._voxel_filter.voxel_size = cast(float, state["scan_voxel"])
 
     def _advance(self, scans: list[Scan]) -> list[Estimate]:
         estimates: list[Estimate] = []
