@@ -180,4 +180,4 @@ def test_the_recording_is_known_wherever_it_lies(tmp_path: Path) -> None:
     moved = tmp_path / "elsewhere.bag"
     moved.write_bytes(bag.read_bytes())
     with open_recording(bag) as one, open_recording(moved) as other:
-        assert checkpoint.run_identity(one.info, "") == checkpoint.run_identity(other.info, "")
+        assert checkpoint.run_identity(one.info, "", "both") == checkpoint.run_identity(other.info, "", "both")
