@@ -26,6 +26,7 @@ _FIT_RATIO = 2.5  # residuals of the corners over what their noise explains
 _MEMORY = 0.9  # of the running means, per frame
 _LEAST_PARTNERS = 0.15  # share of the corners that a second camera finds where the calibration puts them
 _SUSTAINED_S = 1.0  # of a contradiction that is no accident
+_TORN_M = 0.5  # standard deviation of the position after a gap of the IMU beyond which the way across it was not seen
 _DARK, _FLAT = 12.0, 5.0  # grey values: mean and standard deviation of an image that shows nothing
 
 
@@ -34,7 +35,8 @@ class Health:
     """Judges frame after frame.
 
     Attributes:
-        contradiction: the first contradiction that lasted for a second; poses from then on are not to be believed.
+        contradiction: the first contradiction that lasted for a second, or a gap of the IMU across which too little was seen;
+            poses from then on are not to be believed.
     """
 
     config: VioConfig
@@ -83,6 +85,11 @@ class Health:
             reasons.append(
                 f"the IMU was silent for {imu_gap_s:.2f} s, of {self.config.max_imu_gap:g} s at most: only images tell the motion"
             )
+            if position_sigma > _TORN_M and self.contradiction is None:
+                self.contradiction = (
+                    f"a gap of {imu_gap_s:.2f} s in the IMU, and too little was seen across it: the way meanwhile is known to "
+                    f"{position_sigma:.1f} m, and the poses before and after it do not belong together"
+                )
         contradictions = self._contradictions(tracks, fit) + ([] if apart is None else [apart])
         if not contradictions:
             self._agreed_ns = time_ns

@@ -57,3 +57,14 @@ def test_a_pose_that_nothing_determines_is_lost() -> None:
     health.begin(0)
     status, reasons = health.judge(frame(1), fit(), False, 0.005, position_sigma(covariance))
     assert status == "lost" and "does not determine the pose" in reasons[0]
+
+
+def test_a_gap_of_the_imu_that_images_do_not_bridge_tears_the_path() -> None:
+    bridged, torn = Health(VioConfig()), Health(VioConfig())
+    for health, sigma in ((bridged, 0.05), (torn, 9.0)):
+        health.begin(0)
+        status, reasons = health.judge(frame(1), fit(), False, 1.94, sigma)
+        assert status == "weak" and "the IMU was silent for 1.94 s" in reasons[0]
+    assert bridged.contradiction is None
+    assert torn.contradiction is not None
+    assert "a gap of 1.94 s in the IMU" in torn.contradiction and "is known to 9.0 m" in torn.contradiction
