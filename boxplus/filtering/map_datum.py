@@ -96,7 +96,7 @@ class MapDatum:
         both = np.kron(np.eye(2), move)
         joint = both @ self._joint @ both.T
         prior = _along_world(cov_prior[_POSE, _POSE], x)
-        joint[_POSE, _POSE] += _positive(prior - move @ self._filter @ move.T)
+        joint[_POSE, _POSE] += positive_part(prior - move @ self._filter @ move.T)
         if correction is not None:
             joint[_MAP, _MAP] += self._shared * self._new_share * _along_world(correction.alone, x)
             self._new_share = 0.0
@@ -134,7 +134,7 @@ def _turned(M: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np
     return turned
 
 
-def _positive(M: NDArray[np.float64]) -> NDArray[np.float64]:
+def positive_part(M: NDArray[np.float64]) -> NDArray[np.float64]:
     """The positive semidefinite part of a symmetric matrix."""
     values, vectors = np.linalg.eigh(M)
     positive: NDArray[np.float64] = (vectors * np.maximum(values, 0.0)) @ vectors.T

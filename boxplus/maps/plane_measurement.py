@@ -90,11 +90,10 @@ class PlaneMeasurement:
                 total, self._sums(x, self._p_lidar[refused], self._planes[refused], as_used, criterion=True), strict=True
             ):
                 whole -= part
-        config = self._config
         A += np.triu(A, 1).T
         if matches:  # in between the planes stay, and what they can tell
             signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
-            self._directions = pose_directions(signal, noise, self.lever_arm, config.weak_threshold)
+            self._directions = pose_directions(signal, noise, self.lever_arm, self._config.weak_threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         return Information(A * self._weight, b * self._weight, self._directions, used, rms)

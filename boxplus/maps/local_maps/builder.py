@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,9 +117,7 @@ class LocalMapBuilder:
         self._last, self._T_odo_before = middle, T_odo_map
         newest = self._seen[-1]
         # It stays for the way that the next stretch is measured from; its points are in the map already.
-        self._seen = [
-            _Seen(newest.time_ns, newest.T_odo_body, newest.covariance, newest.up_odo, newest.path_m, newest.p_body[:0])
-        ]
+        self._seen = [replace(newest, p_body=newest.p_body[:0])]
         return made
 
     @staticmethod

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
+from boxplus.filtering.map_datum import positive_part
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 
@@ -63,8 +64,7 @@ def relative_covariance(covariance_before: ArrayLike, covariance_after: ArrayLik
         checked_covariance("covariance_after", covariance_after),
     )
     Ad = se3.adjoint(se3.inverse(SE3.check("T_before_after", np.atleast_2d(np.asarray(T_before_after, dtype=np.float64)))[0]))
-    values, vectors = np.linalg.eigh(after - Ad @ before @ Ad.T)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return positive_part(after - Ad @ before @ Ad.T)
 
 
 def drift_covariance(length_m: float, rotation: float, position: float) -> Floats:
