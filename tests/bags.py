@@ -84,6 +84,9 @@ class Content:
     drop_fields: tuple[str, ...] = ()
     with_imu: bool = True
     static_time: bool = False
+    fixes: list[tuple[int, tuple[float, float, float], int]] = field(default_factory=list)  # offset [ns], place, status
+    fix_topics: tuple[str, ...] = ("/fix",)
+    fix_covariance_type: int = 2
 
     def p_lidar(self, index: int) -> NDArray[np.float32]:
         rng = np.random.default_rng(index)
@@ -165,6 +168,10 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
         for index in (k for k in range(count) if content.keeps("/imu", k)):
             stamp_ns = START_NS + index * 10**9 // content.imu_rate
             events.append((stamp_ns, "/imu", _imu_message(bag, content, stamp_ns)))
+    for offset_ns, place, status in content.fixes:
+        for topic in content.fix_topics:
+            stamp_ns = START_NS + offset_ns
+            events.append((stamp_ns, topic, _fix_message(bag, stamp_ns, place, status, content.fix_covariance_type)))
     if content.transforms:
         events.append((START_NS, "/tf_static", _transform_message(bag, content)))
     with bag.writer:
@@ -239,6 +246,19 @@ def _imu_message(bag: _Bag, content: Content, stamp_ns: int) -> Any:
         angular_velocity_covariance=np.zeros(9),
         linear_acceleration=vector(*accel),
         linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def _fix_message(bag: _Bag, stamp_ns: int, place: tuple[float, float, float], status: int, kind: int) -> Any:
+    types = bag.store.types
+    return types["sensor_msgs/msg/NavSatFix"](
+        header=bag.header(stamp_ns, "antenna"),
+        status=types["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=place[0],
+        longitude=place[1],
+        altitude=place[2],
+        position_covariance=np.array([1.0, 0.1, 0.0, 0.1, 2.0, 0.0, 0.0, 0.0, 9.0]),
+        position_covariance_type=kind,
     )
 
 

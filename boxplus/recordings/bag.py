@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from boxplus.recordings import point_time
+from boxplus.recordings.bag_gnss import bag_fixes
 from boxplus.recordings.bag_probe import CLOUD_PARSERS, find_out
 from boxplus.recordings.clouds import coordinates, view_points
 from boxplus.recordings.container import Container, interval
@@ -21,6 +22,7 @@ from boxplus.recordings.messages import (
 from boxplus.recordings.open_container import open_container
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Event, Recording, Tally
+from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
@@ -42,7 +44,10 @@ def open_bag(path: Path, options: RecordingOptions) -> Recording:
     def read(tally: Tally) -> Iterator[Event]:
         return _events(container, info, options, start_ns, stop_ns, tally)
 
-    return Recording(info, read, container.close)
+    def read_fixes() -> GnssFixes:
+        return bag_fixes(container, info.gnss_topic, start_ns, stop_ns)
+
+    return Recording(info, read, container.close, read_fixes if info.gnss_topic else None)
 
 
 class _ImuBlock:

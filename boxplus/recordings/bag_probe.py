@@ -9,6 +9,7 @@ import numpy as np
 
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import point_time
+from boxplus.recordings.bag_gnss import antenna_of, choose_gnss
 from boxplus.recordings.clouds import cloud_layout, view_points
 from boxplus.recordings.container import Channel, Container, interval, share
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
@@ -111,6 +112,12 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         evidence += [gyro_evidence, accel_evidence]
         T_imu_lidar, source, found_extrinsic = _extrinsic(container, transforms, imu_probe.frame, probe.frame)
         evidence.append(found_extrinsic)
+    gnss, found_gnss = choose_gnss(channels, options.gnss_topic)
+    evidence += found_gnss
+    p_imu_antenna = None
+    if gnss is not None and imu is not None:
+        p_imu_antenna, found_antenna = antenna_of(container, gnss, transforms, imu_probe.frame)
+        evidence.append(found_antenna)
     messages = lidar.count + (0 if imu is None else imu.count)
     return RecordingInfo(
         path=path,
@@ -127,6 +134,8 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         accel_unit=accel_unit,
         T_imu_lidar=T_imu_lidar,
         T_imu_lidar_source=source,
+        gnss_topic=gnss.topic if gnss is not None else "",
+        p_imu_antenna=p_imu_antenna,
         evidence=evidence,
     )
 

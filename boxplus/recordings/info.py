@@ -88,6 +88,8 @@ class RecordingInfo:
         gyro_unit, accel_unit: units in the recording (samples are delivered in SI units).
         T_imu_lidar: (4, 4) float64, LiDAR coordinates to IMU coordinates, or None when the recording does not say.
         T_imu_lidar_source: where it comes from; empty when unknown.
+        gnss_topic: stream of positions by satellite in use; empty where there is none.
+        p_imu_antenna: (3,) the antenna in the IMU's frame [m], or None when the recording does not say.
         evidence: every decision with its reasons; grows while a damaged file is read.
     """
 
@@ -105,4 +107,6 @@ class RecordingInfo:
     accel_unit: AccelUnit
     T_imu_lidar: NDArray[np.float64] | None = None
     T_imu_lidar_source: str = ""
+    gnss_topic: str = ""
+    p_imu_antenna: NDArray[np.float64] | None = None
     evidence: list[Evidence] = field(default_factory=list)

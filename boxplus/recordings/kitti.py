@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, Verdict, no_imu
-from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions, check_start
+from boxplus.recordings.kitti_oxts import oxts_fixes, read_oxts
+from boxplus.recordings.options import NO_GNSS, NO_IMU, NO_POINT_TIME, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
+from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
-_ACCEL_COLUMNS = slice(11, 14)
-_GYRO_COLUMNS = slice(17, 20)
-_OXTS_COLUMNS = 30
 _POINT_BYTES = 16
 _CALIBRATION = "calib_imu_to_velo.txt"
 
@@ -62,6 +61,10 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
         evidence.append(no_imu(options.imu_topic == NO_IMU))
     else:
         evidence += _imu_evidence(imu, source)
+    has_gnss = imu is not None and options.gnss_topic != NO_GNSS
+    if has_gnss:
+        text = "latitude, longitude and altitude of the OXTS, its own solution of satellites and inertial sensors"
+        evidence.append(Evidence("gnss_topic", "oxts", "ok", text))
     info = RecordingInfo(
         path=path,
         format="KITTI raw folder",
@@ -77,6 +80,8 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
         accel_unit="m/s2",
         T_imu_lidar=T_imu_lidar,
         T_imu_lidar_source=source,
+        gnss_topic="oxts" if has_gnss else "",
+        p_imu_antenna=np.zeros(3) if has_gnss else None,
         evidence=evidence,
     )
     start_ns = first + round(options.start_s * 1e9)
@@ -85,7 +90,13 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
     def read(tally: Tally) -> Iterator[Event]:
         return _events(scans, imu, options, start_ns, stop_ns, tally)
 
-    return Recording(info, read, lambda: None)
+    def read_fixes() -> GnssFixes:
+        if imu is None:
+            return GnssFixes.from_arrays([], [])
+        chosen = np.flatnonzero((imu.time_ns >= start_ns) & (imu.time_ns < stop_ns))
+        return oxts_fixes([imu.paths[k] for k in chosen], imu.time_ns[chosen])
+
+    return Recording(info, read, lambda: None, read_fixes if has_gnss else None)
 
 
 def _imu_topic(imu: SensorFiles | None) -> list[Topic]:
@@ -286,14 +297,3 @@ def _read_imu(imu: SensorFiles, index: int, tally: Tally) -> ImuSamples | None:
         tally.rejected[f"messages: {values}"] += 1
         return None
     return ImuSamples.from_arrays(imu.time_ns[index : index + 1], values[:3], values[3:])
-
-
-def read_oxts(file: Path) -> NDArray[np.float64] | str:
-    """Angular velocity [rad/s] and specific force [m/s²] (6,) of one file, along the IMU's axes; or why there is none."""
-    try:
-        values = np.array(file.read_text(errors="replace").split(), dtype=np.float64)
-    except (OSError, ValueError):
-        return "unreadable oxts file"
-    if len(values) < _OXTS_COLUMNS:
-        return f"oxts file without its {_OXTS_COLUMNS} columns"
-    return np.concatenate([values[_GYRO_COLUMNS], values[_ACCEL_COLUMNS]])

@@ -171,6 +171,19 @@ def parse_imu(data: bytes, encoding: Encoding) -> tuple[int, str, tuple[float, .
     return stamp_ns, frame, numbers[13:16], numbers[25:28]
 
 
+def parse_nav_sat_fix(data: bytes, encoding: Encoding) -> tuple[int, str, int, tuple[float, ...], tuple[float, ...], int]:
+    """sensor_msgs/NavSatFix: (stamp [ns], frame, status, latitude, longitude and altitude, covariance (9), its type).
+
+    Raises MalformedMessageError.
+    """
+    cursor = Cursor(data, encoding)
+    stamp_ns, frame = cursor.header()
+    status = int(cursor.values("b")[0])
+    cursor.values("H")  # which systems of satellites
+    position = cursor.values("d", 3)
+    return stamp_ns, frame, status, position, cursor.values("d", 9), cursor.value("B")
+
+
 def parse_transforms(data: bytes, encoding: Encoding) -> list[tuple[str, str, NDArray[np.float64]]]:
     """tf2_msgs/TFMessage: (parent, child, translation and xyzw quaternion (7,)) each. Raises MalformedMessageError."""
     cursor = Cursor(data, encoding)

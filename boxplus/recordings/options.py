@@ -19,6 +19,9 @@ NO_POINT_TIME = "none"
 NO_IMU = "none"
 """Value of `imu_topic` for a LiDAR alone: samples of an IMU are left out."""
 
+ANY_GNSS, NO_GNSS = "auto", "none"
+"""Values of `gnss_topic`: the only one there is, and none."""
+
 
 class RecordingOptions(BaseModel):
     """How to read a recording. None means: find it from the data, and refuse when two readings fit.
@@ -30,6 +33,10 @@ class RecordingOptions(BaseModel):
 
     lidar_topic: str | None = Field(default=None, description="topic of the LiDAR (bags only)")
     imu_topic: str | None = Field(default=None, description="topic of the IMU (bags only); 'none': the LiDAR alone, without one")
+    gnss_topic: str = Field(
+        default=ANY_GNSS,
+        description="topic of the satellite receiver; 'auto': the only one there is; 'none': positions by satellite are left out",
+    )
     point_time_field: str | None = Field(
         default=None,
         description="name of the cloud's field with the time of each point; 'none' takes all points at the message's stamp",

@@ -12,6 +12,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, RecordingInfo
+from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
@@ -137,9 +138,22 @@ class Recording(EventStream[RecordingInfo, Event]):
 
     delivers = "scans and IMU samples"
 
-    def __init__(self, info: RecordingInfo, read: Callable[[Tally], Iterator[Event]], close: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        info: RecordingInfo,
+        read: Callable[[Tally], Iterator[Event]],
+        close: Callable[[], None],
+        read_fixes: Callable[[], GnssFixes] | None = None,
+    ) -> None:
         super().__init__(info, read, close)
         self._lidar_shift_ns = 0
+        self._read_fixes = read_fixes
+
+    def fixes(self) -> GnssFixes:
+        """All positions by satellite of the stretch that is read, in a pass of their own over the file; none where
+        `info.gnss_topic` is empty. What is no position is counted in `rejected` of the result.
+        """
+        return GnssFixes.from_arrays([], []) if self._read_fixes is None else self._read_fixes()
 
     def shift_lidar(self, offset_s: float) -> None:
         """Add this to all times of the LiDAR from the next iteration on [s]; `info.evidence` says so."""

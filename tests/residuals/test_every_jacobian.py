@@ -142,6 +142,11 @@ def _gravity(rng: np.random.Generator) -> Case:
     return residuals.GravityDirection(_points(rng)[2], _points(rng)[2][0]), [SE3.random(rng, COUNT)]
 
 
+def _antenna(rng: np.random.Generator) -> Case:
+    fixes = residuals.AntennaPosition(_points(rng)[0], SE3.random(rng, COUNT), rng.normal(size=(COUNT, 3)))
+    return fixes, [SE3.random(rng, 1)[0], SE3.random(rng, COUNT), np.array([0.3, -0.8, 1.2]), np.array([0.2])]
+
+
 def _imu(rng: np.random.Generator) -> Case:
     time_ns = 10**18 + 5_000_000 * np.arange(200)
     begin = time_ns[0] + rng.integers(0, 300_000_000, COUNT)
@@ -164,6 +169,7 @@ def _marginal(rng: np.random.Generator) -> Case:
 
 
 CASES: dict[str, Callable[[np.random.Generator], Case]] = {
+    "AntennaPosition": _antenna,
     "BalReprojection": _bal,
     "ChordalPose": _relative(residuals.ChordalPose, SE3),
     "ChordalPose2D": _relative(residuals.ChordalPose2D, SE2),

@@ -17,6 +17,7 @@ INDEX = (PAGES / "index.md").read_text(encoding="utf-8")
 ROWS = [line.split("|")[1:-1] for line in INDEX.splitlines() if line.startswith("| `")]
 
 WITH_PROGRAM = [
+    "antenna_position",
     "bal_reprojection",
     "chordal_pose",
     "gravity_direction",

@@ -20,6 +20,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_cover, check_points, check_rate, check_rejected
 from boxplus.runs.inspection.agreement_checks import Compared, check_agreement
 from boxplus.runs.inspection.cameras.examination import examine_cameras
+from boxplus.runs.inspection.gnss_checks import check_gnss
 from boxplus.runs.inspection.imu_checks import check_finite, check_rest, check_saturation, first_second, quiet_stretch
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
 from boxplus.sensors.imu import ImuSamples
@@ -181,6 +182,8 @@ def _examine(
     found += check_rate("lidar", np.array(log.scan_start_ns, np.int64), gap_factor=1.5)
     found += check_points(log)
     imu = log.all_imu()
+    if info.gnss_topic:
+        found += check_gnss(recording.fixes(), np.array(log.scan_start_ns, np.int64), usable(imu))
     if not len(imu):
         return
     found += check_rate("imu", imu.time_ns, gap_factor=3.0, slow_hz=_SLOW_IMU_HZ)

@@ -26,7 +26,8 @@ from boxplus.recordings.cameras.folders.layout import ImageFiles, Layout, first_
 from boxplus.recordings.cameras.imu_table import ImuTable
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.info import Evidence
-from boxplus.recordings.kitti import calibration_file, calibration_lines, read_oxts, rigid_transform, sensor_files
+from boxplus.recordings.kitti import calibration_file, calibration_lines, rigid_transform, sensor_files
+from boxplus.recordings.kitti_oxts import read_oxts
 
 Values = dict[str, NDArray[np.float64]]
 
