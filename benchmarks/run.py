@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [NAME ...] [--json FILE] [--gate | --update-baseline] [--quick]
 
-Names: knn_static map_dynamic scan recordings memory map_growth cholesky; all of them when none is given. Each runs in a process
-of its own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, `--update-baseline`
+Names: knn_static map_dynamic scan recordings memory map_growth cholesky ordering; all of them when none is given. Each runs in a
+process of its own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, `--update-baseline`
 takes the figures of this run for those to come, deliberately. `--quick` is a smoke run: its figures mean nothing.
 """
 
@@ -86,6 +86,7 @@ BENCHMARKS = {
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
     "memory": Benchmark(("--minutes", "3")),
     "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),
+    "ordering": Benchmark(("--rounds", "1", "--cube", "8", "--points", "600", "--only", "cube", "walk")),
     "graphs": Benchmark(("--rounds", "1", "--only", "intel", "MIT")),
     "incremental": Benchmark(("--only", "world", "--poses", "300")),
     "loops": Benchmark(("--poses", "300", "--seeds", "1", "--without-gtsam")),

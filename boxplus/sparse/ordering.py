@@ -1,7 +1,7 @@
 """Fill-reducing elimination orders of block-sparse symmetric matrices, and the exact cost of a factorisation in an order.
 
 The graph has one node per block, so ordering costs the same for poses of six scalars as for single scalars. Two orders
-are computed where it pays, approximate minimum degree and nested dissection (METIS), and the cheaper one is kept: what
+are computed where it pays, approximate minimum degree and nested dissection, and the cheaper one is kept: what
 each costs is counted exactly without factorising (Gilbert, Ng, Peyton, "An efficient algorithm to compute row and column
 counts for sparse Cholesky factorization", SIAM J. Matrix Anal. Appl. 15(4), 1994), weighted by block sizes.
 """
@@ -16,13 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
+from boxplus.sparse.dissection.nested_dissection import nested_dissection
 from boxplus.sparse.minimum_degree import minimum_degree
 
 Method = Literal["auto", "minimum_degree", "nested_dissection", "natural"]
 
-DISSECTION_FLOPS = 4000.0
+DISSECTION_FLOPS = 10_000.0
 """`auto` tries nested dissection where minimum degree costs more than this many operations per node and edge: below, even
-an order for nothing would not pay for the time that METIS takes."""
+an order for nothing would not pay for the time that it takes."""
+
+_MOST_TRIES = 8
 
 _ONE = np.uint32(1)
 _NONE = np.uint32(0xFFFFFFFF)
@@ -68,29 +71,18 @@ def order(col_start: ArrayLike, row: ArrayLike, sizes: ArrayLike, method: Method
     if method == "minimum_degree":
         return _evaluate(start, neighbours, weights, minimum_degree(start, neighbours, weights), "minimum_degree")
     if method == "nested_dissection":
-        return _evaluate(start, neighbours, weights, nested_dissection(start, neighbours, weights), "nested_dissection")
+        return _evaluate(
+            start, neighbours, weights, nested_dissection(start, neighbours, weights, _MOST_TRIES), "nested_dissection"
+        )
     if method != "auto":
         raise InputError("method auto, minimum_degree, nested_dissection or natural", repr(method), "choose one of them")
     degree = _evaluate(start, neighbours, weights, minimum_degree(start, neighbours, weights), "minimum_degree")
-    if degree.flops <= DISSECTION_FLOPS * (len(weights) + len(neighbours)):
+    worth = degree.flops / (DISSECTION_FLOPS * max(len(weights) + len(neighbours), 1))
+    if worth <= 1.0:
         return degree
-    dissection = _evaluate(start, neighbours, weights, nested_dissection(start, neighbours, weights), "nested_dissection")
+    tries = min(max(int(worth**0.5 / 2.5), 1), _MOST_TRIES)  # more time where more is to be gained
+    dissection = _evaluate(start, neighbours, weights, nested_dissection(start, neighbours, weights, tries), "nested_dissection")
     return dissection if dissection.flops < degree.flops else degree
-
-
-def nested_dissection(start: NDArray[np.int64], neighbours: NDArray[np.int32], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order the nodes of an undirected graph by METIS' multilevel nested dissection.
-
-    Args and result as `minimum_degree`.
-    """
-    import pymetis
-
-    if not len(neighbours):
-        return np.arange(len(sizes))
-    weights = None if (sizes == sizes[0]).all() else sizes.astype(np.int32)
-    graph = pymetis.CSRAdjacency(start.astype(np.int32), neighbours)
-    permutation, _ = pymetis.nested_dissection(graph, vweights=weights, options=pymetis.Options(seed=0))
-    return np.array(permutation, np.int64)
 
 
 def _checked(

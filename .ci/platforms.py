@@ -1,0 +1,60 @@
+"""Whether every dependency has a wheel on the platforms that the README names: nobody should need a compiler.
+
+    python .ci/platforms.py
+
+Asks pip what it would install, for each platform and Python, without installing or building anything. Exit code 0 also where the
+package index cannot be reached, which is said; 1 where something has no wheel. Two minutes.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+UNREACHABLE = re.compile(r"NewConnectionError|Max retries|ConnectTimeout|ReadTimeout|name resolution|ProxyError|SSLError")
+PLATFORMS = {
+    "Windows x86-64": ["win_amd64"],
+    "Linux x86-64": ["manylinux_2_28_x86_64", "manylinux_2_17_x86_64"],
+    "Linux aarch64 (Jetson, Raspberry Pi)": ["manylinux_2_28_aarch64", "manylinux_2_17_aarch64"],
+    "macOS 14 on Apple silicon": [f"macosx_{version}_0_arm64" for version in range(11, 15)],
+}
+PYTHONS = ("3.11", "3.14")
+"""The oldest and the newest that are supported."""
+
+
+def main() -> int:
+    """Ask for every combination, say what came out."""
+    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    failed = False
+    for name, tags in PLATFORMS.items():
+        for python in PYTHONS:
+            with tempfile.TemporaryDirectory() as folder:
+                command = [
+                    sys.executable,
+                    "-m",
+                    "pip",
+                    "install",
+                    "--dry-run",
+                    "--quiet",
+                    "--ignore-installed",
+                    "--only-binary=:all:",
+                ]
+                where = [f"--platform={tag}" for tag in tags] + [f"--python-version={python}", f"--target={folder}"]
+                run = subprocess.run([*command, *where, *dependencies], capture_output=True, text=True, check=False)
+            if run.returncode and UNREACHABLE.search(run.stderr):
+                print("platforms: not checked, the package index cannot be reached")
+                return 0
+            print(f"platforms: Python {python} on {name}: {'no wheel' if run.returncode else 'wheels for everything'}")
+            if run.returncode:
+                print("\n".join(line for line in run.stderr.splitlines() if "ERROR" in line))
+                failed = True
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
