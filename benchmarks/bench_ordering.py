@@ -3,9 +3,10 @@
     python benchmarks/bench_ordering.py [--only cube disc] [--rounds 5]
 
 Graphs: a cube of grid points, points in a disc and in a ball joined to their nearest neighbours, a walk over a Manhattan grid
-that comes back to where it was, each with 6 scalars a node and generated from a seed, and those of --graphs. "Operations" is the sum
-of the squares of the factor's column lengths, counted exactly. METIS is timed by processor time with its default settings; ours
-as `order` calls it: minimum degree first, nested dissection where that pays. Without pymetis there is nothing to compare with.
+that comes back to where it was, each with 6 scalars a node and generated from a seed, and those of --graphs. "Operations" is the
+sum of the squares of the factor's column lengths, counted exactly. METIS is timed by processor time with its default settings;
+ours as `order` calls it: minimum degree first, nested dissection where that pays. Without pymetis there is nothing to compare
+with.
 """
 
 from __future__ import annotations
