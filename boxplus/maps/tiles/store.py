@@ -125,14 +125,34 @@ class TileStore:
         Raises:
             InputError: a segment was removed or damaged since the map was opened.
         """
-        edge = self.manifest.voxel_m if voxel is None else voxel
         for index in self.counts:
-            parts = [self._read_segment(path) for path in self._segments.get(index, [])]
-            records = np.concatenate(parts + self._unsorted.get(index, []))
-            if edge is not None:
-                records = records[first_per_voxel(records, edge)]
-            intensity = np.ascontiguousarray(records[:, 3]) if records.shape[1] == 4 else None
-            yield Tile(index, np.ascontiguousarray(records[:, :3]), intensity)
+            yield self.read_tile(index, voxel)
+
+    def read_tile(self, index: TileIndex, voxel: float | None = None, damaged: list[str] | None = None) -> Tile:
+        """One tile of `counts`.
+
+        Args:
+            voxel: as for `iter_tiles`.
+            damaged: given a list, segments that cannot be read are left out and named in it.
+
+        Raises:
+            InputError: a segment was removed or damaged since the map was opened, and `damaged` is None.
+        """
+        edge = self.manifest.voxel_m if voxel is None else voxel
+        parts = []
+        for path in self._segments.get(index, []):
+            try:
+                parts.append(self._read_segment(path))
+            except InputError as error:
+                if damaged is None:
+                    raise
+                damaged.append(str(error))
+        parts += self._unsorted.get(index, [])
+        records = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+        if edge is not None:
+            records = records[first_per_voxel(records, edge)]
+        intensity = np.ascontiguousarray(records[:, 3]) if records.shape[1] == 4 else None
+        return Tile(index, np.ascontiguousarray(records[:, :3]), intensity)
 
     def _read_segment(self, path: Path) -> NDArray[np.float32]:
         cloud = read_ply(path)

@@ -1,0 +1,151 @@
+"""Open a map that an earlier run saved, or a bare cloud: its points around any position, and its local maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.pcd import read_pcd
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
+from boxplus.maps.tiles.store import TileStore
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+from boxplus.runs.output_folder import SUMMARY, program_of
+from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.saved_map.places import along, over_ground
+from boxplus.runs.saved_map.tiled_points import TiledPoints
+
+_ROUNDING = 0.01  # m, by which a point may lie outside of its tile
+_TILE = 32.0  # m, in memory, of a cloud from a file
+_WHAT = "a folder of 'boxplus lio' or 'boxplus slam', a map folder with tiles, or a PLY or PCD file"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedMap:
+    """A map from disk.
+
+    Attributes:
+        path: what was opened.
+        kind: "boxplus lio", "boxplus slam", "map folder" or "point cloud".
+        local_maps: places in it; T_odo_map (7,) is the pose of each in the map's frame, z up, and its points are those that can
+            be seen from there. Covariances are those of the trajectory, zero for a map without one.
+        trajectory: the poses it was made on, in the map's frame; None for a bare map.
+        voxel: one point per voxel of this edge is given [m].
+        report: sentences on what is torn, left out, or had to be computed. It grows where a tile turns out damaged later.
+    """
+
+    path: Path
+    kind: str
+    local_maps: list[LocalMap]
+    trajectory: Trajectory | None
+    voxel: float
+    report: list[str]
+    _points: TiledPoints
+
+    def points_near(self, centre: ArrayLike, radius: float) -> NDArray[np.float32]:
+        """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
+        return self._points.near(centre, radius)
+
+
+def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> SavedMap:
+    """Open a run's folder, a folder with map tiles, or a PLY or PCD file, as a map.
+
+    Of a run, the (corrected) trajectory says where its local maps are. Without one they stand on a grid over the ground, which is
+    said in `report`. z is taken to be up.
+
+    Args:
+        config: where local maps are cut, their voxel and range.
+
+    Raises:
+        InputError: none of these; no map in it, or no point; a trajectory without times.
+
+    Example:
+        `saved = open_saved_map("run1_slam"); saved.points_near([0.0, 0.0, 0.0], 30.0)`
+    """
+    config = config if config is not None else LocalMapConfig()  # type: ignore[call-arg]
+    base = Path(path)
+    if not base.exists():
+        raise InputError(_WHAT, f"nothing at {base}", "check the path")
+    report: list[str] = []
+    kind, trajectory = "point cloud", None
+    if base.is_file():
+        points = _of_file(base, config.voxel)
+    else:
+        tiles, kind, trajectory = _what_is_in(base, report)
+        points = _of_tiles(tiles, config.voxel, report)
+    if not points.tiles:
+        raise InputError("a map with points", f"none in {base}", "; ".join(report) or "give the map of a run that went through")
+    if trajectory is not None:
+        local_maps = along(trajectory, points.near, config)
+        report.append(f"{len(local_maps)} local maps were computed from the map along its trajectory")
+    else:
+        local_maps, spacing = over_ground(points, points.near, config)
+        report.append(
+            f"the map has no trajectory: {len(local_maps)} local maps were computed over its ground, every {spacing:g} m, and "
+            "z is taken to be up"
+        )
+    if not local_maps:
+        raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
+    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points)
+
+
+def _what_is_in(base: Path, report: list[str]) -> tuple[Path, str, Trajectory | None]:
+    """The folder with the tiles, what wrote it, and the trajectory they were made on."""
+    if (base / MANIFEST).is_file():
+        run = base.parent
+        if (run / SUMMARY).is_file() and RunFolder(run).tiles == base and RunFolder(run).trajectory.is_file():
+            report.append(f"the map belongs to the run in {run}, whose trajectory is used")
+            return base, program_of(run / SUMMARY) or "map folder", _trajectory(run, report)
+        return base, "map folder", None
+    folder = RunFolder(base)
+    if not (folder.tiles / MANIFEST).is_file():
+        raise InputError(_WHAT, f"a folder without map tiles, {base}", "run without --no-map")
+    kind = (program_of(base / SUMMARY) if (base / SUMMARY).is_file() else None) or "map folder"
+    return folder.tiles, kind, _trajectory(base, report) if folder.trajectory.is_file() else None
+
+
+def _trajectory(run: Path, report: list[str]) -> Trajectory:
+    trajectory = read_trajectory(RunFolder(run).trajectory)
+    report.extend(trajectory.warnings)
+    trajectory.times  # noqa: B018 - refuses one without times
+    return trajectory
+
+
+def _of_tiles(folder: Path, voxel: float, report: list[str]) -> TiledPoints:
+    store = TileStore.open(folder)
+    report.extend(store.report)
+
+    size = store.manifest.tile_size_m
+
+    def read(index: TileIndex) -> NDArray[np.float32]:
+        damaged: list[str] = []
+        points = store.read_tile(index, damaged=damaged).points
+        report.extend(f"a tile is damaged, and what could not be read is left out: {text}" for text in damaged)
+        # Overwritten bytes read as numbers too; those of a tile lie in it.
+        low = np.array(index) * size
+        inside = ((points >= low - _ROUNDING) & (points <= low + size + _ROUNDING)).all(axis=1)
+        if not inside.all():
+            name = tile_folder(folder, index).name
+            report.append(f"tile {name} is damaged: {np.count_nonzero(~inside)} of its points lie outside of it and are left out")
+            points = points[inside]
+        return np.ascontiguousarray(points[first_per_voxel(points, voxel)])
+
+    return TiledPoints(store.counts, store.manifest.tile_size_m, read)
+
+
+def _of_file(path: Path, voxel: float) -> TiledPoints:
+    """A cloud is kept in memory as a whole, thinned."""
+    readers = {".ply": read_ply, ".pcd": read_pcd}
+    if path.suffix.lower() not in readers:
+        raise InputError(_WHAT, f"a file {path.name}", "convert it to PLY or PCD")
+    points = readers[path.suffix.lower()](path).points
+    points = points[np.isfinite(points).all(axis=1)]
+    tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
+    return TiledPoints(tiles, _TILE, lambda index: tiles[index])

@@ -1,0 +1,143 @@
+"""A saved map from a run's folder, from tiles alone, from a cloud; with damaged tiles; and what is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.pcd import write_pcd
+from boxplus.formats.ply import write_ply
+from boxplus.formats.trajectory_writer import TrajectoryWriter
+from boxplus.manifolds import se3
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.visibility import visible
+from boxplus.maps.tiles.writer import TileWriter
+from boxplus.runs.saved_map.saved_map import SavedMap, open_saved_map
+
+CONFIG = LocalMapConfig(length=8.0, voxel=0.25, max_range=30.0)
+
+
+def two_rooms() -> NDArray[np.float32]:
+    """Two rooms of 12 m × 8 m × 3 m side by side along y with a wall between, points every 0.2 m; and nothing above."""
+    x, y, z = np.arange(0.1, 12.0, 0.2), np.arange(0.1, 16.0, 0.2), np.arange(0.1, 3.0, 0.2)
+    floor = np.stack(np.meshgrid(x, y, [0.0]), axis=-1).reshape(-1, 3)
+    walls = [np.stack(np.meshgrid(x, [at], z), axis=-1).reshape(-1, 3) for at in (0.0, 8.0, 16.0)]
+    ends = [np.stack(np.meshgrid([at], y, z), axis=-1).reshape(-1, 3) for at in (0.0, 12.0)]
+    return np.concatenate([floor, *walls, *ends]).astype(np.float32)
+
+
+def write_run(folder: Path, points: NDArray[np.float32]) -> None:
+    """What is read of a run: its summary, its trajectory through the first room, its tiles."""
+    folder.mkdir()
+    (folder / "run.json").write_text(json.dumps({"program": "boxplus slam"}))
+    with TrajectoryWriter(folder) as writer:
+        for k in range(21):
+            status = "lost" if k == 20 else "ok"
+            at = (50.0, 50.0, 0.0) if k == 20 else (1.0 + 0.5 * k, 4.0, 1.2)
+            writer.append(k * 100_000_000, np.eye(3), np.array(at), 1e-6 * (k + 1) * np.eye(6), status)
+    with TileWriter(folder / "map", tile_size=10.0) as tiles:
+        tiles.append(points)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("saved") / "run"
+    write_run(folder, two_rooms())
+    return folder
+
+
+def in_map(saved: SavedMap, number: int) -> NDArray[np.float64]:
+    local_map = saved.local_maps[number]
+    return se3.act(local_map.T_odo_map, local_map.points.astype(np.float64))
+
+
+def test_of_a_run_local_maps_stand_on_its_trajectory_and_hold_what_is_seen_from_there(run: Path) -> None:
+    saved = open_saved_map(run, CONFIG)
+    assert saved.kind == "boxplus slam" and saved.trajectory is not None and len(saved.trajectory) == 21
+    assert len(saved.local_maps) == 2
+    for number, local_map in enumerate(saved.local_maps):
+        assert local_map.number == number
+        np.testing.assert_allclose(local_map.T_odo_map[[5, 6]], [4.0, 1.2], atol=1e-6)
+        assert local_map.T_odo_map[4] < 11.0  # the scan that was lost at x = 50 makes none
+        points = in_map(saved, number)
+        assert len(points) > 2000
+        # The wall at y = 8 hides the second room; a little behind a surface is let through.
+        assert np.mean(points[:, 1] > 10.0) < 0.01
+        assert np.mean(points[:, 1] < 8.1) > 0.9
+    assert np.linalg.norm(saved.local_maps[1].covariance) > 0.0
+    assert any("2 local maps were computed" in text for text in saved.report)
+
+
+def test_the_map_folder_within_a_run_is_that_run(run: Path) -> None:
+    inner = open_saved_map(run / "map", CONFIG)
+    assert inner.kind == "boxplus slam" and len(inner.local_maps) == 2
+    assert any("belongs to the run" in text for text in inner.report)
+
+
+def test_points_near_are_all_of_the_map_within_the_radius(run: Path) -> None:
+    saved, points = open_saved_map(run, CONFIG), two_rooms()
+    centre = np.array([9.0, 9.5, 1.0])
+    near = saved.points_near(centre, 3.0)
+    assert (np.linalg.norm(near - centre, axis=1) <= 3.0 + 1e-5).all()
+    expected = points[np.linalg.norm(points - centre, axis=1) <= 2.5]
+    gap = np.linalg.norm(expected[:, None] - near[None], axis=2).min(axis=1)
+    assert gap.max() <= np.sqrt(3.0) * saved.voxel  # one a voxel is left of them
+    assert len(saved.points_near([500.0, 0.0, 0.0], 3.0)) == 0
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_a_bare_cloud_has_places_over_its_ground(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    (write_ply if suffix == ".ply" else write_pcd)(path, two_rooms())
+    saved = open_saved_map(path, CONFIG)
+    assert saved.kind == "point cloud" and saved.trajectory is None
+    eyes = np.stack([m.T_odo_map[4:] for m in saved.local_maps])
+    on_floor = eyes[eyes[:, 2] < 3.0]
+    assert len(on_floor) >= 6 and (np.abs(on_floor[:, 2] - 2.0) < 0.3).all()
+    assert {bool(y > 8.0) for y in on_floor[:, 1]} == {True, False}  # in either room
+    assert any("no trajectory" in text and "z is taken to be up" in text for text in saved.report)
+
+
+def test_a_damaged_tile_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", two_rooms())
+    segments = sorted((tmp_path / "run" / "map" / "tiles").glob("*/*.ply"))
+    cut, overwritten = segments[0], segments[-1]
+    cut.write_bytes(cut.read_bytes()[:-100])
+    content = bytearray(overwritten.read_bytes())
+    content[-600:-300] = b"\x7f" * 300
+    overwritten.write_bytes(bytes(content))
+    saved = open_saved_map(tmp_path / "run", CONFIG)
+    saved.points_near([6.0, 8.0, 1.0], 30.0)
+    assert any(str(cut) in text and "damaged" in text for text in saved.report)
+    assert any(overwritten.parent.name in text and "lie outside" in text for text in saved.report)
+    assert np.isfinite(saved.points_near([6.0, 8.0, 1.0], 30.0)).all()
+    assert len(saved.local_maps) == 2 and all(len(m.points) > 500 for m in saved.local_maps)
+
+
+def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing at"):
+        open_saved_map(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="without map tiles"):
+        open_saved_map(tmp_path / "empty")
+    (tmp_path / "text.txt").write_text("no points")
+    with pytest.raises(InputError, match="convert it to PLY or PCD"):
+        open_saved_map(tmp_path / "text.txt")
+    with TileWriter(tmp_path / "none"):
+        pass
+    with pytest.raises(InputError, match="a map with points"):
+        open_saved_map(tmp_path / "none")
+
+
+def test_what_a_wall_hides_is_not_visible() -> None:
+    random = np.random.default_rng(4)
+    near = np.column_stack([np.full(4000, 4.0), random.uniform(-4, 4, 4000), random.uniform(-2, 2, 4000)])
+    points = np.concatenate([near, 3.0 * near]).astype(np.float32)
+    mask = visible(points, [0.0, 0.0, 0.0], 50.0)
+    assert mask[:4000].all() and np.mean(mask[4000:]) < 0.05
+    assert not visible(points, [0.0, 0.0, 0.0], 3.0).any()
