@@ -98,6 +98,12 @@ class EventStream(Generic[InfoT, EventT]):
     def __iter__(self) -> Iterator[EventT]:
         return self.events()
 
+    def read_again(self) -> Iterator[EventT]:
+        """The events from the beginning, beside an iteration that is over: its `rejected` and `progress` stay."""
+        tally = Tally()
+        for event in self._read(tally):
+            yield self._taken(event, tally)
+
     @property
     def rejected(self) -> dict[str, int]:
         """Points and messages dropped so far in the current iteration, by reason."""

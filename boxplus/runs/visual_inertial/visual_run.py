@@ -16,8 +16,9 @@ from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
-from boxplus.runs.run_facts import StartFacts, State
+from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
+from boxplus.runs.visual_inertial.causes import likely_causes
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
@@ -36,7 +37,12 @@ _TOLD = {
     "gravity, deviation [deg]": "gravity is known to {:.2f} deg",
     "scale, deviation [%]": "scale to {:.1f} %",
 }  # of the tests of a start; `run.json` has all of them
-_OWN_STATE = ("_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s")
+_OWN_STATE = (
+    "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
+    "_troubled_ns",
+)  # fmt: skip
+_MAY_BE = "this may be the cause"
+_MUCH_LOST = 0.15  # share of the frames
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -122,6 +128,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._push_s = 0.0  # since the frame before
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
         self._time_offset_s = 0.0
+        self._troubled_ns: int | None = None
+        self._causes: list[str] = []
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -149,6 +157,11 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         """See `RunLoop.at_end`."""
         super().at_end(state)
         self.seconds["writing"] += self._line_file.write()
+        lost = self.counts.status.get("lost", 0) > _MUCH_LOST * self.counts.count
+        if state == "finished" and (not self.counts.count or self._odometry.contradiction is not None or lost):
+            self.stage = "looking for the cause"
+            self.show_progress()
+            self._causes = likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
         """See `RunLoop.push`."""
@@ -171,6 +184,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         stages = dict(estimate.timing_s)
         stages["window"] = max(self._push_s - sum(stages.values()), 0.0)
         self._push_s, self.status = 0.0, estimate.status
+        if self._troubled_ns is None and (self._odometry.contradiction is not None or estimate.status == "lost"):
+            self._troubled_ns = estimate.time_ns
         self._rejected.update(estimate.rejected)
         self._lines_rejected.update(estimate.lines_rejected)
         if self._view is not None:
@@ -198,19 +213,22 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
         if self._odometry.start_problem:
             reasons.append(self._odometry.start_problem)
+        cause = f"; {_MAY_BE}: {'; '.join(self._causes)}" if self._causes else ""
         images = ", ".join(str(count) for _, count in sorted(self._images.items())) or "no"
         return InputError(
             "frames that IMU samples cover, and a start that can be found",
             f"{images} images and {self.counts.imu_samples_read} IMU samples, and no start "
-            f"({'; '.join(reasons) or 'no reason counted'})",
+            f"({'; '.join(reasons) or 'no reason counted'}){cause}",
             "see 'boxplus inspect' for what is wrong with the recording; one camera needs accelerations that change",
         )
 
     def summarize(self, state: State, error: str | None) -> VioSummary:
         """See `RunLoop.summarize`."""
         counts, start = self.counts, self._odometry.start
+        shared = self.shared_facts(state, error, with_imu=True)
+        shared["warnings"] += [WarningFacts(text=f"{_MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
-            **self.shared_facts(state, error, with_imu=True),
+            **shared,
             cameras=self._cameras(),
             start=None if start is None else _start_facts(start),
             start_facts={} if start is None else {name: float(value) for name, value in start.facts.items()},

@@ -235,3 +235,5 @@ def test_cameras_that_are_swapped_end_with_exit_code_3(tmp_path: Path) -> None:
     assert done.exit_code == 3, done.output
     contradiction = read_vio_summary(out / "run.json").contradiction
     assert contradiction is not None and "which camera is which" in contradiction
+    said = " ".join(warning.text for warning in read_vio_summary(out / "run.json").warnings)
+    assert "this may be the cause" in said and "the cameras are swapped" in said

@@ -1,0 +1,87 @@
+"""Do the sensors of a recording go together?
+
+The first two cameras by their calibration, the first one and the IMU by how both turn.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.recordings.cameras.info import CameraStream
+from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.readout import check_readout
+from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
+from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
+from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
+from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.imu import ImuSamples
+
+_STEREO_PAIRS = 12
+_MOST_TURNS = 240
+_APART = 3
+
+
+class Comparison:
+    """Notes images one by one, and says at the end what does not go together.
+
+    Args:
+        pictures: the cameras that deliver intensities.
+        images: of each that will be noted, about.
+
+    Attributes:
+        turns: of the first camera.
+    """
+
+    def __init__(self, pictures: Sequence[CameraStream], images: int) -> None:
+        self._pictures = list(pictures)
+        self._every = max(1, images // _STEREO_PAIRS)
+        self._seconds = 0  # images of the second camera so far
+        self._last: tuple[int, NDArray[np.uint8]] | None = None
+        self._corners = Corners()
+        self.turns = Turns(images=deque(maxlen=_APART))
+
+    def note(self, image: CameraImage, grey: NDArray[np.uint8]) -> None:
+        """The next image, and its grey values (H, W)."""
+        if image.camera == self._pictures[0].index:
+            self._turn(image.time_ns, grey)
+            self._last = image.time_ns, grey
+        elif len(self._pictures) > 1 and image.camera == self._pictures[1].index:
+            self._seconds += 1
+            if self._seconds % self._every == 0 and self._last is not None and self._last[0] == image.time_ns:
+                before, after = follow(self._last[1], grey)
+                self._corners.first.append(before)
+                self._corners.second.append(after)
+
+    def _turn(self, time_ns: int, grey: NDArray[np.uint8]) -> None:
+        """Note how the first camera turned since its last image."""
+        model, turns = self._pictures[0].model, self.turns
+        if model is None or turns.tried >= _MOST_TURNS:
+            return
+        # Over a few images the turn is larger and its error the same.
+        if len(turns.images) == _APART:
+            before_ns, before = turns.images[0]
+            turns.tried += 1
+            turned = rotation_between(model, before, grey)
+            turns.followed.append(turned.followed if isinstance(turned, Turned) else turned)
+            if isinstance(turned, Turned):
+                turns.add(before_ns, time_ns, turned.R_2_1, turned.before, turned.after)
+        turns.images.append((time_ns, grey))
+
+    def of_cameras(self) -> list[Evidence]:
+        """Whether the stereo calibration fits; nothing of one camera alone."""
+        return [check_calibration(self._pictures[:2], self._corners)] if len(self._pictures) > 1 else []
+
+    def with_imu(self, imu: ImuSamples) -> list[Evidence]:
+        """Whether camera and IMU turn alike, and whether all rows of an image do; nothing without a camera."""
+        if not self._pictures:
+            return []
+        camera = self._pictures[0]
+        aligned = align(self.turns, imu)
+        found = check_rotation(camera, aligned)
+        if not isinstance(aligned, str) and camera.model is not None and not any(e.value == "unlike" for e in found):
+            found += check_readout(camera, self.turns, imu, aligned)
+        return found

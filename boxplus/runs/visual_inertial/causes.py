@@ -1,0 +1,57 @@
+"""What may be the cause of a run that fails, or contradicts itself: the checks of `boxplus inspect` on the part where it did.
+
+An odometry sees that its sensors do not go together, not why. How camera and gyroscope turn, one beside the other, and where
+the corners of two cameras lie, tells clocks apart from mountings, and both from an IMU that is another's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.cameras.events import CameraEvent
+from boxplus.recordings.cameras.info import CameraRecordingInfo
+from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.comparison import Comparison
+from boxplus.sensors.eight_bits import EightBits
+from boxplus.sensors.imu import ImuSamples
+
+_BEFORE_S, _AFTER_S = 14.0, 2.0
+_MARGIN_NS = 500_000_000  # of IMU samples on both sides
+
+
+def likely_causes(info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None) -> list[str]:
+    """Sentences about what does not go together, by readings that need no odometry; none where these find nothing.
+
+    Args:
+        info: of the recording.
+        events: of it, from the beginning; sixteen seconds are looked at.
+        cameras: how many of them the run uses.
+        around_ns: when the run contradicted itself [ns]; None where it never began, and its beginning is looked at.
+    """
+    pictures = [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
+    rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
+    compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (_BEFORE_S + _AFTER_S))))
+    begin_ns = None
+    to_8_bits, imu = EightBits(), []
+    try:
+        for event in events:
+            time_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
+            if begin_ns is None:
+                begin_ns = time_ns if around_ns is None else max(time_ns, around_ns - round(1e9 * _BEFORE_S))
+                end_ns = begin_ns + round(1e9 * (_BEFORE_S + _AFTER_S))
+            if time_ns > end_ns + _MARGIN_NS:
+                break
+            if isinstance(event, ImuSamples):
+                if event.time_ns[-1] > begin_ns - _MARGIN_NS:
+                    imu.append(event)
+            elif not event.is_depth and event.camera < cameras and time_ns >= begin_ns:
+                compared.note(event, to_8_bits(event.grey()))
+    except RecordingError:
+        return []
+    found = compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu else [])
+    return [_sentence(finding) for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
+
+
+def _sentence(finding: Evidence) -> str:
+    return f"{finding.key} {finding.value}: {finding.text}"

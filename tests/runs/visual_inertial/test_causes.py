@@ -1,0 +1,76 @@
+"""What may have been the cause of a run that failed, told without an odometry."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from boxplus.recordings.cameras.events import CameraEvent
+from boxplus.recordings.cameras.info import CameraRecordingInfo
+from boxplus.runs.visual_inertial.causes import likely_causes
+from boxplus.sensors.imu import ImuSamples
+from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[CameraRecordingInfo, list[CameraEvent]]:
+    made = as_camera_recording(simulate_cameras("room_moving", 4, duration_s=7.5, rig=make_rig("mono", None, 0.35, 10.0)))
+    return made.info, list(made)
+
+
+def late(event: CameraEvent, offset_ns: int) -> CameraEvent:
+    return dataclasses.replace(event, time_ns=event.time_ns + offset_ns) if isinstance(event, ImuSamples) else event
+
+
+def test_a_sound_recording_has_no_cause(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:
+    info, events = recorded
+    assert likely_causes(info, iter(events), 1, None) == []
+
+
+def test_a_clock_that_is_off_is_named_with_its_offset(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:
+    info, events = recorded
+    (said,) = likely_causes(info, (late(event, 50_000_000) for event in events), 1, None)
+    assert "offset of the clocks" in said
+    offset_ms = float(said.split(" ms")[0].split()[-1])
+    assert abs(offset_ms - 50.0) < 10.0
+
+
+def test_a_mounting_the_wrong_way_round_is_named(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:
+    info, events = recorded
+    (camera,) = info.cameras
+    assert camera.T_body_camera is not None
+    inverted = dataclasses.replace(camera, T_body_camera=np.linalg.inv(camera.T_body_camera))
+    (said,) = likely_causes(dataclasses.replace(info, cameras=[inverted]), iter(events), 1, None)
+    assert "the inverse of what is stated fits" in said
+
+
+@pytest.mark.parametrize(("trouble_s", "read_s"), [(None, 16.0), (5.0, 16.0), (40.0, 42.0)])
+def test_sixteen_seconds_are_looked_at(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]], trouble_s: float | None, read_s: float
+) -> None:
+    info, _ = recorded
+    read: list[float] = []
+
+    def samples() -> Iterator[CameraEvent]:
+        for k in range(120):
+            read.append(0.5 * k)
+            yield ImuSamples.from_arrays(np.array([500_000_000 * k]), np.zeros((1, 3)), np.zeros((1, 3)))
+
+    assert likely_causes(info, samples(), 1, None if trouble_s is None else round(1e9 * trouble_s)) == []
+    assert abs(read[-1] - read_s) <= 1.0
+
+
+def test_reading_again_leaves_the_counts_of_the_reading_before() -> None:
+    made = as_camera_recording(simulate_cameras("room_moving", 4, duration_s=0.5, rig=make_rig("mono", None, 0.2, 10.0)))
+    events = list(made)
+    assert made.progress == 1.0
+    again = made.read_again()
+    next(again)
+    assert made.progress == 1.0
+    assert 1 + len(list(again)) == len(events)
