@@ -1,4 +1,4 @@
-"""`boxplus map`: look into a map folder and merge its tiles into one file."""
+"""`boxplus map`: look into a map folder, and write its tiles as one file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from boxplus.errors import InputError
 
 map_app = typer.Typer(
     name="map",
-    help="Look into a map folder, or merge its tiles into one file.",
+    help="Look into a map folder, or write its tiles as one file.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -44,8 +44,8 @@ def info_command(folder: _Folder) -> None:
         typer.echo(sentence)
 
 
-@map_app.command("merge")
-def merge_command(
+@map_app.command("export")
+def export_command(
     folder: _Folder,
     ply: Annotated[Path | None, typer.Option(help="PLY file to write; default without --pcd: FOLDER.ply.")] = None,
     pcd: Annotated[Path | None, typer.Option(help="PCD file to write.")] = None,

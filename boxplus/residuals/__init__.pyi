@@ -1,3 +1,4 @@
+from .anchored_pose import AnchoredRelativePose as AnchoredRelativePose
 from .antenna_position import AntennaPosition as AntennaPosition
 from .camera.bal_reprojection import BalCamera as BalCamera
 from .camera.bal_reprojection import BalReprojection as BalReprojection

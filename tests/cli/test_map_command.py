@@ -1,4 +1,4 @@
-"""`boxplus map info` and `boxplus map merge`."""
+"""`boxplus map info` and `boxplus map export`."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def test_info(folder: Path) -> None:
     assert "whole: the run that wrote it closed it" in result.output
 
 
-def test_merge(folder: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(map_app, ["merge", str(folder)])
+def test_export(folder: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
     assert result.exit_code == 0
     assert len(read_ply(tmp_path / "map.ply")) == 3
-    result = CliRunner().invoke(map_app, ["merge", str(folder), "--pcd", str(tmp_path / "a.pcd"), "--voxel", "0.5"])
+    result = CliRunner().invoke(map_app, ["export", str(folder), "--pcd", str(tmp_path / "a.pcd"), "--voxel", "0.5"])
     assert result.output.startswith("2 points → ")
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").intensity, [3.0, 1.0])
 
 
-def test_merge_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:
+def test_export_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "map.ply").write_text("mine")
-    result = CliRunner().invoke(map_app, ["merge", str(folder)])
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
     assert isinstance(result.exception, InputError)
     assert (tmp_path / "map.ply").read_text() == "mine"
-    assert CliRunner().invoke(map_app, ["merge", str(folder), "--overwrite"]).exit_code == 0
+    assert CliRunner().invoke(map_app, ["export", str(folder), "--overwrite"]).exit_code == 0
     assert len(read_ply(tmp_path / "map.ply")) == 3
 
 
@@ -56,13 +56,13 @@ def test_the_output_folder_of_a_run_will_do(folder: Path, tmp_path: Path) -> Non
 def test_a_dot_in_the_folder_is_kept(tmp_path: Path) -> None:
     with TileWriter(tmp_path / "map.v1") as writer:
         writer.append([[1.0, 2.0, 3.0]])
-    assert CliRunner().invoke(map_app, ["merge", str(tmp_path / "map.v1")]).exit_code == 0
+    assert CliRunner().invoke(map_app, ["export", str(tmp_path / "map.v1")]).exit_code == 0
     assert (tmp_path / "map.v1.ply").is_file()
 
 
-def test_merge_of_an_interrupted_run_warns(folder: Path) -> None:
+def test_export_of_an_interrupted_run_warns(folder: Path) -> None:
     writer = TileWriter(folder)
-    result = CliRunner().invoke(map_app, ["merge", str(folder)])
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
     assert "warning: the run that wrote this map did not close it" in result.output
     writer.close()
 

@@ -111,6 +111,12 @@ def _relative(kind: Callable[..., Residual], manifold: Manifold) -> Callable[[np
     return case
 
 
+def _anchored(rng: np.random.Generator) -> Case:
+    A, T = SE3.random(rng, 2), SE3.random(rng, COUNT)
+    second = _near(rng, se3.compose(se3.inverse(A[1]), se3.compose(A[0], T)))
+    return residuals.AnchoredRelativePose(SE3.random(rng, 1).repeat(COUNT, axis=0)), [A[0], T, A[1], second]
+
+
 def _prior(rng: np.random.Generator) -> Case:
     mean = SE3.random(rng, COUNT)
     return residuals.Prior(SE3, mean), [SE3.boxplus(mean, rng.uniform(-1.5, 1.5, (COUNT, 6)))]
@@ -169,6 +175,7 @@ def _marginal(rng: np.random.Generator) -> Case:
 
 
 CASES: dict[str, Callable[[np.random.Generator], Case]] = {
+    "AnchoredRelativePose": _anchored,
     "AntennaPosition": _antenna,
     "BalReprojection": _bal,
     "ChordalPose": _relative(residuals.ChordalPose, SE3),

@@ -25,10 +25,15 @@ from boxplus.systems.slam.odometry_chain import OdometryChain, mahalanobis
 _EXACT = 200  # loops up to which the largest set is found exactly
 
 
-def cycle_error(a: Loop, b: Loop, odometry: OdometryChain, odometry_scale: float = 1.0) -> float:
-    """By how many standard deviations the cycle of two loops does not close; the odometry's are scaled."""
+def cycle_error(
+    a: Loop, b: Loop, odometry: OdometryChain, odometry_scale: float = 1.0, of_places: OdometryChain | None = None
+) -> float:
+    """By how many standard deviations the cycle of two loops does not close; the odometry's are scaled.
+
+    `of_places` is the odometry of the places, where these are of another session than the queries.
+    """
     T_kl, S_kl = odometry.between(a.query, b.query)
-    T_ji, S_ji = odometry.between(b.place, a.place)
+    T_ji, S_ji = (odometry if of_places is None else of_places).between(b.place, a.place)
     Z_a, Z_b = a.T_place_query, b.T_place_query
     end = se3.compose(se3.inverse(Z_b), T_ji)
     A_a = se3.adjoint(se3.inverse(se3.compose(T_kl, end)))
@@ -38,11 +43,11 @@ def cycle_error(a: Loop, b: Loop, odometry: OdometryChain, odometry_scale: float
     return mahalanobis(se3.log(se3.compose(se3.compose(Z_a, T_kl), end)), S)
 
 
-def agree(a: Loop, b: Loop, odometry: OdometryChain, config: SlamConfig) -> bool:
+def agree(a: Loop, b: Loop, odometry: OdometryChain, config: SlamConfig, of_places: OdometryChain | None = None) -> bool:
     """Whether the cycle of two loops closes as well as those of true ones do."""
     from scipy.stats import chi2
 
-    return cycle_error(a, b, odometry, config.odometry_scale) ** 2 <= float(chi2.ppf(config.innovation, 6))
+    return cycle_error(a, b, odometry, config.odometry_scale, of_places) ** 2 <= float(chi2.ppf(config.innovation, 6))
 
 
 def largest_clique(adjacent: NDArray[np.bool_]) -> list[int]:

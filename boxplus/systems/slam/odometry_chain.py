@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,13 @@ from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import Floats, LocalMap, relative_covariance
 
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+class RelativePoses(Protocol):
+    """Something that knows the pose of one local map in another."""
+
+    def between(self, a: int, b: int) -> tuple[Floats, Floats]:
+        """T_a_b (7,) and its covariance (6, 6) on the right."""
 
 
 class OdometryChain:

@@ -58,31 +58,38 @@ class Proposer:
         query = len(maps) - 1
         found: list[Proposal] = []
         if self._config.appearance == "density":
-            features = _described(maps[query], self._config)
-            found = [_seen(candidate) for candidate in self._densities.candidates(features, before=before, seed=query)]
+            features = described(maps[query], self._config)
+            found = [seen(candidate) for candidate in self._densities.candidates(features, before=before, seed=query)]
             self._densities.add(features)
         if self._config.appearance != "none":
             context = scan_context(maps[query].points, self._config.context_range)
             if not found:
                 alike = self._contexts.candidates(context, before=before, count=_CONTEXTS)
-                found = [self._turned(maps, place, yaw) for place, far, yaw in alike if far <= self._config.context_distance]
+                found = [
+                    turned(maps[query], maps[place], place, yaw, self._config)
+                    for place, far, yaw in alike
+                    if far <= self._config.context_distance
+                ]
             self._contexts.add(context)
         return found + (_near(query, odometry, before, T_map, self._config) if before > 0 else [])
 
-    def _turned(self, maps: Sequence[LocalMap], place: int, yaw: float) -> Proposal:
-        """A scan context tells the yaw; where the query is in the place, the correlation of the density images does."""
-        T = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), 0.0, 0.0, 0.0])
-        T[4:6] = best_shift(maps[-1].points, maps[place].points, T, self._config.descriptor.cell, _CONTEXT_REACH)
-        return Proposal(place, T, "scan context")
 
-
-def _described(local_map: LocalMap, config: SlamConfig) -> Features:
+def described(local_map: LocalMap, config: SlamConfig) -> Features:
+    """The features of a local map; none of one without points."""
     if not len(local_map.points):  # of lost scans only: nothing to be recognised by, but the index counts on
         return Features(np.zeros((0, 2)), np.zeros((0, WORDS), np.uint64))
     return describe(local_map.points, config.descriptor)
 
 
-def _seen(candidate: Candidate) -> Proposal:
+def turned(query: LocalMap, place: LocalMap, number: int, yaw: float, config: SlamConfig) -> Proposal:
+    """A scan context tells the yaw; where the query is in the place, the correlation of the density images does."""
+    T = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), 0.0, 0.0, 0.0])
+    T[4:6] = best_shift(query.points, place.points, T, config.descriptor.cell, _CONTEXT_REACH)
+    return Proposal(number, T, "scan context")
+
+
+def seen(candidate: Candidate) -> Proposal:
+    """A place whose density image looks like the query's."""
     yaw = candidate.motion.yaw
     T = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), *candidate.motion.t, 0.0])
     return Proposal(candidate.place, T, "appearance", candidate.inliers)

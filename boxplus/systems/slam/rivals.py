@@ -55,6 +55,34 @@ def rival_shifts(
     return np.array(found).reshape(-1, 2)
 
 
+def turned_rivals(
+    query: NDArray[np.float32],
+    place: NDArray[np.float32],
+    T_place_query: Floats,
+    *,
+    cell: float,
+    reach: float,
+    share: float,
+) -> list[Floats]:
+    """Poses (7,) of the query turned by a quarter, half and three quarters of a turn at which the images agree nearly as well.
+
+    Args:
+        reach: of the shift beside the turn [m].
+        share: of the agreement where it was laid.
+    """
+    here = float(_agreement(query, place, T_place_query, cell, cell)[0][0, 0])
+    found: list[Floats] = []
+    for turn in (0.5 * np.pi, np.pi, 1.5 * np.pi):
+        T = se3.compose(T_place_query, np.array([np.cos(0.5 * turn), 0.0, 0.0, np.sin(0.5 * turn), 0.0, 0.0, 0.0]))
+        agreement, shift = _agreement(query, place, T, cell, reach)
+        near = (shift**2).sum(axis=-1) <= reach**2
+        k = np.unravel_index(int(np.argmax(np.where(near, agreement, -np.inf))), agreement.shape)
+        if agreement[k] >= share * here:
+            T[4:6] += shift[k]
+            found.append(T)
+    return found
+
+
 def best_shift(
     query: NDArray[np.float32], place: NDArray[np.float32], T_place_query: Floats, cell: float, reach: float
 ) -> Floats:

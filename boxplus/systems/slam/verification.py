@@ -12,7 +12,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Loop
-from boxplus.systems.slam.odometry_chain import OdometryChain, mahalanobis
+from boxplus.systems.slam.odometry_chain import RelativePoses, mahalanobis
 from boxplus.systems.slam.proposals import Proposal
 from boxplus.systems.slam.registration import Registration, Surface, fitting_share, register
 from boxplus.systems.slam.rivals import rival_shifts
@@ -33,7 +33,7 @@ def verify(
     maps: tuple[LocalMap, LocalMap],
     surfaces: tuple[Surface, Surface],
     rms_odometry: float,
-    odometry: OdometryChain,
+    odometry: RelativePoses,
     config: SlamConfig,
 ) -> Loop:
     """Lay the query over the place and ask whether that is a loop: fit, overlap both ways, innovation, rivals.
@@ -99,7 +99,7 @@ def _deformation(query: LocalMap, place: LocalMap, T_place_query: Floats) -> Flo
     return (Q + Ad @ P @ Ad.T) / 12.0
 
 
-def _far_off(loop: Loop, odometry: OdometryChain, config: SlamConfig) -> str | None:
+def _far_off(loop: Loop, odometry: RelativePoses, config: SlamConfig) -> str | None:
     """Whether no registration could bring the motion of the density images to where the odometry says one is."""
     from scipy.stats import chi2
 
@@ -114,7 +114,7 @@ def _far_off(loop: Loop, odometry: OdometryChain, config: SlamConfig) -> str | N
     return f"looks alike, but {metres:.0f} m from where the odometry puts it; that is {sigmas}"
 
 
-def _innovation(loop: Loop, found: Registration, odometry: OdometryChain, config: SlamConfig) -> tuple[float, float]:
+def _innovation(loop: Loop, found: Registration, odometry: RelativePoses, config: SlamConfig) -> tuple[float, float]:
     from scipy.stats import chi2
 
     T_odo, S_odo = odometry.between(loop.place, loop.query)
@@ -126,7 +126,7 @@ def _innovation(loop: Loop, found: Registration, odometry: OdometryChain, config
 
 
 def _refusal(
-    loop: Loop, found: Registration, own: Surface, there: Surface, odometry: OdometryChain, config: SlamConfig
+    loop: Loop, found: Registration, own: Surface, there: Surface, odometry: RelativePoses, config: SlamConfig
 ) -> str | None:
     if loop.measured < config.least_measured:
         return f"the surfaces determine {loop.measured} of 6 directions only"
@@ -144,7 +144,7 @@ def _refusal(
 
 
 def _rival(
-    loop: Loop, found: Registration, own: Surface, there: Surface, odometry: OdometryChain, config: SlamConfig
+    loop: Loop, found: Registration, own: Surface, there: Surface, odometry: RelativePoses, config: SlamConfig
 ) -> str | None:
     """A sentence on another place of the same two maps that fits as well, and that the odometry does not exclude."""
     T_odo, S_odo = odometry.between(loop.place, loop.query)

@@ -1,0 +1,1 @@
+"""Sessions of one place: where they met, and one map of them."""

@@ -1,0 +1,127 @@
+"""One pose graph over sessions: each with its own poses, an anchor in the world, and encounters between them.
+
+A session enters by its own optimum and the information there: its steps and loops are measured as they stand after its own
+optimisation, so that they cost nothing until an encounter pulls. Encounters connect two poses and two anchors (Kim et al., ICRA
+2010) and are the only residuals that may be outliers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import se3
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.graduated import graduate
+from boxplus.optimization.losses import Squared
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.residuals.anchored_pose import AnchoredRelativePose
+from boxplus.residuals.gravity_direction import GravityDirection
+from boxplus.residuals.relative_pose import RelativePose
+from boxplus.systems.sessions.encounter import Encounter
+from boxplus.systems.sessions.session import Session
+from boxplus.systems.slam.loop import Floats
+
+_INLIER = 0.999  # of true encounters within the threshold
+_DAMPING = 1e-9
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedGraph:
+    """Where the sessions are.
+
+    Attributes:
+        T_world_session: (s, 7) anchors; covariance: (s, 6, 6) on their right, of the first zero.
+        T_world_map: for each session (n, 7), its local maps.
+        is_kept: (encounters,) which of them the result rests on; errors: what each is off by, in standard deviations.
+    """
+
+    T_world_session: Floats
+    covariance: Floats
+    T_world_map: list[Floats]
+    is_kept: NDArray[np.bool_]
+    errors: Floats
+
+
+def join(sessions: Sequence[Session], encounters: Sequence[Encounter], T_start: Floats, gravity_sigma: float) -> JoinedGraph:
+    """Minimise over poses and anchors; the first session's frame is the world.
+
+    Args:
+        encounters: at least one, numbers of sessions as in `sessions`; all sessions connected.
+        T_start: (s, 7) anchors to start from.
+    """
+    graph = _Graph(sessions, encounters, T_start, gravity_sigma)
+    kept, solution = graph.solve()
+    anchors = solution[graph.anchors]
+    ends = np.cumsum([len(session.maps) for session in sessions])[:-1]
+    within = np.split(solution[graph.poses], ends)
+    return JoinedGraph(
+        anchors,
+        solution.covariance(graph.anchors[np.arange(len(sessions))]),
+        [se3.compose(np.broadcast_to(A, T.shape), T) for A, T in zip(anchors, within, strict=True)],
+        kept,
+        np.sqrt(graph.encounters.squares(solution.values)),
+    )
+
+
+class _Graph:
+    def __init__(
+        self, sessions: Sequence[Session], encounters: Sequence[Encounter], T_start: Floats, gravity_sigma: float
+    ) -> None:
+        self.problem = problem = Problem()
+        counts = [len(session.maps) for session in sessions]
+        first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        poses = np.concatenate([session.T_session_map for session in sessions])
+        self.poses = x = problem.add_variables(SE3, poses, name="poses")
+        self.anchors = A = problem.add_variables(SE3, T_start, name="anchors")
+        steps = np.concatenate([begin + np.arange(count - 1) for begin, count in zip(first, counts, strict=True)]).astype(
+            np.int64
+        )
+        if len(steps):
+            covariance = np.concatenate([np.stack([m.covariance for m in s.maps])[1:] for s in sessions if len(s.maps) > 1])
+            measured = se3.compose(se3.inverse(poses[steps]), poses[steps + 1])
+            problem.add_residuals(RelativePose(measured, covariance=covariance), x[steps], x[steps + 1], name="odometry")
+        for number, (session, begin, count) in enumerate(zip(sessions, first, counts, strict=True)):
+            vertical = GravityDirection(np.tile(_UP, (count, 1)), session.up, sigma=gravity_sigma)
+            problem.add_residuals(vertical, x[begin + np.arange(count)], name=f"gravity_{number}")
+            if session.loops:
+                i, j = begin + np.array([[loop.place, loop.query] for loop in session.loops]).T
+                own = RelativePose(
+                    se3.compose(se3.inverse(poses[i]), poses[j]), information=np.stack([k.information for k in session.loops])
+                )
+                problem.add_residuals(own, x[i], x[j], name=f"loops_{number}")
+        if len(sessions) > 1:
+            ups = np.stack([session.up for session in sessions])
+            level = GravityDirection(ups[1:], ups[0], sigma=gravity_sigma)
+            problem.add_residuals(level, A[np.arange(1, len(sessions))], name="level")
+        residual = AnchoredRelativePose(
+            np.stack([e.loop.T_place_query for e in encounters]), information=np.stack([e.loop.information for e in encounters])
+        )
+        a, i, b, j = np.array(
+            [
+                (e.place_session, first[e.place_session] + e.loop.place, e.query_session, first[e.query_session] + e.loop.query)
+                for e in encounters
+            ]
+        ).T
+        self.encounters = problem.add_residuals(residual, A[a], x[i], A[b], x[j], name="encounters")
+        problem.fix(A[0:1])
+        problem.fix(x[first])
+
+    def solve(self) -> tuple[NDArray[np.bool_], Solution]:
+        """Which encounters are kept, and the minimum with them."""
+        from scipy.stats import chi2
+
+        options = SolverOptions(initial_damping=_DAMPING)
+        threshold = math.sqrt(float(chi2.ppf(_INLIER, 6)))
+        found = graduate(self.problem, self.encounters, loss="truncated", inlier_threshold=threshold, options=options)
+        self.encounters.set_loss(Squared())
+        kept = found.inliers["encounters"]
+        self.problem.set_weights(self.encounters, kept.astype(np.float64))
+        return kept, self.problem.solve(options, start=found.solution)

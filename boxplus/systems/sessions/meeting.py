@@ -1,0 +1,269 @@
+"""Did two sessions meet? Nothing is known of where one began in the other, so that one encounter alone proves nothing.
+
+1. *Encounters*: what looks alike, where a second local map looks alike at the same alignment, is laid over each other, with
+   every test of a loop but that of the odometry. Where the same maps fit as well elsewhere, within `reach` or turned, they say
+   nothing.
+2. *Agreement*: two encounters close a cycle with the ways of both sessions; the largest set in which all pairs do is the
+   hypothesis.
+3. *Prediction*: the hypothesis says which other local maps lie over each other. It is right only if they do.
+4. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
+   look like one of the other: refused.
+5. *Support*: enough encounters, of different local maps, along a way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from boxplus.manifolds import se3
+from boxplus.systems.sessions.config import SessionsConfig
+from boxplus.systems.sessions.encounter import Encounter, Meeting
+from boxplus.systems.sessions.graph import JoinedGraph, join
+from boxplus.systems.sessions.places import Places
+from boxplus.systems.slam.consistency import agree, largest_clique
+from boxplus.systems.slam.loop import Floats, Loop
+from boxplus.systems.slam.proposals import Proposal
+from boxplus.systems.slam.registration import fitting_share, register
+from boxplus.systems.slam.rivals import turned_rivals
+from boxplus.systems.slam.verification import verify
+
+_START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+_SIGMAS_OF_REACH = 7.0  # standard deviations of the position of a proposal that make up the reach in which rivals are tried
+_TILT, _YAW = 0.03, 0.1  # rad, of a proposal
+_RIVAL_AGREEMENT, _AS_GOOD = 0.6, 0.95  # of density images and of fitting points, for a rival that is turned
+_TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
+_BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: by which two likenesses of one alignment differ
+_PREDICTED = 2  # places that are looked at for each local map of the query session
+_FIRST = 2  # encounters that agree make a hypothesis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Belief:
+    """What is believed of the pose of one local map of the query session in one of the place session."""
+
+    T_place_query: Floats
+    covariance: Floats
+
+    def between(self, a: int, b: int) -> tuple[Floats, Floats]:
+        """See `RelativePoses`; whatever is asked for, it is this pair."""
+        del a, b
+        return self.T_place_query, self.covariance
+
+
+def meet(place: Places, query: Places, config: SessionsConfig, numbers: tuple[int, int] = (0, 1)) -> Meeting:
+    """Look for encounters of two sessions and decide whether they were at the same place.
+
+    Args:
+        numbers: of the place session and of the query session, for the result.
+    """
+    return _Meeting(place, query, config, numbers).decide()
+
+
+class _Meeting:
+    def __init__(self, place: Places, query: Places, config: SessionsConfig, numbers: tuple[int, int]) -> None:
+        self.place, self.query, self.config, self.numbers = place, query, config, numbers
+        self.loops: dict[tuple[int, int], Loop] = {}
+        self.proposed = 0
+
+    def decide(self) -> Meeting:
+        self._look_for_encounters()
+        standing = [loop for loop in self.loops.values() if loop.refusal is None]
+        if len({loop.query for loop in standing}) < _FIRST:
+            return self._refused(self._nothing_found())
+        chosen = self._largest_agreeing(standing)
+        if len(_queries(chosen)) < _FIRST:
+            return self._refused(f"{len(standing)} encounters fit, but no two of them agree on where one session is in the other")
+        predicted, confirmed, found = self._check_predictions(chosen)
+        if rival := self._rival(standing, chosen, confirmed):
+            return self._refused(rival, predicted, confirmed)
+        self._take(found)
+        standing = [loop for loop in self.loops.values() if loop.refusal is None]
+        chosen = self._largest_agreeing(standing)
+        if refusal := self._too_little(chosen, predicted, confirmed):
+            return self._refused(refusal, predicted, confirmed)
+        joined = self._joined(chosen)
+        kept = {id(loop) for loop, is_kept in zip(chosen, joined.is_kept, strict=True) if is_kept}
+        if refusal := self._too_little([loop for loop in chosen if id(loop) in kept], predicted, confirmed):
+            return self._refused(refusal, predicted, confirmed)
+        against = "contradicts the encounters that agree with each other"
+        final = [
+            loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)
+            for loop in self.loops.values()
+        ]
+        final = [replace(loop, weight=float(loop.refusal is None)) for loop in final]
+        return Meeting(*self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed)
+
+    def _refused(self, why: str, predicted: int = 0, confirmed: int = 0) -> Meeting:
+        return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, why)
+
+    def _nothing_found(self) -> str:
+        if not self.loops:
+            alike = f"{self.proposed} pairs of local maps look alike, but no two at one alignment"
+            return alike if self.proposed else "no local map of one looks like one of the other"
+        ambiguous = sum(
+            loop.refusal is not None and loop.refusal.startswith("the maps fit as well") for loop in self.loops.values()
+        )
+        if ambiguous >= _FIRST:
+            return f"what they have in common looks the same in several places: {ambiguous} encounters fit as well elsewhere"
+        passed = sum(loop.refusal is None for loop in self.loops.values())
+        return f"{len(self.loops)} pairs of local maps look alike at one alignment, and {passed or 'none'} of them fit"
+
+    def _look_for_encounters(self) -> None:
+        """Step 1."""
+        c = self.config
+        sigma = np.array([_TILT, _TILT, _YAW, *[c.reach / _SIGMAS_OF_REACH] * 3])
+        proposals = [(k, proposal) for k in range(len(self.query)) for proposal in self.place.proposals(self.query, k)]
+        self.proposed = len(proposals)
+        for number, proposal in self._seconded(proposals):
+            self._take([self._verified(number, proposal, _Belief(proposal.T_start, np.diag(sigma**2)))])
+
+    def _seconded(self, proposals: list[tuple[int, Proposal]]) -> list[tuple[int, Proposal]]:
+        """Those for which another local map of the query session looks alike at the same alignment, roughly."""
+        T_place, T_query = self.place.session.T_session_map, self.query.session.T_session_map
+        anchors = [
+            se3.compose(se3.compose(T_place[proposal.place], proposal.T_start), se3.inverse(T_query[number]))
+            for number, proposal in proposals
+        ]
+        kept = []
+        for a, (number, proposal) in enumerate(proposals):
+            for b, (other, _) in enumerate(proposals):
+                if other == number:
+                    continue
+                xi = se3.log(
+                    se3.compose(se3.inverse(se3.compose(anchors[a], T_query[other])), se3.compose(anchors[b], T_query[other]))
+                )
+                far = _BASIN_POSITION + _BASIN_DRIFT * self.query.way(number, other)
+                if np.linalg.norm(xi[:3]) <= _BASIN_ROTATION and np.linalg.norm(xi[3:]) <= far:
+                    kept.append((number, proposal))
+                    break
+        return kept
+
+    def _take(self, loops: list[Loop]) -> None:
+        """Keep them, one for each pair: the first that was not refused, else the last."""
+        for loop in loops:
+            known = self.loops.get((loop.query, loop.place))
+            if known is None or known.refusal is not None:
+                self.loops[loop.query, loop.place] = loop
+
+    def _verified(self, number: int, proposal: Proposal, belief: _Belief) -> Loop:
+        maps = self.query.session.maps[number], self.place.session.maps[proposal.place]
+        surfaces = self.query.surface(number), self.place.surface(proposal.place)
+        rms = max(self.query.rms(number), self.place.rms(proposal.place))
+        loop = verify(proposal, maps, surfaces, rms, belief, self.config.slam)
+        if loop.refusal is None and proposal.source != "nearby" and (turned := self._turned_rival(loop)):
+            loop = replace(loop, refusal=turned)
+        return loop
+
+    def _turned_rival(self, loop: Loop) -> str | None:
+        """A sentence where the maps fit as well turned."""
+        own, there, c = self.query.surface(loop.query), self.place.surface(loop.place), self.config.slam
+        starts = turned_rivals(
+            own.points, there.points, loop.T_place_query, cell=c.descriptor.cell, reach=self.config.reach, share=_RIVAL_AGREEMENT
+        )
+        tolerance = _TOLERANCE * max(loop.rms, _RMS_FLOOR)
+        here = fitting_share(own, there, loop.T_place_query, tolerance, c.registration) if starts else 0.0
+        for start in starts:
+            other = register(own, there, start, c.registration)
+            if other is None:
+                continue
+            if fitting_share(own, there, other.T_target_source, tolerance, c.registration) >= _AS_GOOD * here:
+                turn = se3.log(se3.compose(se3.inverse(loop.T_place_query), other.T_target_source))[:3]
+                return f"the maps fit as well turned by {np.rad2deg(np.linalg.norm(turn)):.0f}°"
+        return None
+
+    def _largest_agreeing(self, loops: list[Loop]) -> list[Loop]:
+        """Step 2."""
+        adjacent = np.eye(len(loops), dtype=np.bool_)
+        for a in range(len(loops)):
+            for b in range(a):
+                adjacent[a, b] = adjacent[b, a] = self._agree(loops[a], loops[b])
+        return [loops[k] for k in largest_clique(adjacent)]
+
+    def _agree(self, a: Loop, b: Loop) -> bool:
+        return agree(a, b, self.query.chain, self.config.slam, self.place.chain)
+
+    def _rival(self, standing: list[Loop], chosen: list[Loop], confirmed: int) -> str | None:
+        """Step 4."""
+        others = [loop for loop in standing if sum(self._agree(loop, own) for own in chosen) < 0.5 * len(chosen)]
+        rival = self._largest_agreeing(others) if others else []
+        mine, theirs, share = len(_queries(chosen)), len(_queries(rival)), self.config.rival_share
+        if theirs < max(share * mine, 1.0):
+            return None
+        predicted, fitting, _ = self._check_predictions(rival)
+        if fitting < max(share * confirmed, self.config.least_confirmed * predicted):
+            return None
+        return f"{mine} local maps agree on where one session is in the other, but {theirs} say something else that fits too"
+
+    def _joined(self, chosen: list[Loop]) -> JoinedGraph:
+        """Both sessions with these encounters."""
+        first = chosen[len(chosen) // 2]
+        T = self.place.session.T_session_map[first.place], self.query.session.T_session_map[first.query]
+        anchor = se3.compose(se3.compose(T[0], first.T_place_query), se3.inverse(T[1]))
+        encounters = [Encounter(0, 1, loop) for loop in chosen]
+        sessions = self.place.session, self.query.session
+        return join(sessions, encounters, np.stack([_START, anchor]), self.config.slam.gravity_sigma)
+
+    def _check_predictions(self, chosen: list[Loop]) -> tuple[int, int, list[Loop]]:
+        """Step 3: how many pairs of local maps should lie over each other, how many do, and what was found of them."""
+        joined, found = self._joined(chosen), []
+        known = {(loop.query, loop.place) for loop in chosen}
+        predicted = confirmed = 0
+        for number, place in self._predictions(joined):
+            predicted += 1
+            if (number, place) in known:
+                confirmed += 1
+                continue
+            belief = self._expected(number, place, chosen)
+            start = se3.compose(se3.inverse(joined.T_world_map[0][place]), joined.T_world_map[1][number])
+            found.append(self._verified(number, Proposal(place, start, "nearby"), belief))
+            confirmed += self._fits(found[-1])
+        return predicted, confirmed, found
+
+    def _predictions(self, joined: JoinedGraph) -> list[tuple[int, int]]:
+        """Pairs (query, place) that should lie near each other."""
+        places, queries = (T[:, 4:] for T in joined.T_world_map)
+        found: list[tuple[int, int]] = []
+        for number, position in enumerate(queries):
+            distance = np.linalg.norm(places - position, axis=1)
+            near = np.argsort(distance, kind="stable")[:_PREDICTED]
+            found += [(number, place) for place in near.tolist() if distance[place] <= self.config.nearby]
+        return found
+
+    def _expected(self, number: int, place: int, chosen: list[Loop]) -> _Belief:
+        """What the nearest encounter and the odometry of both sessions say of another pair."""
+        e = min(chosen, key=lambda loop: self.place.way(place, loop.place) + self.query.way(number, loop.query))
+        T_a, S_a = self.place.chain.between(place, e.place)
+        T_b, S_b = self.query.chain.between(e.query, number)
+        A_a = se3.adjoint(se3.inverse(se3.compose(e.T_place_query, T_b)))
+        A_e = se3.adjoint(se3.inverse(T_b))
+        covariance = A_a @ S_a @ A_a.T + A_e @ e.covariance @ A_e.T + S_b
+        return _Belief(se3.compose(se3.compose(T_a, e.T_place_query), T_b), covariance)
+
+    def _fits(self, loop: Loop) -> bool:
+        """Whether a predicted pair overlaps as it should; directions that are open and rivals are no matter here."""
+        c = self.config.slam
+        is_near = np.isfinite(loop.innovation) and loop.innovation <= loop.innovation_limit
+        bound = c.largest_rms * max(loop.rms_odometry, _RMS_FLOOR)
+        return bool(is_near and min(loop.overlap) >= c.least_overlap and loop.rms <= bound)
+
+    def _too_little(self, chosen: list[Loop], predicted: int, confirmed: int) -> str | None:
+        """Step 5."""
+        c = self.config
+        if confirmed < c.least_confirmed * predicted:
+            return f"if they met, {predicted} pairs of local maps would lie over each other; {confirmed} of them do"
+        queries, places = _queries(chosen), {loop.place for loop in chosen}
+        if min(len(queries), len(places)) < c.least_encounters:
+            return (
+                f"{len(chosen)} encounters agree, of {len(queries)} local maps of one session and {len(places)} of the other; "
+                f"{c.least_encounters} are asked for"
+            )
+        spread = min(self.query.way(min(queries), max(queries)), self.place.way(min(places), max(places)))
+        if spread < c.least_spread:
+            return f"the encounters that agree lie within {spread:.0f} m of way, {c.least_spread:.0f} m are asked for"
+        return None
+
+
+def _queries(loops: list[Loop]) -> set[int]:
+    return {loop.query for loop in loops}

@@ -1,0 +1,207 @@
+"""Sessions that do not know of each other in, where they are in one world out. Derivations: docs/sessions.md.
+
+alignment = align_sessions([Session.of("monday", maps, T_session_map), Session.of("friday", …)])
+for world in alignment.worlds:            # sessions that met; those that met nobody are a world of their own
+    …
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from boxplus.errors import InputError
+from boxplus.manifolds import se3
+from boxplus.systems.sessions.config import SessionsConfig
+from boxplus.systems.sessions.encounter import Encounter, Meeting
+from boxplus.systems.sessions.graph import JoinedGraph, join
+from boxplus.systems.sessions.meeting import meet
+from boxplus.systems.sessions.places import Places
+from boxplus.systems.sessions.session import Session
+from boxplus.systems.slam.loop import Floats
+from boxplus.systems.slam.odometry_chain import mahalanobis
+
+_START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointWorld:
+    """Sessions in one world, whose frame is that of the first of them.
+
+    Attributes:
+        members: numbers of the sessions, ascending.
+        T_world_session: (s, 7) the session's own frame in the world; covariance: (s, 6, 6) of [w, v] [rad, m] on its right.
+        T_world_map: for each session (n, 7), its local maps.
+        encounters: what the result rests on, numbers of sessions as they were given.
+    """
+
+    members: tuple[int, ...]
+    T_world_session: Floats
+    covariance: Floats
+    T_world_map: list[Floats]
+    encounters: list[Encounter]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionAlignment:
+    """Where sessions are.
+
+    Attributes:
+        sessions: as they were given.
+        worlds: the largest first; a session that met nobody is a world of its own.
+        meetings: of every pair that was looked at, with what spoke against it.
+    """
+
+    sessions: Sequence[Session]
+    worlds: list[JointWorld]
+    meetings: list[Meeting]
+
+    def why_apart(self, session: int) -> list[str]:
+        """What spoke against joining a session with each of the others, as sentences."""
+        names = [own.name for own in self.sessions]
+        return [
+            f"{names[m.query_session]} and {names[m.place_session]}: {m.refusal}"
+            for m in self.meetings
+            if m.refusal is not None and session in (m.place_session, m.query_session)
+        ]
+
+
+def align_sessions(
+    sessions: Sequence[Session],
+    config: SessionsConfig | None = None,
+    *,
+    pairs: Iterable[tuple[int, int]] | None = None,
+    progress: Callable[[Meeting], None] | None = None,
+) -> SessionAlignment:
+    """Find out which sessions met, and place those that did in one world.
+
+    Args:
+        sessions: two at least.
+        config: settings; each has a default.
+        pairs: of numbers of sessions that are looked at; all of them if left out.
+        progress: called with every pair.
+
+    Raises:
+        InputError: fewer than two sessions, two of one name; OpenCV, the extra `vision`, is not installed.
+
+    Example: docs/sessions.md.
+    """
+    config = config if config is not None else SessionsConfig()
+    names = [session.name for session in sessions]
+    if len(sessions) < 2 or len(set(names)) < len(names):
+        raise InputError("two sessions at least, of different names", f"{names}", "name each of them once")
+    places = [Places(session, config.slam) for session in sessions]
+    wanted = combinations(range(len(sessions)), 2) if pairs is None else sorted({(min(p), max(p)) for p in pairs})
+    meetings = []
+    for a, b in wanted:
+        meetings.append(meet(places[a], places[b], config, (a, b)))
+        if progress is not None:
+            progress(meetings[-1])
+    return place_sessions(sessions, meetings, config)
+
+
+def place_sessions(sessions: Sequence[Session], meetings: Sequence[Meeting], config: SessionsConfig) -> SessionAlignment:
+    """One world for the sessions that met, directly or through others.
+
+    Meetings are taken by the number of their encounters. One between sessions that others have joined already has to agree with
+    them, and at least half of its encounters with the graph of all; otherwise it is refused.
+    """
+    decided = list(meetings)
+    while True:
+        anchored, decided = _anchored(len(sessions), decided, config)
+        worlds, doubted = [], set[int]()
+        for members in sorted(anchored.groups(), key=lambda group: (-len(group), group)):
+            world, doubts = _world(sessions, members, decided, anchored, config)
+            worlds.append(world)
+            doubted |= doubts
+        if not doubted:
+            return SessionAlignment(tuple(sessions), worlds, decided)
+        why = "most of its encounters contradict those with other sessions"
+        decided = [_apart(meeting, why) if k in doubted else meeting for k, meeting in enumerate(decided)]
+
+
+class _Anchors:
+    """Where sessions are in the frame of the one that each of them has been joined with, covariances on the right."""
+
+    def __init__(self, count: int) -> None:
+        self.root = list(range(count))
+        self.T = [_START] * count
+        self.covariance = [np.zeros((6, 6))] * count
+
+    def groups(self) -> list[tuple[int, ...]]:
+        found: dict[int, list[int]] = {}
+        for number, root in enumerate(self.root):
+            found.setdefault(root, []).append(number)
+        return [tuple(members) for members in found.values()]
+
+    def between(self, a: int, b: int) -> tuple[Floats, Floats]:
+        """T_a_b of two sessions of one root, and its covariance, as if both had been placed independently."""
+        T = se3.compose(se3.inverse(self.T[a]), self.T[b])
+        Ad = se3.adjoint(se3.inverse(T))
+        return T, Ad @ self.covariance[a] @ Ad.T + self.covariance[b]
+
+    def unite(self, a: int, b: int, T_a_b: Floats, covariance: Floats) -> None:
+        """Move all that b is joined with to a's root."""
+        root, old = self.root[a], self.root[b]
+        members = [k for k, own in enumerate(self.root) if own == old]
+        moved = {}
+        for k in members:
+            T_b_k, S_b_k = self.between(b, k) if k != b else (_START, np.zeros((6, 6)))
+            T_a_k = se3.compose(T_a_b, T_b_k)
+            A_a, A_b = se3.adjoint(se3.inverse(T_a_k)), se3.adjoint(se3.inverse(T_b_k))
+            S = A_a @ self.covariance[a] @ A_a.T + A_b @ covariance @ A_b.T + S_b_k
+            moved[k] = se3.compose(self.T[a], T_a_k), S
+        for k, (T, S) in moved.items():
+            self.root[k], self.T[k], self.covariance[k] = root, T, S
+
+
+def _anchored(count: int, meetings: list[Meeting], config: SessionsConfig) -> tuple[_Anchors, list[Meeting]]:
+    """A first placement along the meetings with most encounters, and the meetings that contradict it refused."""
+    from scipy.stats import chi2
+
+    anchors, decided = _Anchors(count), list(meetings)
+    limit = float(np.sqrt(chi2.ppf(config.slam.innovation, 6)))
+    for k in sorted(range(len(meetings)), key=lambda k: (-len(meetings[k].accepted), k)):
+        meeting = meetings[k]
+        if meeting.T_place_query is None or meeting.covariance is None:
+            continue
+        a, b = meeting.place_session, meeting.query_session
+        if anchors.root[a] != anchors.root[b]:
+            anchors.unite(a, b, meeting.T_place_query, meeting.covariance)
+            continue
+        T, S = anchors.between(a, b)
+        xi = se3.log(se3.compose(se3.inverse(meeting.T_place_query), T))
+        far = mahalanobis(xi, config.slam.odometry_scale**2 * (S + meeting.covariance))
+        if far > limit:
+            decided[k] = _apart(meeting, f"lies {far:.0f} standard deviations from where other sessions put the two")
+    return anchors, decided
+
+
+def _world(
+    sessions: Sequence[Session], members: tuple[int, ...], meetings: list[Meeting], anchors: _Anchors, config: SessionsConfig
+) -> tuple[JointWorld, set[int]]:
+    """The joint graph of some sessions, and the meetings most of whose encounters it does not keep."""
+    if len(members) == 1:
+        T = sessions[members[0]].T_session_map
+        return JointWorld(members, _START[None], np.zeros((1, 6, 6)), [T], []), set()
+    row = {number: k for k, number in enumerate(members)}
+    start = np.stack([anchors.between(members[0], number)[0] if number != members[0] else _START for number in members])
+    encounters, source = [], []
+    for k, meeting in enumerate(meetings):
+        if meeting.place_session in row and meeting.query_session in row:
+            encounters += meeting.accepted
+            source += [k] * len(meeting.accepted)
+    own = [replace(e, place_session=row[e.place_session], query_session=row[e.query_session]) for e in encounters]
+    graph: JoinedGraph = join([sessions[number] for number in members], own, start, config.slam.gravity_sigma)
+    of, kept = np.array(source), graph.is_kept
+    doubted = {k for k in set(source) if np.count_nonzero(kept[of == k]) < 0.5 * np.count_nonzero(of == k)}
+    chosen = [e for e, is_kept in zip(encounters, kept, strict=True) if is_kept]
+    world = JointWorld(members, graph.T_world_session, graph.covariance, graph.T_world_map, chosen)
+    return world, doubted
+
+
+def _apart(meeting: Meeting, why: str) -> Meeting:
+    return replace(meeting, refusal=why, T_place_query=None, covariance=None)
