@@ -139,7 +139,7 @@ class _Matched:
     e: Floats
     J: Floats
     weight: Floats
-    cell: NDArray[np.int64]
+    where: Floats
     to_origin: Floats
     lever: float
     scale: float
@@ -173,14 +173,12 @@ class _Matched:
         e = plane[:, 3]
         scale = max(_SCALE * float(np.median(np.abs(e))), _LEAST_SCALE)
         weight = 1.0 / (1.0 + (e / (2.0 * scale)) ** 2) ** 2
-        where = np.floor((quaternion.to_matrix(T[:4]) @ p.T).T / config.cluster).astype(np.int64)
-        _, cell = np.unique(where, axis=0, return_inverse=True)
         # w about the middle moves the origin: v = v' + middle × w … on the right, T Exp(ξ) with ξ = A ξ'.
         A = np.eye(6)
         A[:3, :3] /= lever
         x, y, z = middle
         A[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / lever
-        return cls(e, J, weight, cell.ravel(), A, lever, scale, float(weight @ plane[:, 4]))
+        return cls(e, J, weight, p @ quaternion.to_matrix(T[:4]).T, A, lever, scale, float(weight @ plane[:, 4]))
 
     def _modes(self, weak_information: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         H = self.J.T @ (self.J * self.weight[:, None])
@@ -197,8 +195,9 @@ class _Matched:
 
     def covariance(self, config: RegistrationConfig, deformation: Floats) -> tuple[Floats, Floats, Floats]:
         values, vectors, good = self._modes(config.weak_information)
-        gradients = np.zeros((int(self.cell.max()) + 1, 6))
-        np.add.at(gradients, self.cell, self.J * (self.weight * self.e)[:, None])
+        _, cell = np.unique(np.floor(self.where / config.cluster).astype(np.int64), axis=0, return_inverse=True)
+        gradients = np.zeros((int(cell.max()) + 1, 6))
+        np.add.at(gradients, cell.ravel(), self.J * (self.weight * self.e)[:, None])
         V = vectors[:, good]
         G = gradients @ V / values[good]
         own = config.inflation * (G.T @ G)
