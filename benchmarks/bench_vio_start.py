@@ -38,9 +38,9 @@ from boxplus.simulation.motions.manoeuvres import constant_turn, constant_veloci
 from boxplus.simulation.motions.spline import Motion, Trajectory
 from boxplus.simulation.motions.trajectories import at_rest, spin_in_place
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 MOTIONS = (
     "flying", "handheld", "flying", "handheld", "flying", "handheld",

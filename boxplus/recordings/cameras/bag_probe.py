@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from boxplus._opencv import opencv
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings.cameras.bag_calibration import by_topic, given_for, plain_topic, stated_in_bag, static_messages
 from boxplus.recordings.cameras.calibration import StatedRig, read_camchain, usable_mountings
-from boxplus.recordings.cameras.decode import DEPTH_ENCODINGS, MalformedImageError, opencv
+from boxplus.recordings.cameras.decode import DEPTH_ENCODINGS, MalformedImageError
 from boxplus.recordings.cameras.info import CameraRecordingInfo, ImuStream
 from boxplus.recordings.cameras.messages import (
     COMPRESSED_TYPE,
@@ -195,7 +196,7 @@ def _probe(
 
 def _look_at(image: ImageMessage, probe: _Probe) -> None:
     if image.needs_opencv:
-        opencv("compressed images and Bayer mosaics")
+        opencv("to decode compressed images and Bayer mosaics", RecordingError)
     try:
         pixels = image.pixels()
     except MalformedImageError as error:

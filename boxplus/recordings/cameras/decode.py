@@ -7,7 +7,6 @@ no checksum; such an image may be decoded with wrong pixels.
 
 from __future__ import annotations
 
-import importlib
 import re
 import struct
 import zlib
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._opencv import opencv
 from boxplus.errors import RecordingError
 
 Pixels = NDArray[Any]
@@ -51,18 +51,6 @@ class MalformedImageError(ValueError):
     """The bytes of an image are not what they say they are."""
 
 
-def opencv(what: str) -> Any:
-    """The module cv2.
-
-    Raises:
-        RecordingError: it is not installed; the message says what it is needed for.
-    """
-    try:
-        return importlib.import_module("cv2")
-    except ImportError:
-        raise RecordingError(f"OpenCV, to decode {what}", "it is not installed", "pip install 'boxplus[vision]'") from None
-
-
 def needs_opencv(data: bytes) -> bool:
     """Whether an encoded image can be read with OpenCV only."""
     return not data.startswith((b"P5", b"P6"))
@@ -90,7 +78,7 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
     if order is not None:
         return np.ascontiguousarray(pixels[:, :, list(order)])
     if encoding in _BAYER:
-        cv2 = opencv("Bayer mosaics")
+        cv2 = opencv("to decode Bayer mosaics", RecordingError)
         return np.asarray(cv2.cvtColor(pixels[:, :, 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2RGB")))
     return pixels[:, :, 0]
 
@@ -113,7 +101,7 @@ def decode_file(data: bytes) -> Pixels:
         what = "PNG"
     else:
         raise MalformedImageError("neither JPEG, PNG, PGM nor PPM" if data else "an empty file")
-    cv2 = opencv(f"{what} images")
+    cv2 = opencv(f"to decode {what} images", RecordingError)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

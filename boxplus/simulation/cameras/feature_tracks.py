@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.simulation.motions.spline import Trajectory
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 
 Floats = NDArray[np.float64]
 _NEAREST_M = 0.2

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import Status
 from boxplus.systems.visual_inertial_odometry.observations import Fit
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _ENOUGH = 15  # landmarks that agree; fewer leave directions to the IMU
 _ANY = 6  # landmarks without which a frame counts as blind

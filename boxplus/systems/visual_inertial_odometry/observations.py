@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import NO_LINES, LineFit
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

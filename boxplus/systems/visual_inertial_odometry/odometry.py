@@ -17,6 +17,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._opencv import opencv
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.sensors.camera_image import CameraImage
@@ -24,6 +25,8 @@ from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker, Tracker
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
 from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
@@ -31,8 +34,6 @@ from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker, Tracker, opencv
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
@@ -70,7 +71,7 @@ class VisualInertialOdometry:
         self._to_8_bits = EightBits()  # for lines; corners have their own
         self._line_tracker = line_tracker
         if self.config.lines and line_tracker is None:
-            self._line_tracker = LineTracker(opencv(), self.rig, self.config.max_lines)
+            self._line_tracker = LineTracker(opencv("which finds lines"), self.rig, self.config.max_lines)
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._waiting: deque[Tracks] = deque()

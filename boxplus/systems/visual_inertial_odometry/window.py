@@ -30,14 +30,14 @@ from boxplus.residuals.prior import Prior
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
-from boxplus.systems.visual_inertial_odometry.corner_creep import CornerCreep
+from boxplus.systems.visual_inertial_odometry.corners.creep import CornerCreep
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, motion_px
+from boxplus.systems.visual_inertial_odometry.corners.triangulation import mean_parallax, triangulate
 from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, imu_noise
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks, motion_px
-from boxplus.systems.visual_inertial_odometry.triangulation import mean_parallax, triangulate
 
 _HUBER = 1.5  # standard deviations
 _LEAVING = 2  # keyframes at most, for every one that is new

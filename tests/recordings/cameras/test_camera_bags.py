@@ -1,6 +1,7 @@
 """Bags with cameras: images, IMU and calibration as they were written, in the order of time, and what is wrong is counted."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -188,13 +189,8 @@ def test_topics_are_chosen_or_refused(tmp_path: Path) -> None:
 
 
 def test_compressed_images_without_opencv_are_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from boxplus.recordings.cameras import decode
-
-    def absent(name: str) -> None:
-        raise ImportError(name)
-
     path = CameraBag(topics=("/cam0/image_raw/compressed",), compressed="jpeg").write(tmp_path)
-    monkeypatch.setattr(decode.importlib, "import_module", absent)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(RecordingError, match=r"pip install 'boxplus\[vision\]'"):
         open_camera_recording(path)
 

@@ -11,8 +11,8 @@ from boxplus import CameraImage, Pinhole, RadialTangential
 from boxplus.manifolds import so3
 from boxplus.residuals import ImuNoise
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VioEstimate, VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 NOISE = ImuNoise(gyro=1e-3, accel=1e-2, gyro_walk=1e-4, accel_walk=1e-3)
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -7,9 +7,9 @@ import numpy as np
 from boxplus.errors import SingularProblemError
 from boxplus.systems.visual_inertial_odometry import VioConfig
 from boxplus.systems.visual_inertial_odometry.beginning import covariance_of
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
 from boxplus.systems.visual_inertial_odometry.observations import Fit
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 
 def frame(k: int, corners: int = 40) -> Tracks:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from boxplus.systems.visual_inertial_odometry import VioConfig
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker
+from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
 from tests.systems.visual_inertial_odometry.simulated_rays import PIXEL_SIGMA, Flight, rig, run
 
 

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from boxplus._opencv import opencv
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.calibration import StatedCamera, read_camchain, usable_mountings
-from boxplus.recordings.cameras.decode import MalformedImageError, Pixels, decode_file, needs_opencv, opencv
+from boxplus.recordings.cameras.decode import MalformedImageError, Pixels, decode_file, needs_opencv
 from boxplus.recordings.cameras.events import IMU, CameraEvent, CameraRecording, Pending, StampFilter, assembled
 from boxplus.recordings.cameras.imu_table import ImuTable, imu_stream
 from boxplus.recordings.cameras.info import CameraRecordingInfo, ImageKind, ImuStream
@@ -183,7 +184,7 @@ def first_size(images: ImageFiles) -> tuple[int, int]:
         try:
             data = file.read_bytes()
             if needs_opencv(data):
-                opencv(f"the images in {images.source}")
+                opencv(f"to decode the images in {images.source}", RecordingError)
             pixels = decode_file(data)
         except MalformedImageError as error:
             reason = f"{file.name}: {error}"

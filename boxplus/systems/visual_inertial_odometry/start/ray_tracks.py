@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -10,8 +10,8 @@ import numpy as np
 from boxplus.manifolds import so3
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.start.ray_tracks import Floats
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 STILL_PX = 0.5  # median motion of the corners in half of the window, beyond that from image to image, which is noise
 _GYRO_STD, _ACCEL_STD = 0.01, 0.1  # rad/s, m/s²: of means over a tenth of a second, which shaking at high rates leaves alone

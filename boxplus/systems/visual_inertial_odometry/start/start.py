@@ -29,13 +29,13 @@ from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_noise import sample_noise
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.gyro_bias import estimate_gyro_bias, stereo_points
 from boxplus.systems.visual_inertial_odometry.start.linear_motion import solve_motion
 from boxplus.systems.visual_inertial_odometry.start.ray_tracks import Floats, RayTracks
 from boxplus.systems.visual_inertial_odometry.start.refinement import Refined, refine
 from boxplus.systems.visual_inertial_odometry.start.rest import judge_rest, shortest_turn
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _GYRO_BIAS = 0.2  # rad/s, standard deviation beforehand
 _SPACING_S = 0.2  # between keyframes

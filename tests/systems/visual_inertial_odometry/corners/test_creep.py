@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from boxplus.systems.visual_inertial_odometry import VioConfig
-from boxplus.systems.visual_inertial_odometry.corner_creep import CornerCreep
+from boxplus.systems.visual_inertial_odometry.corners.creep import CornerCreep
 from tests.systems.visual_inertial_odometry.simulated_rays import (
     IMAGE_EVERY,
     Flight,

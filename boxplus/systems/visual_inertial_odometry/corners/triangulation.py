@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import RigCamera
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
 
 _MOST_SIGMAS = 5.0  # by which a view may differ from the point found
 _RELATIVE, _ABSOLUTE = 0.3, 0.02  # of the standard deviation of ρ: of ρ, and in 1/m for points that are nearly at infinity

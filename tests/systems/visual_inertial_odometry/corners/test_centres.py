@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.systems.visual_inertial_odometry.corner_centres import centred
+from boxplus.systems.visual_inertial_odometry.corners.centres import centred
 
 cv2 = pytest.importorskip("cv2")
 

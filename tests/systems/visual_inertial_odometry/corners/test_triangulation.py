@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.systems.visual_inertial_odometry.triangulation import triangulate
+from boxplus.systems.visual_inertial_odometry.corners.triangulation import triangulate
 
 
 def views(p_world: np.ndarray, bodies: np.ndarray, mountings: np.ndarray) -> np.ndarray:

@@ -9,8 +9,9 @@ import pytest
 
 from boxplus import InputError, Pinhole
 from boxplus.manifolds import so3
-from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, tracking
-from boxplus.systems.visual_inertial_odometry.tracking import FeatureTracker
+from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
+from boxplus.systems.visual_inertial_odometry.corners import tracking
+from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
 
 SIZE = (320, 240)
 CAMERA = Pinhole(220.0, 220.0, 159.5, 119.5)

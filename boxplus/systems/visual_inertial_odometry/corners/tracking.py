@@ -9,7 +9,6 @@ Source: Lucas and Kanade 1981; Bouguet, Pyramidal implementation, 2001; Shi and 
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -18,13 +17,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import InputError
+from boxplus._opencv import opencv
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
-from boxplus.systems.visual_inertial_odometry.corner_centres import centred
+from boxplus.systems.visual_inertial_odometry.corners.centres import centred
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.triangulation import inverse_depths
 from boxplus.systems.visual_inertial_odometry.rig import Rig
-from boxplus.systems.visual_inertial_odometry.tracks import Tracks
-from boxplus.systems.visual_inertial_odometry.triangulation import inverse_depths
 
 _WINDOW = (21, 21)
 _LEVELS = 3
@@ -39,18 +38,6 @@ _GUESSED = 4  # cv2.OPTFLOW_USE_INITIAL_FLOW
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
-
-
-def opencv() -> Any:
-    """The module cv2.
-
-    Raises:
-        InputError: it is not installed; the message names the extra.
-    """
-    try:
-        return importlib.import_module("cv2")
-    except ImportError:
-        raise InputError("OpenCV, which follows corners", "it is not installed", "pip install 'boxplus[vision]'") from None
 
 
 class Tracker(Protocol):
@@ -87,7 +74,7 @@ class FeatureTracker:
     """
 
     def __init__(self, config: VioConfig, rig: Rig) -> None:
-        self._cv2, self._config, self._rig = opencv(), config, rig
+        self._cv2, self._config, self._rig = opencv("which follows corners"), config, rig
         self._to_8_bits = EightBits()
         self._images: list[Grey | None] = [None] * len(rig.cameras)
         self._before: Grey | None = None

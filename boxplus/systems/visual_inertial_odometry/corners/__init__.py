@@ -1,0 +1,1 @@
+"""Corners: found, followed, measured at their centres, and what their errors are."""
