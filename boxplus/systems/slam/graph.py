@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.graduated import graduate
+from boxplus.optimization.group import Group
 from boxplus.optimization.losses import Squared
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import Variables
 from boxplus.residuals.gravity_direction import GravityDirection
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.slam.loop import Floats, Loop
@@ -42,6 +44,35 @@ class ClosedGraph:
     solution: Solution
 
 
+def open_graph(T_odo: Sequence[Floats], covariances: Sequence[Floats], gravity_sigma: float) -> tuple[Problem, Variables]:
+    """Poses of local maps along the odometry, each with its vertical, the first held where it is; arguments as `close_graph`."""
+    poses = np.stack(T_odo)
+    steps = np.arange(len(poses) - 1)
+    problem = Problem()
+    x = problem.add_variables(SE3, poses, name="poses")
+    if len(steps):
+        measured = se3.compose(se3.inverse(poses[:-1]), poses[1:])
+        problem.add_residuals(RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry")
+    # Every map's z axis is its own measurement of the vertical; their mean is that of the odometry's world.
+    vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), mean_up(poses), sigma=gravity_sigma)
+    problem.add_residuals(vertical, x, name="gravity")
+    problem.fix(x[0:1])
+    return problem, x
+
+
+def add_loops(problem: Problem, x: Variables, loops: Sequence[Loop], name: str) -> Group:
+    """The measurements of loops between poses of `open_graph`."""
+    i, j = np.array([[loop.place, loop.query] for loop in loops]).T
+    Z, information = (np.stack([getattr(loop, what) for loop in loops]) for what in ("T_place_query", "information"))
+    return problem.add_residuals(RelativePose(Z, information=information), x[i], x[j], name=name)
+
+
+def mean_up(T_odo: Floats) -> Floats:
+    """(3,) the vertical of the odometry's world, from poses (n, 7) of level maps."""
+    up = quaternion.to_matrix(T_odo[:, :4])[:, :, 2].mean(axis=0)
+    return np.asarray(up / np.linalg.norm(up))
+
+
 def close_graph(
     T_odo: Sequence[Floats],
     covariances: Sequence[Floats],
@@ -59,29 +90,14 @@ def close_graph(
         covariances: n of (6, 6), that of each pose in the one before; the first is not looked at.
         loops: at least one; `forced` ones are believed whatever they say.
     """
-    poses = np.stack(T_odo)
-    steps = np.arange(len(poses) - 1)
-    problem = Problem()
-    x = problem.add_variables(SE3, poses, name="poses")
-    measured = se3.compose(se3.inverse(poses[:-1]), poses[1:])
-    problem.add_residuals(RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry")
-    ups = quaternion.to_matrix(poses[:, :4])[:, :, 2]
-    up = ups.mean(axis=0)
-    # Every map's z axis is its own measurement of the vertical; their mean is that of the odometry's world.
-    vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), up / np.linalg.norm(up), sigma=gravity_sigma)
-    problem.add_residuals(vertical, x, name="gravity")
-    problem.fix(x[0:1])
+    problem, x = open_graph(T_odo, covariances, gravity_sigma)
     is_forced = np.array(forced, dtype=np.bool_) if len(forced) else np.zeros(len(loops), dtype=np.bool_)
     rows = {"forced": np.flatnonzero(is_forced), _LOOPS: np.flatnonzero(~is_forced)}
     groups = {}
     for name, own in rows.items():
         if len(own):
             chosen = [loops[k] for k in own.tolist()]
-            residual = RelativePose(
-                np.stack([loop.T_place_query for loop in chosen]), information=np.stack([loop.information for loop in chosen])
-            )
-            i, j = np.array([[loop.place, loop.query] for loop in chosen]).T
-            groups[name] = problem.add_residuals(residual, x[i], x[j], name=name)
+            groups[name] = add_loops(problem, x, chosen, name)
     options = SolverOptions(initial_damping=_DAMPING)
     is_kept = np.ones(len(loops), dtype=np.bool_)
     if _LOOPS in groups:

@@ -1,0 +1,117 @@
+"""Fixes attached to local maps: where in its local map the odometry has the IMU at the instant of a fix."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.gnss import GnssFixes
+from boxplus.systems.georeference.config import GeoreferenceConfig
+
+Floats = NDArray[np.float64]
+
+_LONGEST_GAP_NS = 1_000_000_000  # between poses of the odometry that still say where the IMU is between them
+_HEIGHT_FACTOR = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttachedFixes:
+    """N fixes that an odometry says where they were made.
+
+    Attributes:
+        time_ns: (N,) of the fixes, in the clock of the odometry.
+        lat_lon_alt: (N, 3) [°, °, m]; covariance: (N, 3, 3) east, north, up [m²], what was unknown filled in.
+        map_of: (N,) number of the local map; T_map_imu: (N, 7) in its frame; v_map: (N, 3) velocity there [m/s].
+        left_out: fixes that are not among them, by reason.
+    """
+
+    time_ns: NDArray[np.int64]
+    lat_lon_alt: Floats
+    covariance: Floats
+    map_of: NDArray[np.intp]
+    T_map_imu: Floats
+    v_map: Floats
+    left_out: Counter[str]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def sigma(self) -> Floats:
+        """(N,) standard deviation of a horizontal axis [m]."""
+        return np.sqrt(0.5 * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
+
+    @property
+    def frame(self) -> EnuFrame:
+        """East, north and up at the median of the fixes, which a few wrong ones do not move."""
+        lla = self.lat_lon_alt.copy()
+        lla[:, 1] = lla[0, 1] + (lla[:, 1] - lla[0, 1] + 180.0) % 360.0 - 180.0
+        lat, lon, alt = np.median(lla, axis=0).tolist()
+        return EnuFrame(lat, (lon + 180.0) % 360.0 - 180.0, alt)
+
+
+def attach(
+    fixes: GnssFixes,
+    map_time_ns: NDArray[np.int64],
+    T_odo_map: Floats,
+    time_ns: NDArray[np.int64],
+    T_odo_imu: Floats,
+    config: GeoreferenceConfig,
+) -> AttachedFixes:
+    """Attach fixes to the local maps nearest in time.
+
+    Args:
+        fixes: any number. map_time_ns: (n,), T_odo_map: (n, 7) of the local maps, at least one.
+        time_ns: (K,) ascending, T_odo_imu: (K, 7) of the odometry.
+    """
+    left_out = Counter(fixes.rejected)
+    t = fixes.time_ns + round(config.time_offset_s * 1e9)
+    after = np.clip(np.searchsorted(time_ns, t, side="right"), 1, max(len(time_ns) - 1, 1))
+    inside = (t >= time_ns[0]) & (t <= time_ns[-1]) if len(time_ns) > 1 else np.zeros(len(t), dtype=np.bool_)
+    after = np.minimum(after, len(time_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = (time_ns[after] - time_ns[before]).astype(np.float64)
+    follows = gap <= _LONGEST_GAP_NS
+    _count(left_out, "outside of the odometry's time", ~inside)
+    _count(left_out, "in a gap of the odometry", inside & ~follows)
+    keep = np.flatnonzero(inside & follows)
+    chosen = keep[_one_each(t[keep], config.interval)]
+    if len(keep) > len(chosen):
+        left_out["one of several within the interval"] = len(keep) - len(chosen)
+    t, before, after, gap = t[chosen], before[chosen], after[chosen], np.maximum(gap[chosen], 1.0)
+    A, B = T_odo_imu[before], T_odo_imu[after]
+    between = se3.log(se3.compose(se3.inverse(A), B))
+    T_odo = se3.compose(A, se3.exp(((t - time_ns[before]) / gap)[:, None] * between))
+    v_odo = (B[:, 4:] - A[:, 4:]) / (gap[:, None] * 1e-9)
+    map_of = np.argmin(np.abs(map_time_ns[None, :] - t[:, None]), axis=1)
+    T_map_odo = se3.inverse(T_odo_map[map_of])
+    v_map = np.einsum("nab,nb->na", quaternion.to_matrix(T_map_odo[:, :4]), v_odo)
+    covariance = _filled(fixes.covariance[chosen], config)
+    return AttachedFixes(t, fixes.lat_lon_alt[chosen], covariance, map_of, se3.compose(T_map_odo, T_odo), v_map, left_out)
+
+
+def _one_each(t: NDArray[np.int64], interval: float) -> NDArray[np.intp]:
+    """The first of every interval."""
+    if not len(t) or interval <= 0.0:
+        return np.arange(len(t))
+    cell = (t - t[0]) // max(round(interval * 1e9), 1)
+    return np.flatnonzero(np.concatenate([[True], np.diff(cell) > 0]))
+
+
+def _filled(covariance: Floats, config: GeoreferenceConfig) -> Floats:
+    """With what the settings say where the receiver says nothing, and nothing better than the settings allow."""
+    filled = covariance.copy()
+    axes = np.diag([1.0, 1.0, _HEIGHT_FACTOR**2])
+    filled[~np.isfinite(filled).all(axis=(1, 2))] = config.sigma**2 * axes
+    values, vectors = np.linalg.eigh(filled)
+    return np.asarray((vectors * np.maximum(values, config.least_sigma**2)[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+def _count(counts: Counter[str], reason: str, rows: NDArray[np.bool_]) -> None:
+    if number := int(np.count_nonzero(rows)):
+        counts[reason] = number

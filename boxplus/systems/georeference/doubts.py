@@ -1,0 +1,86 @@
+"""What speaks against a georeference that was found: fixes that fit nothing, clocks, lever arm, an odometry that is bent."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.systems.georeference.attachment import AttachedFixes
+from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.fit import Fit
+
+_MANY_GATED = 0.15
+_LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
+_LASTING = 30.0  # [s]
+_SIGMAS = 3.0
+_LEAST_DELAY = 0.03
+_NOISY = 1.5
+_BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
+
+
+def runs_of(gated: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Stretches [begin, end) of successive gated fixes."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], gated, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def gated_stretches(attached: AttachedFixes, found: Fit) -> list[tuple[float, float, float]]:
+    """(begin since the first fix [s], duration [s], median distance [m]) of stretches of fixes that are not used."""
+    seconds = (attached.time_ns - attached.time_ns[0]) * 1e-9
+    distance = np.linalg.norm(found.errors, axis=1)
+    return [
+        (float(seconds[a]), float(seconds[b - 1] - seconds[a]), float(np.median(distance[a:b])))
+        for a, b in runs_of(~found.is_used)
+    ]
+
+
+def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
+    """Gated fixes by what they look like."""
+    counts: Counter[str] = Counter()
+    for a, b in runs_of(~found.is_used):
+        counts["off for a stretch (multipath)" if b - a > 2 else "off alone"] += b - a
+    return counts
+
+
+def doubts_of(
+    attached: AttachedFixes,
+    found: Fit,
+    has_lever: bool,
+    stretches: list[tuple[float, float, float]],
+    config: GeoreferenceConfig,
+) -> list[str]:
+    """Sentences about what to doubt."""
+    warnings = []
+    if not has_lever:
+        lever = ", ".join(f"{x:.2f}" for x in found.lever)
+        warnings.append(
+            f"the lever arm of the antenna is not known: estimated as {lever} m in the IMU frame, to "
+            f"{float(np.max(found.lever_sigma[:2])):.2f} m on the ground; give --gnss-lever-arm"
+        )
+    if abs(found.delay) > max(_SIGMAS * found.delay_sigma, _LEAST_DELAY):
+        late = "late" if found.delay > 0 else "early"
+        warnings.append(
+            f"fixes seem to be stamped {abs(found.delay):.2f} s {late} (± {found.delay_sigma:.2f} s), which was allowed for; correct "
+            f"the stamps, or set gnss.time_offset_s={config.time_offset_s - found.delay:.2f}"
+        )
+    share = 1.0 - float(found.is_used.mean())
+    if share > _MANY_GATED:
+        warnings.append(f"{100 * share:.0f} % of the fixes contradict the others and are not used")
+    total = (attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
+    for begin, duration, metres in stretches:
+        if duration > max(_LONG * total, _LASTING):
+            warnings.append(
+                f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: another datum or "
+                "base station, or the odometry is wrong there"
+            )
+    if found.noise_scale > _NOISY:
+        warnings.append(f"fixes scatter {found.noise_scale:.1f} times as much as they claim; their standard deviations were raised")
+    if found.tension > _BENT:
+        warnings.append(
+            f"fixes bend the odometry {math.sqrt(found.tension):.1f} times as much as its covariance allows: it drifts more than claimed, "
+            "or the fixes have another scale or datum"
+        )
+    return warnings

@@ -1,0 +1,201 @@
+"""The pose graph of local maps with fixes: poses, georeference, lever arm and delay together, outliers by truncated least squares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3, so3
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.graduated import graduate
+from boxplus.optimization.losses import Squared
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.variables import Variables
+from boxplus.residuals.antenna_position import AntennaPosition
+from boxplus.residuals.gravity_direction import GravityDirection
+from boxplus.residuals.prior import Prior
+from boxplus.systems.georeference.attachment import AttachedFixes
+from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.slam.graph import add_loops, mean_up, open_graph
+from boxplus.systems.slam.loop import Loop
+
+Floats = NDArray[np.float64]
+
+_DAMPING = 1e-9
+_MEDIAN_SQUARE = 2.366  # of a normal vector of three
+_ROUNDS = 4
+_SETTLED = 1.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapGraph:
+    """The local maps of an odometry and what holds them together; see `boxplus.systems.slam.graph`.
+
+    Attributes:
+        time_ns: (n,) of the maps. T_odo: (n, 7) along the odometry; T_map: (n, 7) with loops closed.
+        covariances: (n, 6, 6) of each in the one before. loops: those that are believed.
+        gravity_sigma: of the vertical of a local map [rad].
+    """
+
+    time_ns: NDArray[np.int64]
+    T_odo: Floats
+    T_map: Floats
+    covariances: Floats
+    loops: Sequence[Loop] = ()
+    gravity_sigma: float = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """What the graph with fixes came to.
+
+    Attributes:
+        T_map: (n, 7) of the local maps. T_enu_map: (7,); covariance: (6, 6) of it, [w, v] on the right [rad, m].
+        sigma: (n,) standard deviation of a horizontal axis of each map's position in ENU [m].
+        lever: (3,) in the IMU's frame [m]; lever_sigma: (3,), zero where it was given.
+        delay, delay_sigma: by which fixes are stamped late [s].
+        is_used: (N,) which fixes the result rests on. errors: (N, 3) predicted less measured, east, north, up [m].
+        noise_scale: factor of the standard deviations that the fixes needed, at least 1.
+        tension: mean square of the odometry's errors, in variances per direction; far below 1 where nothing bends it.
+    """
+
+    T_map: Floats
+    T_enu_map: Floats
+    covariance: Floats
+    sigma: Floats
+    lever: Floats
+    lever_sigma: Floats
+    delay: float
+    delay_sigma: float
+    is_used: NDArray[np.bool_]
+    errors: Floats
+    noise_scale: float
+    tension: float
+
+
+def level(T_odo: Floats) -> Floats:
+    """(3, 3) rotation that turns the vertical of an odometry's world upright, without yaw."""
+    up = mean_up(T_odo)
+    axis = np.array([up[1], -up[0], 0.0])
+    sine = float(np.linalg.norm(axis))
+    turn = axis * (math.atan2(sine, float(up[2])) / sine) if sine > 0.0 else axis
+    return so3.exp(turn)
+
+
+def fit(
+    graph: MapGraph,
+    attached: AttachedFixes,
+    p_enu: Floats,
+    T_enu_map: Floats,
+    believed: NDArray[np.bool_],
+    lever: Floats | None,
+    config: GeoreferenceConfig,
+) -> Fit:
+    """Minimise over everything, from a start.
+
+    Errors of fixes stay for tens of seconds, so that fixes nearer to each other than that count as one together: standard deviations are
+    multiplied by √(correlation/spacing), and the threshold of outliers divided by it, which decides by each fix's own.
+
+    Args:
+        attached: N fixes, p_enu: (N, 3) where they are. T_enu_map: (7,) the start, believed: (N,) the fixes it rests on.
+        lever: (3,) given; None: estimated about zero.
+    """
+    from scipy.stats import chi2
+
+    spacing = float(np.median(np.diff(attached.time_ns))) * 1e-9
+    inflation = math.sqrt(max(config.correlation / spacing, 1.0))
+    threshold = math.sqrt(float(chi2.ppf(config.inlier, 3)))
+    noise_scale = 1.0
+    start = [graph.T_map, T_enu_map[None], np.zeros((1, 3)) if lever is None else lever[None], np.zeros((1, 1))]
+    for _ in range(_ROUNDS):
+        problem, x = open_graph(list(graph.T_odo), list(graph.covariances), graph.gravity_sigma)
+        if graph.loops:
+            add_loops(problem, x, graph.loops, "loops")
+        world = problem.add_variables(SE3, start[1], name="T_enu_map")
+        arm = problem.add_variables(Euclidean(3), start[2], name="lever arm")
+        delay = problem.add_variables(Euclidean(1), start[3], name="delay")
+        problem.add_residuals(GravityDirection([mean_up(graph.T_odo)], sigma=graph.gravity_sigma), world, name="vertical")
+        problem.add_residuals(Prior(Euclidean(1), [0.0], sigma=config.delay_sigma), delay, name="delay")
+        if lever is None:
+            problem.add_residuals(Prior(Euclidean(3), np.zeros(3), sigma=config.lever_sigma), arm, name="lever arm")
+        else:
+            problem.fix(arm)
+        covariance = (inflation * noise_scale) ** 2 * attached.covariance
+        residual = AntennaPosition(p_enu, attached.T_map_imu, attached.v_map, covariance=covariance)
+        every = np.zeros(len(attached), dtype=np.intp)
+        fixes = problem.add_residuals(residual, world[every], x[attached.map_of], arm[every], delay[every], name="fixes")
+        options = SolverOptions(initial_damping=_DAMPING)
+        found = graduate(
+            problem, fixes, loss="truncated", inlier_threshold=threshold / inflation,
+            weights={"fixes": believed.astype(np.float64)}, options=options, start=start,
+        )  # fmt: skip
+        used = found.inliers["fixes"]
+        squares = fixes.squares(found.solution.values) * inflation**2
+        # Of those the start rests on, not of those that were kept: what is cut off at a threshold always looks quiet.
+        scatter = math.sqrt(float(np.median(squares[believed])) / _MEDIAN_SQUARE)
+        if scatter <= _SETTLED:
+            break
+        noise_scale *= scatter
+    fixes.set_loss(Squared())
+    problem.set_weights(fixes, used.astype(np.float64))
+    solution = problem.solve(options, start=found.solution)
+    return _result(solution, problem, x, (world, arm, delay), residual, attached, used, noise_scale)
+
+
+def _result(
+    solution: Solution,
+    problem: Problem,
+    x: Variables,
+    others: tuple[Variables, Variables, Variables],
+    residual: AntennaPosition,
+    attached: AttachedFixes,
+    used: NDArray[np.bool_],
+    noise_scale: float,
+) -> Fit:
+    world, arm, delay = others
+    T_map, T_enu, lever = solution[x], solution[world][0], solution[arm][0]
+    errors = residual.evaluate(T_enu, T_map[attached.map_of], lever, solution[delay][0])
+    odometry = [group for group in problem.groups if group.name == "odometry"]
+    tension = float(np.mean(odometry[0].squares(solution.values))) / 6.0 if odometry else 0.0
+    return Fit(
+        T_map=T_map,
+        T_enu_map=T_enu,
+        covariance=solution.covariance(world)[0],
+        sigma=_position_sigma(solution, x, world),
+        lever=lever,
+        lever_sigma=solution.standard_deviations(arm)[0],
+        delay=float(solution[delay][0, 0]),
+        delay_sigma=float(solution.standard_deviations(delay)[0, 0]),
+        is_used=used,
+        errors=errors,
+        noise_scale=noise_scale,
+        tension=tension,
+    )
+
+
+def _position_sigma(solution: Solution, x: Variables, world: Variables) -> Floats:
+    """Of p = R₁ p₂ + p₁: ∂p/∂T_enu_map = [−R₁ [p₂]×  R₁], ∂p/∂T_map_k = [0  R₁ R₂]."""
+    T, every = solution[x], np.zeros(len(solution[x]), dtype=np.intp)
+    R1 = quaternion.to_matrix(solution[world][0, :4])
+    R12 = R1 @ quaternion.to_matrix(T[:, :4])
+    of_world = np.concatenate([-R1 @ so3.hat(T[:, 4:]), np.broadcast_to(R1, (len(T), 3, 3))], axis=2)
+    of_map = np.concatenate([np.zeros((len(T), 3, 3)), R12], axis=2)
+    own, between = solution.covariance(x), solution.covariance(world[every], x)
+    cross = of_world @ between @ of_map.transpose(0, 2, 1)
+    total = of_world @ solution.covariance(world)[0] @ of_world.transpose(0, 2, 1) + of_map @ own @ of_map.transpose(0, 2, 1)
+    total = total + cross + cross.transpose(0, 2, 1)
+    return np.sqrt(0.5 * np.maximum(total[:, 0, 0] + total[:, 1, 1], 0.0))
+
+
+def antennas(graph: MapGraph, attached: AttachedFixes, lever: Floats | None) -> Floats:
+    """(N, 3) the antenna at each fix, in the map with loops closed."""
+    T = se3.compose(graph.T_map[attached.map_of], attached.T_map_imu)
+    arm = np.zeros(3) if lever is None else lever
+    return np.asarray(T[:, 4:] + quaternion.to_matrix(T[:, :4]) @ arm)

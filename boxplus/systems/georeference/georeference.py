@@ -1,0 +1,202 @@
+"""A map laid onto the Earth, or a sentence that says why it was not. Derivation: docs/gnss.md."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.gnss import GnssFixes
+from boxplus.systems.georeference.attachment import AttachedFixes, attach
+from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.doubts import doubts_of, gated_stretches, of_gated
+from boxplus.systems.georeference.fit import Fit, MapGraph, antennas, fit, level
+from boxplus.systems.georeference.hypotheses import other_readings
+from boxplus.systems.georeference.start import Start, extent_of, find_start
+
+Floats = NDArray[np.float64]
+
+_FEWEST = 5
+_SIGMAS = 3.0
+_SHORT = 3.0  # times the noise of a fix: less than this of a way tells no heading
+_WIDEST = 0.1  # of the extent, the tolerance of a fix at most: with more, anything fits
+_LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Georeference:
+    """What positions by satellite came to.
+
+    Attributes:
+        refusal: why the map is not laid onto the Earth; None where it is. Then, and only then, there are:
+        frame: east, north and up at its origin; fit: T_enu_map with covariance, the maps' poses, lever arm, delay.
+        fixes: that were looked at, `used` of them. left_out: all others, by reason.
+        stretches: of fixes that fit nothing, (begin [s] since the first fix, duration [s], metres) each.
+        warnings: what to doubt about it, one sentence each.
+    """
+
+    refusal: str | None
+    frame: EnuFrame | None
+    fit: Fit | None
+    fixes: int
+    left_out: dict[str, int]
+    stretches: list[tuple[float, float, float]]
+    warnings: list[str]
+
+    @property
+    def used(self) -> int:
+        """Fixes the result rests on."""
+        return 0 if self.fit is None else int(self.fit.is_used.sum())
+
+
+class _Refused(Exception):  # noqa: N818  (it never leaves this file)
+    pass
+
+
+def georeference(
+    graph: MapGraph,
+    fixes: GnssFixes,
+    time_ns: NDArray[np.int64],
+    T_odo_imu: Floats,
+    config: GeoreferenceConfig | None = None,
+    p_imu_antenna: Floats | None = None,
+) -> Georeference:
+    """Lay local maps onto the Earth.
+
+    Args:
+        graph: local maps of an odometry, loops closed or not.
+        fixes: of the receiver.
+        time_ns: (K,) ascending, T_odo_imu: (K, 7) all poses of the odometry.
+        config: settings; each has a default.
+        p_imu_antenna: (3,) lever arm where the recording tells it; that of the settings goes first.
+
+    Example: docs/gnss.md.
+    """
+    config = config if config is not None else GeoreferenceConfig()
+    lever = p_imu_antenna if config.lever_arm is None else np.array(config.lever_arm)
+    attached = attach(fixes, graph.time_ns, graph.T_odo, time_ns, T_odo_imu, config)
+    none = Georeference(None, None, None, len(attached), dict(attached.left_out), [], [])
+    try:
+        start, frame, warnings = _start(graph, attached, lever, config)
+        return _judged(graph, attached, frame, start, lever, warnings, config)
+    except _Refused as refused:
+        return replace(none, refusal=str(refused))
+
+
+def _start(
+    graph: MapGraph, attached: AttachedFixes, lever: Floats | None, config: GeoreferenceConfig
+) -> tuple[Start, EnuFrame, list[str]]:
+    if len(attached) < _FEWEST:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in attached.left_out.items()) or "there are no others"
+        raise _Refused(f"{len(attached)} fixes can be used; left out: {reasons}")
+    frame = attached.frame
+    p_enu = frame.to_enu(attached.lat_lon_alt)
+    p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
+    extent, sigma = extent_of(p_level), float(np.median(attached.sigma))
+    if extent < _SHORT * sigma:
+        raise _Refused(
+            f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not determined; "
+            "record a longer way"
+        )
+    noise = attached.sigma * max(_scatter(p_level, p_enu) / sigma, 1.0)
+    allowed = (_SIGMAS * noise) ** 2 + _drift(graph)[attached.map_of] ** 2
+    allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2
+    tolerance = np.minimum(np.sqrt(allowed), _WIDEST * extent)
+    start = find_start(p_level, p_enu, tolerance)
+    better, fits_swapped = other_readings(attached.lat_lon_alt, p_level, tolerance, start)
+    if better is not None:
+        share = 0.0 if start is None else start.share
+        raise _Refused(
+            f"{better.name}: read so, {100 * better.start.share:.0f} % of the fixes lie on the path of the odometry, as they are "
+            f"{100 * share:.0f} %; correct the recording"
+        )
+    if start is None or start.share < _LEAST_SHARE:
+        share = 0.0 if start is None else start.share
+        raise _Refused(
+            f"the fixes do not follow the odometry's path: at best {100 * share:.0f} % of them lie within {np.median(tolerance):.1f} m "
+            f"of it, and between fixes far apart the way is {_ratio(p_level, p_enu):.3f} times the odometry's; another datum, "
+            "another unit, another vehicle, or the odometry is wrong"
+        )
+    warnings = []
+    if fits_swapped:
+        warnings.append(
+            f"the path is too straight or too short to tell whether latitude and longitude are swapped: is {frame.latitude:.4f}°, "
+            f"{frame.longitude:.4f}° the right place?"
+        )
+    return start, frame, warnings
+
+
+def _judged(
+    graph: MapGraph,
+    attached: AttachedFixes,
+    frame: EnuFrame,
+    start: Start,
+    lever: Floats | None,
+    warnings: list[str],
+    config: GeoreferenceConfig,
+) -> Georeference:
+    turn = quaternion.from_matrix(level(graph.T_odo))
+    T_enu_map = se3.compose([math.cos(0.5 * start.yaw), 0.0, 0.0, math.sin(0.5 * start.yaw), *start.shift], [*turn, 0.0, 0.0, 0.0])
+    found = fit(graph, attached, frame.to_enu(attached.lat_lon_alt), T_enu_map, start.inliers, lever, config)
+    share = 1.0 - float(found.is_used.mean())
+    stretches = gated_stretches(attached, found)
+    if share > config.most_gated:
+        longest = max(stretches, key=lambda stretch: stretch[1])
+        raise _Refused(
+            f"{100 * share:.0f} % of the fixes contradict the others and the odometry (for {longest[1]:.0f} s from {longest[0]:.0f} s on "
+            f"they lie {longest[2]:.1f} m off): nobody knows which are true; a datum that changes, multipath, or the odometry is wrong"
+        )
+    yaw_sigma = math.sqrt(float(found.covariance[2, 2]))
+    if yaw_sigma > config.largest_yaw_sigma:
+        raise _Refused(
+            f"the heading of the map is known to {math.degrees(yaw_sigma):.1f}° only, more than the "
+            f"{math.degrees(config.largest_yaw_sigma):.1f}° of gnss.largest_yaw_sigma: record a longer way"
+        )
+    left_out = Counter(attached.left_out) + of_gated(attached, found)
+    return Georeference(
+        refusal=None,
+        frame=frame,
+        fit=found,
+        fixes=len(attached),
+        left_out=dict(left_out),
+        stretches=stretches,
+        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, config),
+    )
+
+
+def _scatter(p_level: Floats, p_enu: Floats) -> float:
+    """Noise of a fix that does not last [m], from the lengths of successive steps: both have the same but for it."""
+    a, b = (np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1) for p in (p_level, p_enu))
+    return 1.4826 * float(np.median(np.abs(a - b))) / math.sqrt(2.0)
+
+
+def _drift(graph: MapGraph) -> Floats:
+    """(n,) three standard deviations of each map's position against the middle one, by the odometry alone [m]."""
+    middle = len(graph.T_odo) // 2
+    sigma = np.zeros(len(graph.T_odo))
+    for order in (range(middle + 1, len(sigma)), range(middle, 0, -1)):
+        P = np.zeros((6, 6))
+        for k in order:
+            if order.step > 0:
+                Z, own, to = se3.compose(se3.inverse(graph.T_odo[k - 1]), graph.T_odo[k]), graph.covariances[k], k
+            else:
+                Z, to = se3.compose(se3.inverse(graph.T_odo[k]), graph.T_odo[k - 1]), k - 1
+                back = se3.adjoint(se3.inverse(Z))  # an error on the right of T is that of its inverse, by the adjoint
+                own = back @ graph.covariances[k] @ back.T
+            Ad = se3.adjoint(se3.inverse(Z))
+            P = Ad @ P @ Ad.T + own
+            sigma[to] = _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(P[3:, 3:])[-1]), 0.0))
+    return sigma
+
+
+def _ratio(p_level: Floats, p_enu: Floats) -> float:
+    """Distances between fixes far apart, by the receiver over by the odometry; the median."""
+    half = len(p_level) // 2
+    a, b = (np.linalg.norm(p[half:, :2] - p[: len(p) - half, :2], axis=1) for p in (p_level, p_enu))
+    far = a > 0.3 * extent_of(p_level)
+    return float(np.median(b[far] / a[far])) if far.any() else float("nan")
