@@ -19,6 +19,7 @@ from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.config import MapConfig
 from boxplus.simulation import simulate, write_recording
+from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.slam.config import RegistrationConfig, SlamConfig
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
@@ -146,6 +147,7 @@ def test_every_page_is_in_the_index() -> None:
         ("slam", SlamConfig),
         ("slam", DescriptorConfig),
         ("slam", RegistrationConfig),
+        ("gnss", GeoreferenceConfig),
     ],
 )
 def test_configuration_page_names_every_setting_and_its_default(name_of_page: str, model: type[BaseModel]) -> None:

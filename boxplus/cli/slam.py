@@ -13,6 +13,7 @@ from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.runs.slam.slam_run import SlamResult
+    from boxplus.runs.slam.summary import GnssFacts
 
 
 @takes_recording_options
@@ -37,6 +38,11 @@ def slam(
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
     ] = None,
+    gnss_lever_arm: Annotated[
+        str | None,
+        typer.Option("--gnss-lever-arm", help="Antenna of the satellite receiver in the IMU frame, x,y,z [m]."),
+    ] = None,
+    utm: Annotated[bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).")] = False,
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
@@ -51,13 +57,18 @@ def slam(
     from boxplus.runs.slam.config import load_slam_config
     from boxplus.runs.slam.loop_file import read_loop_decisions
     from boxplus.runs.transform import parse_transform
+    from boxplus.sensors.gnss import antenna_offset
 
     odometry: dict[str, object] = {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)}
     if T_imu_lidar is not None:
         odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
+    gnss: dict[str, object] = {"utm": True} if utm else {}
+    if gnss_lever_arm is not None:
+        gnss["lever_arm"] = antenna_offset(gnss_lever_arm).tolist()
     overrides: dict[str, dict[str, object]] = {
         "recording": options.model_dump(exclude_defaults=True),
         "odometry": odometry,
+        "gnss": gnss,
         "map": {"save": False} if no_map else {},
     }
     run_config = load_slam_config(config, settings or (), overrides)
@@ -107,4 +118,15 @@ def _rows(result: SlamResult) -> list[tuple[str, str]]:
         ("correction", f"{summary.largest_shift_m:.2f} m at most, {summary.last_shift_m:.2f} m at the end"),
         ("map", f"{summary.map_points:,} points" if summary.map_points else "not kept"),
     ]
+    if summary.gnss is not None:
+        rows.insert(2, ("on the Earth", _earth(summary.gnss)))
     return rows + [("warning", text) for text in summary.warnings]
+
+
+def _earth(facts: GnssFacts) -> str:
+    if facts.origin is None or facts.heading_sigma_deg is None:
+        return "no: see the warning"
+    return (
+        f"origin {facts.origin[0]:.6f}°, {facts.origin[1]:.6f}°, {facts.origin[2]:.1f} m; known to "
+        f"{facts.position_sigma_m:.2f} m and {facts.heading_sigma_deg:.2f}° by {facts.used} fixes"
+    )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 BagFormat = Literal["ros2", "ros1"]
 
 IMU_TYPE, TRANSFORMS_TYPE = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 IMU_DELAY_NS = 500_000
 """From the instant of an IMU sample to its arrival."""
 _GROUND_TRUTH_NS = 10_000_000
@@ -90,6 +91,20 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             angular_velocity_covariance=_UNKNOWN,
             linear_acceleration=self.message(vector, x=accel[0], y=accel[1], z=accel[2]),
             linear_acceleration_covariance=_UNKNOWN,
+        )
+
+    def fix(self, stamp_ns: int, frame: str, lat_lon_alt: NDArray[np.float64], covariance: NDArray[np.float64]) -> Any:
+        """sensor_msgs/NavSatFix of one fix; a covariance of NaN is of unknown type."""
+        is_known = bool(np.isfinite(covariance).all())
+        return self.message(
+            FIX_TYPE,
+            header=self.header(stamp_ns, frame),
+            status=self.message("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+            latitude=float(lat_lon_alt[0]),
+            longitude=float(lat_lon_alt[1]),
+            altitude=float(lat_lon_alt[2]),
+            position_covariance=covariance.ravel() if is_known else _UNKNOWN,
+            position_covariance_type=2 if is_known else 0,
         )
 
     def transforms(self, stamp_ns: int, parent: str, children: Mapping[str, NDArray[np.float64]]) -> Any:

@@ -72,6 +72,23 @@ def simulate_drifting_drive(world: World, route: ArrayLike, config: DriftConfig 
         `simulate_drifting_drive(city(), [[0, 0], [60, 0], [60, 60], [0, 60], [0, 0], [60, 0]])`
     """
     config = config if config is not None else DriftConfig()
+    random = np.random.Generator(np.random.PCG64([seed, 700]))
+    time_ns, truth, odometry, covariance = _driven(route, config, random)
+    scans = [_scan(world, T, config, random) for T in truth]
+    return DriftingDrive(time_ns, truth, odometry, covariance, scans)
+
+
+def simulate_drift(route: ArrayLike, config: DriftConfig, seed: int = 0) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+    """The drive without its scans: times (K,) [ns], T_world_body (K, 7), T_odo_body (K, 7) and its covariance (K, 6, 6).
+
+    Arguments and errors as `simulate_drifting_drive`.
+    """
+    return _driven(route, config, np.random.Generator(np.random.PCG64([seed, 700])))
+
+
+def _driven(
+    route: ArrayLike, config: DriftConfig, random: np.random.Generator
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
     corners = np.asarray(route, dtype=np.float64)
     path, _, heading = rounded(corners[:, :2], config.corner_radius)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -82,10 +99,8 @@ def simulate_drifting_drive(world: World, route: ArrayLike, config: DriftConfig 
     position = np.column_stack([np.interp(at, way, path[:, 0]), np.interp(at, way, path[:, 1]), ground + config.height])
     q = np.column_stack([np.cos(0.5 * yaw), np.zeros((len(at), 2)), np.sin(0.5 * yaw)])
     truth = np.hstack([q, position])
-    random = np.random.Generator(np.random.PCG64([seed, 700]))
     odometry, covariance = _drifted(truth, config, random)
-    scans = [_scan(world, T, config, random) for T in truth]
-    return DriftingDrive(np.rint(at / config.speed * 1e9).astype(np.int64), truth, odometry, covariance, scans)
+    return np.rint(at / config.speed * 1e9).astype(np.int64), truth, odometry, covariance
 
 
 def _drifted(truth: Floats, config: DriftConfig, random: np.random.Generator) -> tuple[Floats, Floats]:

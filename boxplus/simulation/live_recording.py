@@ -5,18 +5,29 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
+from boxplus.manifolds import quaternion
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic
 from boxplus.recordings.recording import Event, Recording, Tally
+from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.scan import Scan
 from boxplus.simulation.faults import Fault
+from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from boxplus.simulation.simulation import Simulation
 
-LIDAR_TOPIC, IMU_TOPIC = "/lidar/points", "/imu/data"
+LIDAR_TOPIC, IMU_TOPIC, GNSS_TOPIC = "/lidar/points", "/imu/data", "/gnss/fix"
+GNSS_ORIGIN = EnuFrame(49.0, 8.4, 115.0)
+_GNSS_STEP_NS = 50_000_000
 LIDAR_FRAME, IMU_FRAME = "lidar", "imu"
 
 
-def as_recording(simulation: Simulation, fault: Fault | None = None) -> Recording:
-    """The simulation as a `Recording`; what a fault spoils arrives spoilt, units and mounting as (wrongly) declared."""
+def as_recording(simulation: Simulation, fault: Fault | None = None, gnss: GnssConfig | None = None) -> Recording:
+    """The simulation as a `Recording`; what a fault spoils arrives spoilt, units and mounting as (wrongly) declared.
+
+    With `gnss` a receiver takes part, whose lever arm is known; the world lies at `GNSS_ORIGIN` then, x east and y north.
+    """
     config = simulation.config
     imu_count = round((simulation.end_ns - simulation.start_ns) * 1e-9 * config.imu.rate_hz) + 1
     T_imu_lidar = simulation.T_imu_lidar if fault is None else fault.declared_extrinsic(simulation.T_imu_lidar)
@@ -45,4 +56,15 @@ def as_recording(simulation: Simulation, fault: Fault | None = None) -> Recordin
             tally.done += 1 if isinstance(event, Scan) else len(event)
             yield event
 
-    return Recording(info, read, lambda: None)
+    if gnss is None:
+        return Recording(info, read, lambda: None)
+    info.gnss_topic, info.p_imu_antenna = GNSS_TOPIC, np.array(gnss.lever)
+    return Recording(info, read, lambda: None, lambda: fixes_of(simulation, gnss))
+
+
+def fixes_of(simulation: Simulation, gnss: GnssConfig) -> GnssFixes:
+    """The fixes of a receiver along a simulation, which the seed of the simulation decides."""
+    times = np.arange(simulation.start_ns, simulation.end_ns + 1, _GNSS_STEP_NS)
+    motion = simulation.scenario.trajectory.evaluate(times)
+    poses = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
+    return simulate_gnss(times, poses, GNSS_ORIGIN, gnss, simulation.config.seed)

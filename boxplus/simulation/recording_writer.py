@@ -18,9 +18,18 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation.bag_writer import IMU_DELAY_NS, IMU_TYPE, TRANSFORMS_TYPE, BagFormat, BagWriter, ground_truth_lines
+from boxplus.simulation.bag_writer import (
+    FIX_TYPE,
+    IMU_DELAY_NS,
+    IMU_TYPE,
+    TRANSFORMS_TYPE,
+    BagFormat,
+    BagWriter,
+    ground_truth_lines,
+)
 from boxplus.simulation.faults import Fault
-from boxplus.simulation.live_recording import IMU_FRAME, IMU_TOPIC, LIDAR_FRAME, LIDAR_TOPIC, as_recording
+from boxplus.simulation.gnss import GnssConfig
+from boxplus.simulation.live_recording import GNSS_TOPIC, IMU_FRAME, IMU_TOPIC, LIDAR_FRAME, LIDAR_TOPIC, as_recording, fixes_of
 from boxplus.simulation.simulation import Simulation
 
 POINT = np.dtype(
@@ -35,6 +44,7 @@ _ROS_TYPE = {"<f4": 7, "<u2": 4}
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _TOPICS = {"/tf_static": TRANSFORMS_TYPE, IMU_TOPIC: IMU_TYPE, LIDAR_TOPIC: _CLOUD}
 _SCAN_DELAY_NS = 3_000_000
+_ANTENNA_FRAME = "antenna"
 
 
 def write_recording(
@@ -43,6 +53,7 @@ def write_recording(
     format: BagFormat = "ros2",
     fault: Fault | None = None,
     progress: Callable[[float], None] | None = None,
+    gnss: GnssConfig | None = None,
 ) -> Path:
     """Write a simulation to disk, scan by scan.
 
@@ -54,6 +65,7 @@ def write_recording(
         format: `ros2` for a ROS 2 folder with MCAP storage, `ros1` for a ROS 1 bag.
         fault: what goes wrong.
         progress: called with the share of the recording that is written, 0 to 1.
+        gnss: a receiver that takes part, with its lever arm among the static transforms; see `as_recording`.
 
     Returns:
         The path that was written.
@@ -72,8 +84,9 @@ def write_recording(
     make_folder(target.parent)
     stem = target.with_suffix("") if format == "ros1" else target
     try:
-        with BagWriter(target, format, _TOPICS) as bag:
-            _write_messages(bag, simulation, fault, progress)
+        topics = _TOPICS if gnss is None else {**_TOPICS, GNSS_TOPIC: FIX_TYPE}
+        with BagWriter(target, format, topics) as bag:
+            _write_messages(bag, simulation, fault, progress, gnss)
     except OSError as error:
         raise output_error(target, error) from error
     with atomic_file(f"{stem}.gt.tum") as file:
@@ -85,14 +98,25 @@ def write_recording(
 
 
 def _write_messages(
-    bag: BagWriter, simulation: Simulation, fault: Fault | None, progress: Callable[[float], None] | None
+    bag: BagWriter,
+    simulation: Simulation,
+    fault: Fault | None,
+    progress: Callable[[float], None] | None,
+    gnss: GnssConfig | None,
 ) -> None:
     T_imu_lidar = as_recording(simulation, fault).info.T_imu_lidar
     measured = _Measured(simulation)
     events = measured.events() if fault is None else fault.events(measured.events())
     if T_imu_lidar is not None:
-        mounting = bag.transforms(simulation.start_ns, IMU_FRAME, {LIDAR_FRAME: T_imu_lidar})
-        bag.write("/tf_static", simulation.start_ns, mounting)
+        children = {LIDAR_FRAME: T_imu_lidar}
+        if gnss is not None:
+            children[_ANTENNA_FRAME] = np.eye(4)
+            children[_ANTENNA_FRAME][:3, 3] = gnss.lever
+        bag.write("/tf_static", simulation.start_ns, bag.transforms(simulation.start_ns, IMU_FRAME, children))
+    if gnss is not None:  # stored first, as a receiver's file that is merged in would be
+        fixes = fixes_of(simulation, gnss)
+        for time_ns, place, covariance in zip(fixes.time_ns.tolist(), fixes.lat_lon_alt, fixes.covariance, strict=True):
+            bag.write(GNSS_TOPIC, simulation.start_ns, bag.fix(time_ns, _ANTENNA_FRAME, place, covariance))
     for event in events:
         if isinstance(event, Scan):
             cloud = _cloud(bag, event, simulation.scenario.lidar.ring(event.p_lidar))

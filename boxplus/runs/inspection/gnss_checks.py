@@ -60,7 +60,7 @@ def _check_status(fixes: GnssFixes) -> list[Evidence]:
 def _check_sigma(fixes: GnssFixes) -> Evidence:
     known = fixes.has_covariance
     if not known.any():
-        text = "the receiver does not say how good its positions are: slam.gnss.sigma is taken"
+        text = "the receiver does not say how good its positions are: gnss.sigma is taken"
         return Evidence("gnss_sigma", "unknown", "warning", text)
     variance = np.diagonal(fixes.covariance[known], axis1=1, axis2=2)
     horizontal, vertical = np.sqrt(np.median(variance[:, :2].mean(axis=1))), np.sqrt(np.median(variance[:, 2]))

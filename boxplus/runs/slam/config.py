@@ -11,14 +11,16 @@ from pydantic import Field
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.runs.config import RunConfig
 from boxplus.runs.settings_file import load_settings
+from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.slam.config import SlamConfig
 
 
 class SlamRunConfig(RunConfig):
-    """Settings of `boxplus slam`: those of the odometry, of the local maps and of loop closure. None has to be given."""
+    """Settings of `boxplus slam`: of the odometry, local maps, loop closure and positions by satellite. None has to be given."""
 
     local_maps: LocalMapConfig = Field(default_factory=lambda: LocalMapConfig())  # type: ignore[call-arg]
     slam: SlamConfig = Field(default_factory=lambda: SlamConfig())  # type: ignore[call-arg]
+    gnss: GeoreferenceConfig = Field(default_factory=lambda: GeoreferenceConfig())  # type: ignore[call-arg]
 
     def of_odometry(self) -> RunConfig:
         """The part that `boxplus lio` has."""

@@ -23,6 +23,21 @@ class SlamFolder(RunFolder):
         return self.path / "loops.csv"
 
     @property
+    def georeference(self) -> Path:
+        """Where on the Earth the map is; only with positions by satellite."""
+        return self.path / "georeference.yaml"
+
+    @property
+    def gnss(self) -> Path:
+        """Every fix that was compared with the odometry."""
+        return self.path / "gnss.csv"
+
+    @property
+    def trajectory_utm(self) -> Path:
+        """The trajectory in UTM, where it was asked for."""
+        return self.path / "trajectory_utm.csv"
+
+    @property
     def spool(self) -> Path:
         """Registered scans while the run goes on; gone afterwards."""
         return self.path / "scans.spool"
@@ -35,7 +50,7 @@ class SlamFolder(RunFolder):
     def own_files(self) -> Iterator[Path]:
         """See `RunFolder.own_files`."""
         yield from RunFolder.own_files(self)
-        yield from self.existing([self.loops, self.spool], ())
+        yield from self.existing([self.loops, self.georeference, self.gnss, self.trajectory_utm, self.spool], ())
         yield from self.odometry.own_files()
 
     def own_folders(self) -> Iterator[Path]:

@@ -29,9 +29,11 @@ from boxplus.runs.run_loop import Progress, versions
 from boxplus.runs.run_summary import RunSummary
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
+from boxplus.runs.slam.gnss_output import gnss_facts, gnss_warnings, lay_onto_earth, write_georeference
 from boxplus.runs.slam.loop_file import Pairs, write_loops
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan
 from boxplus.runs.slam.summary import SlamSummary
+from boxplus.sensors.geodesy import require_utm
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.slam import Slam
@@ -97,6 +99,8 @@ def run_slam(
             "run 'boxplus lio': it closes no loops, and needs no IMU",
         )  # fmt: skip
     config = config or SlamRunConfig()
+    if config.gnss.utm:
+        require_utm()
     slam = Slam(config.slam, forbidden=forbidden or (), forced=forced or ())
     claimed = nullcontext(folder) if isinstance(folder, SlamFolder) else claim_slam_folder(folder, overwrite=overwrite)
     started = datetime.now(UTC)
@@ -108,15 +112,22 @@ def run_slam(
         )  # fmt: skip
         beside.finish()
         began = time.perf_counter()
+        earth = lay_onto_earth(recording, own, slam, config.gnss)
         correction = slam.correction()
-        _write_trajectory(own, correction)
-        stored = _write_map(own, config, spool, correction) if config.map.save else 0
+        placed = correction if earth is None or earth.fit is None else correction.placed(earth.fit.T_enu_map)
+        _write_trajectory(own, placed)
+        if earth is not None:
+            write_georeference(own, earth, config.gnss)
+        stored = _write_map(own, config, spool, placed) if config.map.save else 0
         first_ns = odometry.first_time_ns or 0
         seconds = np.array([(m.time_ns - first_ns) * 1e-9 for m in beside.maps])
         write_loops(own.loops, slam.loops, seconds)
         with atomic_file(own.config) as file:
             file.write(dump_slam_config(config).encode())
         summary = _summary(started, recording, odometry, slam, correction, stored, beside.seconds, time.perf_counter() - began)
+        if earth is not None:
+            facts = gnss_facts(recording.info.gnss_topic, earth, correction)
+            summary = summary.model_copy(update={"gnss": facts, "warnings": summary.warnings + gnss_warnings(earth)})
         summary.write(own.summary)
     return SlamResult(summary, odometry, slam, beside.maps, seconds)
 
@@ -169,10 +180,13 @@ def _write_trajectory(folder: SlamFolder, correction: Correction) -> None:
     """The odometry's poses, corrected; covariance (which closing loops can only make smaller) and status are the odometry's."""
     odometry = read_trajectory(folder.odometry.trajectory)
     poses = correction.apply(odometry.times, np.hstack([odometry.q_wxyz, odometry.p]))
+    # Errors of positions are along the world's axes, and the world has turned.
+    turns = np.tile(np.eye(6), (len(poses), 1, 1))
+    turns[:, 3:, 3:] = quaternion.to_matrix(poses[:, :4]) @ quaternion.to_matrix(odometry.q_wxyz).transpose(0, 2, 1)
     none = np.zeros((6, 6))
     with TrajectoryWriter(folder.path) as writer:
         for k, (time_ns, T) in enumerate(zip(odometry.times.tolist(), poses, strict=True)):
-            covariance = none if odometry.covariance is None else odometry.covariance[k]
+            covariance = none if odometry.covariance is None else turns[k] @ odometry.covariance[k] @ turns[k].T
             status = "ok" if odometry.status is None else odometry.status[k]
             writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance, status)
 

@@ -12,6 +12,31 @@ from boxplus.formats.output import atomic_file
 from boxplus.runs.run_facts import Part, State
 
 
+class GnssFacts(Part):
+    """What positions by satellite came to."""
+
+    topic: str
+    refusal: str | None = Field(None, description="why the map is not laid onto the Earth")
+    used: int = Field(0, description="fixes the result rests on")
+    left_out: dict[str, int] = Field(default={}, description="how many others, by reason")
+    stretches: list[tuple[float, float, float]] = Field(
+        default=[], description="of fixes that fit nothing: begin since the first fix [s], duration [s], distance [m]"
+    )
+    origin: tuple[float, float, float] | None = Field(None, description="latitude, longitude [deg], height [m], WGS84")
+    epsg: int | None = Field(None, description="of the UTM zone of the origin")
+    T_enu_map: list[float] | None = Field(None, description="qw, qx, qy, qz, x, y, z")
+    covariance: list[list[float]] | None = Field(None, description="(6, 6) of T_enu_map, [w, v] on the right [rad, m]")
+    T_map_odo: list[float] | None = Field(None, description="at the newest local map")
+    heading_sigma_deg: float | None = None
+    position_sigma_m: float | None = Field(None, description="of a horizontal axis, root mean square over the local maps")
+    rms_m: float | None = Field(None, description="of the fixes that are used, to the ground track [m]")
+    lever_arm_m: tuple[float, float, float] | None = Field(None, description="antenna in the IMU's frame")
+    lever_arm_sigma_m: tuple[float, float, float] | None = Field(None, description="zero where it was given")
+    delay_s: float | None = Field(None, description="by which fixes are stamped late")
+    delay_sigma_s: float | None = None
+    noise_scale: float | None = Field(None, description="factor of the standard deviations that the receiver states")
+
+
 class SlamSummary(Part):
     """The facts of a run with loop closure."""
 
@@ -29,6 +54,7 @@ class SlamSummary(Part):
     loops_accepted: int = 0
     loops_forced: int = Field(0, description="believed because the user said so")
     loops_refused: dict[str, int] = Field(default={}, description="how many, by what spoke against them")
+    gnss: GnssFacts | None = Field(None, description="None: the recording has no positions by satellite, or they were left out")
     largest_shift_m: float = Field(0.0, description="by which closing loops moved a local map at most [m]")
     last_shift_m: float = Field(0.0, description="and the last one [m]")
     map_points: int = Field(0, description="in the corrected map")

@@ -30,4 +30,5 @@ class GeoreferenceConfig(BaseModel):
     correlation: float = Field(30.0, ge=0, description="errors of fixes stay for this long: as much as one fix counts in it [s]")
     inlier: float = Field(0.999, gt=0, lt=1, description="probability of a true fix to be taken for one")
     most_gated: float = Field(0.4, gt=0, lt=1, description="with a larger share of fixes that fit nothing, none is believed")
+    utm: bool = Field(False, description="write the trajectory in UTM, too; needs the extra gnss")
     largest_yaw_sigma: float = Field(0.05, gt=0, description="a heading known worse than this is not determined [rad]")

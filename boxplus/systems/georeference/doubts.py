@@ -63,8 +63,8 @@ def doubts_of(
     if abs(found.delay) > max(_SIGMAS * found.delay_sigma, _LEAST_DELAY):
         late = "late" if found.delay > 0 else "early"
         warnings.append(
-            f"fixes seem to be stamped {abs(found.delay):.2f} s {late} (± {found.delay_sigma:.2f} s), which was allowed for; correct "
-            f"the stamps, or set gnss.time_offset_s={config.time_offset_s - found.delay:.2f}"
+            f"fixes seem to be stamped {abs(found.delay):.2f} s {late} (± {found.delay_sigma:.2f} s), which was allowed for; "
+            f"correct the stamps, or set gnss.time_offset_s={config.time_offset_s - found.delay:.2f}"
         )
     share = 1.0 - float(found.is_used.mean())
     if share > _MANY_GATED:
@@ -73,14 +73,14 @@ def doubts_of(
     for begin, duration, metres in stretches:
         if duration > max(_LONG * total, _LASTING):
             warnings.append(
-                f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: another datum or "
-                "base station, or the odometry is wrong there"
+                f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
+                "another datum or base station, or the odometry is wrong there"
             )
     if found.noise_scale > _NOISY:
-        warnings.append(f"fixes scatter {found.noise_scale:.1f} times as much as they claim; their standard deviations were raised")
+        warnings.append(f"fixes scatter {found.noise_scale:.1f} times as much as they claim; they are believed that much less")
     if found.tension > _BENT:
         warnings.append(
-            f"fixes bend the odometry {math.sqrt(found.tension):.1f} times as much as its covariance allows: it drifts more than claimed, "
-            "or the fixes have another scale or datum"
+            f"fixes bend the odometry {math.sqrt(found.tension):.1f} times as much as its covariance allows: it drifts more than "
+            "claimed, or the fixes have another scale or datum"
         )
     return warnings

@@ -1,9 +1,8 @@
-"""The pose graph of local maps with fixes: poses, georeference, lever arm and delay together, outliers by truncated least squares."""
+"""Poses of local maps, georeference, lever arm and delay in one graph; outliers by truncated least squares."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +22,7 @@ from boxplus.residuals.gravity_direction import GravityDirection
 from boxplus.residuals.prior import Prior
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
-from boxplus.systems.slam.graph import add_loops, mean_up, open_graph
-from boxplus.systems.slam.loop import Loop
+from boxplus.systems.slam.graph import MapGraph, add_loops, mean_up, open_graph
 
 Floats = NDArray[np.float64]
 
@@ -32,24 +30,6 @@ _DAMPING = 1e-9
 _MEDIAN_SQUARE = 2.366  # of a normal vector of three
 _ROUNDS = 4
 _SETTLED = 1.1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapGraph:
-    """The local maps of an odometry and what holds them together; see `boxplus.systems.slam.graph`.
-
-    Attributes:
-        time_ns: (n,) of the maps. T_odo: (n, 7) along the odometry; T_map: (n, 7) with loops closed.
-        covariances: (n, 6, 6) of each in the one before. loops: those that are believed.
-        gravity_sigma: of the vertical of a local map [rad].
-    """
-
-    time_ns: NDArray[np.int64]
-    T_odo: Floats
-    T_map: Floats
-    covariances: Floats
-    loops: Sequence[Loop] = ()
-    gravity_sigma: float = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +80,8 @@ def fit(
 ) -> Fit:
     """Minimise over everything, from a start.
 
-    Errors of fixes stay for tens of seconds, so that fixes nearer to each other than that count as one together: standard deviations are
-    multiplied by √(correlation/spacing), and the threshold of outliers divided by it, which decides by each fix's own.
+    Errors of fixes stay for tens of seconds, so that fixes nearer to each other than that count as one together: standard
+    deviations are multiplied by √(correlation/spacing). The threshold of outliers is divided by it: a fix is judged by its own.
 
     Args:
         attached: N fixes, p_enu: (N, 3) where they are. T_enu_map: (7,) the start, believed: (N,) the fixes it rests on.
@@ -191,7 +171,7 @@ def _position_sigma(solution: Solution, x: Variables, world: Variables) -> Float
     cross = of_world @ between @ of_map.transpose(0, 2, 1)
     total = of_world @ solution.covariance(world)[0] @ of_world.transpose(0, 2, 1) + of_map @ own @ of_map.transpose(0, 2, 1)
     total = total + cross + cross.transpose(0, 2, 1)
-    return np.sqrt(0.5 * np.maximum(total[:, 0, 0] + total[:, 1, 1], 0.0))
+    return np.asarray(np.sqrt(0.5 * np.maximum(total[:, 0, 0] + total[:, 1, 1], 0.0)))
 
 
 def antennas(graph: MapGraph, attached: AttachedFixes, lever: Floats | None) -> Floats:

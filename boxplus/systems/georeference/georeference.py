@@ -15,17 +15,21 @@ from boxplus.sensors.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import doubts_of, gated_stretches, of_gated
-from boxplus.systems.georeference.fit import Fit, MapGraph, antennas, fit, level
-from boxplus.systems.georeference.hypotheses import other_readings
+from boxplus.systems.georeference.fit import Fit, antennas, fit, level
+from boxplus.systems.georeference.hypotheses import other_clock, other_readings
 from boxplus.systems.georeference.start import Start, extent_of, find_start
+from boxplus.systems.slam.graph import MapGraph
 
 Floats = NDArray[np.float64]
 
 _FEWEST = 5
 _SIGMAS = 3.0
-_SHORT = 3.0  # times the noise of a fix: less than this of a way tells no heading
-_WIDEST = 0.1  # of the extent, the tolerance of a fix at most: with more, anything fits
+_NOISIEST = 10.0  # [m] what successive fixes disagree by beyond this is no noise
+_SHORT = 10.0  # times the noise of a fix: less than this of a way tells no heading
+_WIDEST = 0.3  # of the extent, the tolerance of a fix at most: with more, anything fits
 _LEAST_SHARE = 0.5
+_EXPLAINS = 0.8  # of the fixes, for a mistake to be named
+_STRETCHED = 0.1  # a path of another scale than this is another path
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +39,8 @@ class Georeference:
     Attributes:
         refusal: why the map is not laid onto the Earth; None where it is. Then, and only then, there are:
         frame: east, north and up at its origin; fit: T_enu_map with covariance, the maps' poses, lever arm, delay.
-        fixes: that were looked at, `used` of them. left_out: all others, by reason.
+        attached: the fixes that were compared with the odometry.
+        left_out: fixes that are not used, by reason.
         stretches: of fixes that fit nothing, (begin [s] since the first fix, duration [s], metres) each.
         warnings: what to doubt about it, one sentence each.
     """
@@ -43,7 +48,7 @@ class Georeference:
     refusal: str | None
     frame: EnuFrame | None
     fit: Fit | None
-    fixes: int
+    attached: AttachedFixes
     left_out: dict[str, int]
     stretches: list[tuple[float, float, float]]
     warnings: list[str]
@@ -54,8 +59,8 @@ class Georeference:
         return 0 if self.fit is None else int(self.fit.is_used.sum())
 
 
-class _Refused(Exception):  # noqa: N818  (it never leaves this file)
-    pass
+class _Refused(Exception):
+    """Why there is no georeference; it never leaves this file."""
 
 
 def georeference(
@@ -80,7 +85,7 @@ def georeference(
     config = config if config is not None else GeoreferenceConfig()
     lever = p_imu_antenna if config.lever_arm is None else np.array(config.lever_arm)
     attached = attach(fixes, graph.time_ns, graph.T_odo, time_ns, T_odo_imu, config)
-    none = Georeference(None, None, None, len(attached), dict(attached.left_out), [], [])
+    none = Georeference(None, None, None, attached, dict(attached.left_out), [], [])
     try:
         start, frame, warnings = _start(graph, attached, lever, config)
         return _judged(graph, attached, frame, start, lever, warnings, config)
@@ -97,36 +102,50 @@ def _start(
     frame = attached.frame
     p_enu = frame.to_enu(attached.lat_lon_alt)
     p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
-    extent, sigma = extent_of(p_level), float(np.median(attached.sigma))
+    extent, stated = extent_of(p_level), float(np.median(attached.sigma))
+    sigma = max(stated, min(_scatter(p_level, p_enu), _NOISIEST))
     if extent < _SHORT * sigma:
         raise _Refused(
-            f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not determined; "
-            "record a longer way"
+            f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not "
+            "determined; record a longer way"
         )
-    noise = attached.sigma * max(_scatter(p_level, p_enu) / sigma, 1.0)
-    allowed = (_SIGMAS * noise) ** 2 + _drift(graph)[attached.map_of] ** 2
+    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + _drift(graph)[attached.map_of] ** 2
+    speed = np.linalg.norm(attached.v_map, axis=1)
+    allowed += (2.0 * config.delay_sigma * speed) ** 2
     allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2
     tolerance = np.minimum(np.sqrt(allowed), _WIDEST * extent)
     start = find_start(p_level, p_enu, tolerance)
     better, fits_swapped = other_readings(attached.lat_lon_alt, p_level, tolerance, start)
-    if better is not None:
+    if better is not None and better.start.share >= _EXPLAINS:
         share = 0.0 if start is None else start.share
         raise _Refused(
             f"{better.name}: read so, {100 * better.start.share:.0f} % of the fixes lie on the path of the odometry, as they are "
             f"{100 * share:.0f} %; correct the recording"
         )
-    if start is None or start.share < _LEAST_SHARE:
+    if start is None or start.share < _LEAST_SHARE or better is not None:
+        lag = other_clock(attached.time_ns, p_level, p_enu, tolerance, start)
+        if lag is not None and lag.start.share >= _EXPLAINS:
+            raise _Refused(
+                f"the clock of the receiver is another one: {100 * lag.start.share:.0f} % of the fixes follow the odometry "
+                f"when {lag.offset_s:+.2f} s are added to their times; correct the stamps, or set gnss.time_offset_s"
+            )
         share = 0.0 if start is None else start.share
         raise _Refused(
-            f"the fixes do not follow the odometry's path: at best {100 * share:.0f} % of them lie within {np.median(tolerance):.1f} m "
-            f"of it, and between fixes far apart the way is {_ratio(p_level, p_enu):.3f} times the odometry's; another datum, "
+            f"the fixes do not follow the odometry's path: at best {100 * share:.0f} % of them lie within "
+            f"{np.median(tolerance):.1f} m of it, and fixes far apart lie {_ratio(p_level, p_enu):.3f} times as far as "
+            "by the odometry; another datum, "
             "another unit, another vehicle, or the odometry is wrong"
+        )
+    if abs(start.scale - 1.0) > _STRETCHED:
+        raise _Refused(
+            f"the path of the fixes is {start.scale:.3f} times as large as the odometry's: another datum or "
+            "unit, another vehicle, or a way too short for their noise"
         )
     warnings = []
     if fits_swapped:
         warnings.append(
-            f"the path is too straight or too short to tell whether latitude and longitude are swapped: is {frame.latitude:.4f}°, "
-            f"{frame.longitude:.4f}° the right place?"
+            f"the path is too straight or too short to tell whether latitude and longitude are swapped: is "
+            f"{frame.latitude:.4f}°, {frame.longitude:.4f}° the right place?"
         )
     return start, frame, warnings
 
@@ -141,15 +160,17 @@ def _judged(
     config: GeoreferenceConfig,
 ) -> Georeference:
     turn = quaternion.from_matrix(level(graph.T_odo))
-    T_enu_map = se3.compose([math.cos(0.5 * start.yaw), 0.0, 0.0, math.sin(0.5 * start.yaw), *start.shift], [*turn, 0.0, 0.0, 0.0])
+    T_enu_map = se3.compose(
+        [math.cos(0.5 * start.yaw), 0.0, 0.0, math.sin(0.5 * start.yaw), *start.shift], [*turn, 0.0, 0.0, 0.0]
+    )
     found = fit(graph, attached, frame.to_enu(attached.lat_lon_alt), T_enu_map, start.inliers, lever, config)
     share = 1.0 - float(found.is_used.mean())
     stretches = gated_stretches(attached, found)
     if share > config.most_gated:
         longest = max(stretches, key=lambda stretch: stretch[1])
         raise _Refused(
-            f"{100 * share:.0f} % of the fixes contradict the others and the odometry (for {longest[1]:.0f} s from {longest[0]:.0f} s on "
-            f"they lie {longest[2]:.1f} m off): nobody knows which are true; a datum that changes, multipath, or the odometry is wrong"
+            f"{100 * share:.0f} % of the fixes contradict the others and the odometry (for {longest[1]:.0f} s they lie "
+            f"{longest[2]:.1f} m off): nobody knows which are true; multipath, a datum that changes, or a wrong odometry"
         )
     yaw_sigma = math.sqrt(float(found.covariance[2, 2]))
     if yaw_sigma > config.largest_yaw_sigma:
@@ -162,7 +183,7 @@ def _judged(
         refusal=None,
         frame=frame,
         fit=found,
-        fixes=len(attached),
+        attached=attached,
         left_out=dict(left_out),
         stretches=stretches,
         warnings=warnings + doubts_of(attached, found, lever is not None, stretches, config),

@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 _BETTER = 0.1  # by which the cost of one reading must be below that of another to be told from it
 SWAPPED = "latitude and longitude are swapped"
+OFFSETS_S = (*(0.25 * k for k in range(1, 9)), 17.0, 18.0, 19.0)
+"""Offsets of clocks that are tried; GPS time is 18 s ahead of UTC since 2017."""
 _FITS = 0.5  # largest cost of a reading that explains the fixes
 
 
@@ -41,9 +43,7 @@ class Reading:
     start: Start
 
 
-def other_readings(
-    lat_lon_alt: Floats, p_level: Floats, tolerance: Floats, given: Start | None
-) -> tuple[Reading | None, bool]:
+def other_readings(lat_lon_alt: Floats, p_level: Floats, tolerance: Floats, given: Start | None) -> tuple[Reading | None, bool]:
     """The reading that fits clearly better than the numbers as they are, and whether they fit as well when swapped.
 
     Other mirror images fit every straight path; swapping changes lengths, too, and is worth a word where it does not show.
@@ -64,3 +64,31 @@ def other_readings(
     better = [reading for reading in found if reading.start.cost < cost - _BETTER]
     swapped = any(reading.name == SWAPPED and reading.start.cost < cost + _BETTER for reading in found)
     return (better[0] if better else None), swapped
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """A time that, added to those of the fixes, makes them follow the odometry [s], and how well."""
+
+    offset_s: float
+    start: Start
+
+
+def other_clock(time_ns: NDArray[np.int64], p_level: Floats, p_enu: Floats, tolerance: Floats, given: Start | None) -> Lag | None:
+    """A clock that is up to two seconds off, or by the leap seconds between GPS time and UTC, where that fits clearly better.
+
+    Args:
+        time_ns: (N,) of the fixes; the others as in `find_start`.
+    """
+    best: Lag | None = None
+    seconds = (time_ns - time_ns[0]) * 1e-9
+    for offset in (*OFFSETS_S, *(-offset for offset in OFFSETS_S)):
+        inside = (seconds + offset >= 0.0) & (seconds + offset <= seconds[-1])
+        if inside.sum() < 0.5 * len(seconds):
+            continue
+        moved = np.column_stack([np.interp(seconds[inside] + offset, seconds, p_level[:, k]) for k in range(3)])
+        start = find_start(moved, p_enu[inside], tolerance[inside])
+        if start is not None and (best is None or start.cost < best.start.cost):
+            best = Lag(offset, start)
+    cost = 1.0 if given is None else given.cost
+    return best if best is not None and best.start.cost < min(cost - _BETTER, _FITS) else None

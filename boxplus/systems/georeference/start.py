@@ -22,12 +22,14 @@ class Start:
     Attributes:
         yaw: [rad]. shift: (3,) [m].
         inliers: (N,) fixes within their tolerance on the ground.
+        scale: of the path of the fixes against the odometry's, by those that fit.
         cost: mean over the fixes of (distance/tolerance)², 1 at most: 0 where all fit, 1 where none does.
     """
 
     yaw: float
     shift: Floats
     inliers: NDArray[np.bool_]
+    scale: float
     cost: float
 
     @property
@@ -76,7 +78,13 @@ def find_start(p_level: Floats, p_enu: Floats, tolerance: Floats) -> Start | Non
     inliers = _near(p_level, p_enu, angle, shift, tolerance)
     errors = _turned(p_level[:, :2], angle) + shift - p_enu[:, :2]
     up = np.median((p_enu - p_level)[inliers if inliers.any() else slice(None), 2])
-    return Start(angle, np.array([*shift, up]), inliers, _cost(errors, tolerance))
+    scale = _scale(_turned(p_level[inliers, :2], angle), p_enu[inliers, :2]) if inliers.sum() > 1 else 0.0
+    return Start(angle, np.array([*shift, up]), inliers, scale, _cost(errors, tolerance))
+
+
+def _scale(p: Floats, q: Floats) -> float:
+    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+    return float((a * b).sum() / max(float((a * a).sum()), 1e-12))
 
 
 def _cost(errors: Floats, tolerance: Floats) -> float:
@@ -90,7 +98,7 @@ def _near(p_level: Floats, p_enu: Floats, angle: float, shift: Floats, tolerance
 
 def _turned(p: Floats, angle: float) -> Floats:
     c, s = np.cos(angle), np.sin(angle)
-    return p @ np.array([[c, s], [-s, c]])
+    return np.asarray(p @ np.array([[c, s], [-s, c]]))
 
 
 def _fitted(p: Floats, q: Floats, weights: Floats) -> tuple[float, Floats]:

@@ -36,6 +36,10 @@ class Correction:
         """(7,) that of the newest local map: what a live consumer multiplies the odometry by."""
         return se3.compose(self.T_map[-1], se3.inverse(self.T_odo[-1]))
 
+    def placed(self, T_enu_map: ArrayLike) -> Correction:
+        """The same with the map laid onto the Earth: results of `apply` are in ENU then."""
+        return Correction(self.time_ns, self.T_odo, se3.compose(T_enu_map, self.T_map))
+
     def apply(self, time_ns: ArrayLike, T_odo_body: ArrayLike) -> Floats:
         """Poses (m, 7) of a body in the map, for those along the odometry (m, 7) at times (m,) [ns].
 

@@ -44,6 +44,24 @@ class ClosedGraph:
     solution: Solution
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MapGraph:
+    """The local maps of an odometry and what holds them together.
+
+    Attributes:
+        time_ns: (n,) of the maps. T_odo: (n, 7) along the odometry; T_map: (n, 7) with loops closed.
+        covariances: (n, 6, 6) of each in the one before. loops: those that are believed.
+        gravity_sigma: of the vertical of a local map [rad].
+    """
+
+    time_ns: NDArray[np.int64]
+    T_odo: Floats
+    T_map: Floats
+    covariances: Floats
+    loops: Sequence[Loop] = ()
+    gravity_sigma: float = 0.005
+
+
 def open_graph(T_odo: Sequence[Floats], covariances: Sequence[Floats], gravity_sigma: float) -> tuple[Problem, Variables]:
     """Poses of local maps along the odometry, each with its vertical, the first held where it is; arguments as `close_graph`."""
     poses = np.stack(T_odo)
@@ -52,7 +70,9 @@ def open_graph(T_odo: Sequence[Floats], covariances: Sequence[Floats], gravity_s
     x = problem.add_variables(SE3, poses, name="poses")
     if len(steps):
         measured = se3.compose(se3.inverse(poses[:-1]), poses[1:])
-        problem.add_residuals(RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry")
+        problem.add_residuals(
+            RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry"
+        )
     # Every map's z axis is its own measurement of the vertical; their mean is that of the odometry's world.
     vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), mean_up(poses), sigma=gravity_sigma)
     problem.add_residuals(vertical, x, name="gravity")

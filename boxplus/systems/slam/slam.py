@@ -21,7 +21,7 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.correction import Correction
-from boxplus.systems.slam.graph import close_graph
+from boxplus.systems.slam.graph import MapGraph, close_graph
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
 from boxplus.systems.slam.proposals import Proposal, Proposer
@@ -116,6 +116,18 @@ class Slam:
         return Correction(
             np.array([m.time_ns for m in self._maps], dtype=np.int64), np.stack(self._odometry.poses), np.stack(self.T_map)
         )
+
+    def graph(self) -> MapGraph:
+        """Local maps, odometry and the loops believed now: what positions by satellite are added to.
+
+        Raises:
+            InputError: no local map yet.
+        """
+        correction = self.correction()
+        loops = [loop for loop in self.loops if loop.is_accepted]
+        scale = self._drift_scale(loops)
+        covariances = np.stack([scale * m.covariance for m in self._maps])
+        return MapGraph(correction.time_ns, correction.T_odo, correction.T_map, covariances, loops, self.config.gravity_sigma)
 
     def _close(self) -> None:
         """Believe the largest set of loops that agree with each other and with the odometry, and move the maps."""

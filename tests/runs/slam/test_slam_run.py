@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from boxplus.errors import InputError
 from boxplus.formats.ply import read_ply
@@ -21,8 +22,10 @@ from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import read_loop_decisions
 from boxplus.runs.slam.slam_run import SlamResult, run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan
+from boxplus.sensors.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
-from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.gnss import GnssConfig
+from boxplus.simulation.live_recording import GNSS_ORIGIN, as_recording
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.scenarios import make_scenario
 from boxplus.simulation.simulation import Simulation
@@ -43,6 +46,9 @@ def round_a_block() -> Simulation:
     return Simulation(replace(make_scenario("drive"), name="round a block", world=world, trajectory=drive, lidar=lidar), seed=3)
 
 
+RECEIVER = GnssConfig(lever=(0.3, 0.0, 0.8), sigma=0.02, slow_sigma=0.02, claimed=0.04, multipath=2, multipath_s=4.0)
+
+
 @dataclass(frozen=True)
 class Finished:
     folder: SlamFolder
@@ -54,13 +60,13 @@ class Finished:
 
 
 def block() -> Recording:
-    return as_recording(round_a_block())
+    return as_recording(round_a_block(), gnss=RECEIVER)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     folder = SlamFolder(tmp_path_factory.mktemp("slam") / "out")
-    config = load_slam_config(settings=SETTINGS)
+    config = load_slam_config(settings=[*SETTINGS, "gnss.utm=true"])
     result = run_slam(block(), folder.path, config)
     write_slam_report(folder.path, result)
     return Finished(folder, result, round_a_block())
@@ -100,6 +106,26 @@ def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> Non
     assert page.count("<img alt=") == 1 + sum(loop.measured > 0 for loop in loops)
     assert finished.folder.odometry.report.exists()
     assert sum(finished.result.summary.loops_refused.values()) == sum(not loop.is_accepted for loop in loops)
+
+
+def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
+    folder, facts = finished.folder, finished.result.summary.gnss
+    assert facts is not None and facts.refusal is None and facts.epsg == 32632 and facts.position_sigma_m is not None
+    place = yaml.safe_load(folder.georeference.read_text(encoding="utf-8"))
+    origin = EnuFrame(*place["origin"].values())
+    trajectory = read_trajectory(folder.trajectory)
+    truth = origin.to_enu(GNSS_ORIGIN.to_geodetic(finished.simulation.ground_truth(trajectory.times).p_world_imu))
+    off = np.linalg.norm(trajectory.p - truth, axis=1)
+    assert off.max() < max(4.0 * facts.position_sigma_m, 0.2)  # nothing was aligned
+    rows = list(csv.DictReader(folder.gnss.open(encoding="utf-8")))
+    assert sum(row["used"] == "1" for row in rows) == facts.used
+    gated = sum(count for reason, count in facts.left_out.items() if reason.startswith("off "))
+    assert gated + facts.used == len(rows) and 0 < gated < 0.3 * len(rows) and facts.stretches
+    utm = np.loadtxt(folder.trajectory_utm, delimiter=",", skiprows=2)
+    np.testing.assert_allclose(utm[:, 1:], to_utm(origin.to_geodetic(trajectory.p), 32632), atol=1e-3)
+    points = read_ply(folder.map_ply).points.mean(axis=0)
+    expected = origin.to_enu(GNSS_ORIGIN.to_geodetic([[20.0, 20.0, 0.0]]))[0]  # the middle of the block
+    assert np.linalg.norm((points - expected)[:2]) < 15.0
 
 
 def test_a_folder_with_results_is_replaced_only_when_asked(finished: Finished) -> None:

@@ -1,0 +1,164 @@
+"""A map laid onto the Earth: right where fixes are good, and a sentence where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.sensors.gnss import GnssFixes
+from boxplus.simulation.drifting_drive import DriftConfig
+from boxplus.simulation.gnss import GnssConfig
+from boxplus.systems.georeference.attachment import attach
+from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.fit import level
+from boxplus.systems.georeference.georeference import Georeference, georeference
+from boxplus.systems.georeference.start import find_start
+from tests.systems.georeference.drives import LAPS, Drive, drive
+
+LEVER = (0.8, -0.3, 1.1)
+GOOD = GnssConfig(sigma=0.3, slow_sigma=0.1, claimed=0.3, lever=LEVER)
+
+
+@pytest.fixture(scope="module")
+def laps() -> Drive:
+    return drive(LAPS)
+
+
+def found(
+    given: Drive, receiver: GnssConfig, config: GeoreferenceConfig | None = None, lever: tuple[float, ...] | None = LEVER
+) -> Georeference:
+    arm = None if lever is None else np.array(lever)
+    return georeference(given.graph, given.fixes(receiver), given.time_ns, given.T_odo_imu, config, arm)
+
+
+def test_a_map_lies_where_it_is_and_drifts_no_more(laps: Drive) -> None:
+    result = found(laps, GOOD)
+    assert result.refusal is None and result.fit is not None and result.warnings == []
+    off = laps.off(result)
+    assert off.max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+    assert result.used == len(result.attached)
+    R = quaternion.to_matrix(result.fit.T_enu_map[:4])
+    assert np.degrees(np.arccos(R[2, 2])) < 1.0  # up stays up
+    assert np.degrees(np.sqrt(result.fit.covariance[2, 2])) < 0.5
+
+
+def test_multipath_is_gated_and_counted(laps: Drive) -> None:
+    result = found(laps, GOOD.model_copy(update={"multipath": 3, "multipath_s": 6.0}))
+    assert result.refusal is None and result.fit is not None
+    assert laps.off(result).max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+    gated = sum(count for reason, count in result.left_out.items() if reason.startswith("off "))
+    assert gated == len(result.attached) - result.used and 6 <= gated <= 25
+    assert all(metres > 5.0 for _, duration, metres in result.stretches if duration > 2.0)
+
+
+@pytest.mark.parametrize(
+    ("receiver", "sentence"),
+    [
+        ({"swapped": True}, "latitude and longitude are swapped: read so, 100 %"),
+        ({"delay_s": 18.0}, "when -18.00 s are added"),
+        ({"unit": "rad"}, "latitude and longitude are radians"),
+        ({"jump": (30.0, 20.0, 0.0)}, "% of the fixes contradict the others"),
+    ],
+)
+def test_what_is_wrong_with_the_fixes_is_refused_with_evidence(laps: Drive, receiver: dict[str, object], sentence: str) -> None:
+    result = found(laps, GOOD.model_copy(update=receiver))
+    assert result.refusal is not None and sentence in result.refusal
+    assert result.fit is None and result.frame is None
+
+
+def test_fixes_of_another_vehicle_are_refused(laps: Drive) -> None:
+    other = drive([[0, 0], [100, 0], [100, -120], [220, -120]], seed=4)
+    result = georeference(laps.graph, other.fixes(GOOD), laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
+    assert result.refusal is not None and "do not follow the odometry's path" in result.refusal
+
+
+@pytest.mark.parametrize("delay", [0.4, -0.4])
+def test_stamps_that_are_late_are_doubted_and_allowed_for(laps: Drive, delay: float) -> None:
+    result = found(laps, GOOD.model_copy(update={"delay_s": delay}))
+    assert result.fit is not None and 0.5 < result.fit.delay / delay < 1.1  # drawn to zero by what is known beforehand
+    (warning,) = [text for text in result.warnings if "stamped" in text]
+    assert ("late" in warning) == (delay > 0)
+    corrected = found(laps, GOOD.model_copy(update={"delay_s": delay}), GeoreferenceConfig(time_offset_s=-delay))
+    assert corrected.warnings == []
+
+
+def test_a_lever_arm_nobody_gave_is_estimated_and_said(laps: Drive) -> None:
+    precise = GOOD.model_copy(update={"sigma": 0.02, "slow_sigma": 0.0, "claimed": 0.02})
+    result = found(laps, precise, lever=None)
+    assert result.fit is not None and any("lever arm" in text for text in result.warnings)
+    off = np.abs(result.fit.lever - LEVER)[:2]
+    assert (off < 4.0 * result.fit.lever_sigma[:2]).all()
+    assert result.fit.lever_sigma[1] < 0.1  # sideways; ahead, a delay looks the same where the speed is
+
+
+def test_claims_that_are_too_good_are_seen_through(laps: Drive) -> None:
+    result = found(laps, GOOD.model_copy(update={"claimed": 0.03}))
+    assert result.fit is not None and 5.0 < result.fit.noise_scale < 20.0
+    assert any("scatter" in text for text in result.warnings)
+    assert laps.off(result).max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+
+
+def northward(length: float) -> Drive:
+    given = drive([[0, 0], [length, 0]], seed=1)
+    yaw = 0.5 * np.pi - 2.0 * np.arctan2(given.T_enu_imu[0, 3], given.T_enu_imu[0, 0])
+    turn = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), 0.0, 0.0, 0.0])
+    return Drive(given.time_ns, se3.compose(turn, given.T_enu_imu), given.T_odo_imu, given.graph, given.at)
+
+
+def test_a_straight_way_tells_the_heading_but_not_always_the_order_of_the_numbers() -> None:
+    assert found(northward(250.0), GOOD).warnings == []  # swapped, the way would be 1 % shorter
+    north = northward(150.0)
+    result = found(north, GOOD.model_copy(update={"sigma": 1.5, "claimed": 1.5}))
+    assert result.refusal is None and result.fit is not None
+    assert any("swapped" in text for text in result.warnings)
+    assert north.off(result).max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+
+
+def test_standing_still_tells_no_heading() -> None:
+    still = drive([[0, 0], [30, 0]], seed=1, config=DriftConfig(step_m=0.02, speed=0.02))
+    few = slice(0, 60)
+    graph = drive([[0, 0], [30, 0]], seed=1).graph
+    fixes = still.fixes(GOOD.model_copy(update={"rate_hz": 1.0})).selected(np.arange(50))
+    result = georeference(graph, fixes, still.time_ns[few], still.T_odo_imu[few], None, np.array(LEVER))
+    assert result.refusal is not None and "heading of the map is not determined" in result.refusal
+
+
+def test_fixes_outside_of_the_odometry_are_counted(laps: Drive) -> None:
+    fixes = laps.fixes(GOOD)
+    early = georeference(laps.graph, fixes.shifted(-(10**13)), laps.time_ns, laps.T_odo_imu)
+    assert early.refusal is not None and f"{len(fixes)} outside of the odometry's time" in early.refusal
+    gap = np.ones(len(laps.time_ns), dtype=bool)
+    gap[100:150] = False
+    attached = attach(
+        fixes, laps.graph.time_ns, laps.graph.T_odo, laps.time_ns[gap], laps.T_odo_imu[gap], GeoreferenceConfig(interval=0.0)
+    )
+    assert attached.left_out["in a gap of the odometry"] > 10
+    assert len(attached) + sum(attached.left_out.values()) == len(fixes)
+    again = se3.compose(laps.graph.T_odo[attached.map_of], attached.T_map_imu)
+    p = np.column_stack([np.interp(attached.time_ns, laps.time_ns, laps.T_odo_imu[:, k]) for k in range(4, 7)])
+    np.testing.assert_allclose(again[:, 4:], p, atol=0.05)  # along chords and not along arcs
+    assert np.linalg.norm(attached.v_map, axis=1) == pytest.approx(8.0, abs=0.3)
+    assert len(georeference(laps.graph, GnssFixes.from_arrays([], []), laps.time_ns, laps.T_odo_imu).attached) == 0
+
+
+def test_the_start_stands_nearly_half_of_all_fixes_anywhere() -> None:
+    random = np.random.default_rng(5)
+    p = np.column_stack([random.uniform(-100.0, 100.0, (80, 2)), np.zeros(80)])
+    c, s = np.cos(2.5), np.sin(2.5)
+    q = p @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + [5.0, -3.0, 7.0]
+    q[:36, :2] += random.uniform(-300.0, 300.0, (36, 2))
+    start = find_start(p, q, np.full(80, 0.5))
+    assert start is not None and start.yaw % (2.0 * np.pi) == pytest.approx(2.5, abs=1e-9)
+    np.testing.assert_allclose(start.shift, [5.0, -3.0, 7.0], atol=1e-9)
+    assert start.inliers[36:].all() and start.inliers[:36].sum() <= 1
+    assert find_start(p[:1], q[:1], np.full(1, 0.5)) is None
+
+
+def test_a_world_that_leans_is_set_upright() -> None:
+    lean = np.concatenate([se3.exp([0.2, -0.1, 0.0, 0.0, 0.0, 0.0])[:4], np.zeros(3)])
+    maps = se3.compose(lean, np.array([[1.0, 0, 0, 0, 1, 2, 3], [0.6, 0, 0, 0.8, 4, 5, 6]]))
+    up = quaternion.to_matrix(maps[:, :4])[0, :, 2]
+    R = level(maps)
+    np.testing.assert_allclose(R @ up, [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(level(maps[:, :] * 1.0) @ R.T, np.eye(3), atol=1e-12)
