@@ -49,7 +49,7 @@ def drive(route: ArrayLike, seed: int = 1, config: DriftConfig | None = None) ->
     at = np.arange(min(_SCANS_OF_A_MAP // 2, len(time_ns) - 1), len(time_ns), _SCANS_OF_A_MAP)
     steps = [np.zeros((6, 6))]
     for a, b in itertools.pairwise(at):
-        Ad = se3.adjoint(se3.compose(se3.inverse(odometry[b]), odometry[a]))
+        Ad = se3.adjoint(se3.compose(se3.inverse(truth[b]), truth[a]))  # P was made along the truth
         steps.append(covariance[b] - Ad @ covariance[a] @ Ad.T + 1e-8 * np.eye(6))
     graph = MapGraph(time_ns[at], odometry[at], odometry[at], np.stack(steps))
     return Drive(time_ns, se3.compose(T_enu, truth), odometry, graph, at)

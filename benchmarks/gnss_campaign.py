@@ -1,0 +1,139 @@
+"""Maps laid onto the Earth by simulated receivers: how far off the result is, against the odometry alone, and what is refused.
+
+    python benchmarks/gnss_campaign.py --seeds 1:13:2
+
+Drives whose odometry drifts by random walks, without points: loops play no part. A result that is off by more than four of its
+own standard deviations without a warning is a silent failure. Settings were chosen on even seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import se3
+from boxplus.sensors.geodesy import EnuFrame
+from boxplus.simulation.drifting_drive import DriftConfig, simulate_drift
+from boxplus.simulation.gnss import GnssConfig, simulate_gnss
+from boxplus.systems.georeference.georeference import georeference
+from boxplus.systems.slam.graph import MapGraph
+
+ORIGIN = EnuFrame(49.01, 8.43, 116.0)
+LEVER = (0.6, 0.0, 1.2)
+SCANS_OF_A_MAP = 20
+SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A receiver; whether the right answer is a map, a refusal, or either with a warning."""
+
+    gnss: dict[str, object]
+    expected: str
+    with_lever: bool = True
+
+
+CASES = {
+    "good": Case({}, "map"),
+    "RTK": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02}, "map"),
+    "poor": Case({"sigma": 2.0, "slow_sigma": 2.0, "claimed": 3.0}, "map"),
+    "states nothing": Case({"claimed": None}, "map"),
+    "claims 1 cm": Case({"claimed": 0.01}, "map"),
+    "no lever arm": Case({}, "map", with_lever=False),
+    "multipath": Case({"multipath": 4}, "map"),
+    "much multipath": Case({"multipath": 10, "multipath_s": 8.0}, "map"),
+    "small multipath": Case({"multipath": 4, "multipath_m": 4.0}, "map"),
+    "tunnels": Case({"tunnels": 2}, "map"),
+    "0.3 s late": Case({"delay_s": 0.3}, "said"),
+    "18 s late": Case({"delay_s": 18.0}, "refusal"),
+    "swapped": Case({"swapped": True}, "refusal"),
+    "radians": Case({"unit": "rad"}, "refusal"),
+    "datum jumps 5 m": Case({"jump": (4.0, 3.0, 0.0)}, "said"),
+    "datum jumps 50 m": Case({"jump": (40.0, 30.0, 0.0)}, "said"),
+    "other vehicle": Case({}, "refusal"),
+}
+
+
+def route(seed: int) -> NDArray[np.float64]:
+    """A walk along the streets of a grid, 40 to 120 m to the next corner, never straight back."""
+    random = np.random.default_rng([seed, 31])
+    corners, heading = [np.zeros(2)], int(random.integers(4))
+    for _ in range(int(random.integers(4, 12))):
+        direction = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading]
+        corners.append(corners[-1] + random.uniform(40.0, 120.0) * direction)
+        heading = (heading + int(random.choice([-1, 1]))) % 4
+    return np.stack(corners)
+
+
+def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
+    """Verdict, a line about it, root mean square errors of the odometry, which begins at the truth, and of the map; seconds."""
+    case = CASES[name]
+    time_ns, truth, odometry, covariance = simulate_drift(route(seed), DriftConfig(), seed)
+    random = np.random.default_rng([seed, 32])
+    yaw = random.uniform(-np.pi, np.pi)
+    T_enu = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), *random.uniform(-50.0, 50.0, 3)])
+    T_enu_imu = se3.compose(T_enu, truth)
+    at = np.arange(SCANS_OF_A_MAP // 2, len(time_ns), SCANS_OF_A_MAP)
+    steps = [np.zeros((6, 6))]
+    for a, b in itertools.pairwise(at):
+        Ad = se3.adjoint(se3.compose(se3.inverse(truth[b]), truth[a]))  # P was made along the truth
+        steps.append(covariance[b] - Ad @ covariance[a] @ Ad.T + 1e-8 * np.eye(6))
+    graph = MapGraph(time_ns[at], odometry[at], odometry[at], np.stack(steps))
+    seen, seen_ns = T_enu_imu, time_ns
+    if name == "other vehicle":
+        seen_ns, other, _, _ = simulate_drift(route(seed + 1000), DriftConfig(), seed)
+        seen = se3.compose(T_enu, other)
+    receiver = GnssConfig(**{"lever": LEVER, **case.gnss})
+    fixes = simulate_gnss(seen_ns, seen, ORIGIN, receiver, seed)
+    began = time.perf_counter()
+    found = georeference(graph, fixes, time_ns, odometry, None, np.array(LEVER) if case.with_lever else None)
+    seconds = time.perf_counter() - began
+    before = _rms(se3.compose(T_enu, odometry)[at, 4:6] - T_enu_imu[at, 4:6])
+    if found.fit is None or found.frame is None:
+        verdict = "refused" if case.expected == "refusal" else "REFUSED" if case.expected == "map" else "said"
+        return verdict, f"{found.refusal}", before, float("nan"), seconds
+    p = se3.compose(found.fit.T_enu_map, found.fit.T_map)[:, 4:]
+    off = (p - found.frame.to_enu(ORIGIN.to_geodetic(T_enu_imu[at, 4:])))[:, :2]
+    after, sigma = _rms(off), _rms(found.fit.sigma[:, None] * [1.0, 1.0])
+    is_off = bool((np.linalg.norm(off, axis=1) > SIGMAS * np.sqrt(2.0) * found.fit.sigma).any()) or case.expected == "refusal"
+    verdict = "map" if not is_off else "off, said" if _serious(found.warnings) else "SILENT"
+    gated = 1.0 - found.used / len(found.attached)
+    line = f"sigma {sigma:.2f} gated {100 * gated:.0f} % delay {found.fit.delay:+.2f}"
+    return verdict, " | ".join([line, *found.warnings]), before, after, seconds
+
+
+def _serious(warnings: list[str]) -> bool:
+    """That the lever arm is not known is said of every such run and speaks against none."""
+    return any("lever arm" not in text for text in warnings)
+
+
+def _rms(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", default=",".join(CASES), help="comma-separated")
+    parser.add_argument("--seeds", default="1:13:2", help="first:last:step, the last one excluded")
+    parser.add_argument("--verbose", action="store_true", help="a line a run")
+    options = parser.parse_args()
+    seeds = range(*(int(text) for text in options.seeds.split(":")))
+    for name in options.cases.split(","):
+        rows = [run(name, seed) for seed in seeds]
+        if options.verbose:
+            for seed, (verdict, line, before, after, _) in zip(seeds, rows, strict=True):
+                print(f"  {name:16s} {seed:3d} {verdict:9s} {before:6.2f} -> {after:6.2f} m  {line}")
+        verdicts = [verdict for verdict, *_ in rows]
+        counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts)))
+        laid = [(before, after) for _, _, before, after, _ in rows if np.isfinite(after)]
+        medians = f"{np.median([b for b, _ in laid]):.2f} -> {np.median([a for _, a in laid]):.2f} m" if laid else "-"
+        print(f"{name:16s} {counts:28s} {medians:18s} {np.mean([row[-1] for row in rows]):.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
