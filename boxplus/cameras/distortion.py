@@ -1,4 +1,4 @@
-"""Lens distortion in OpenCV's order of coefficients: k1, k2, p1, p2, k3 (SPEC.md 3.1; Brown, 1971).
+"""Lens distortion in OpenCV's order of coefficients: k1, k2, p1, p2, k3 (docs/cameras.md; Brown, 1971).
 
 With x, y on the normalised image plane, r² = x² + y² and s = 1 + k1 r² + k2 r⁴ + k3 r⁶ the lens moves (x, y) to
 

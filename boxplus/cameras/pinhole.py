@@ -1,5 +1,6 @@
-"""The pinhole camera with lens distortion: projection, its derivatives, and the way back (SPEC.md 3.1, 3.4, 6.1).
+"""The pinhole camera with lens distortion: projection, its derivatives, and the way back.
 
+Derivation: docs/cameras.md and docs/residuals/line_reprojection.md.
 The intrinsics are one vector, [fx, fy, cx, cy], followed by the coefficients of the distortion model in the order
 k1, k2, p1, p2, k3. A shorter model is the longer one with zeros, so that one kernel serves all.
 """
@@ -39,7 +40,7 @@ def project_point(
     p2: float,
     k3: float,
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """u, v and the entries of P = ∂(u, v)/∂(x, y, z), row by row (SPEC.md 3.1); the caller checks the depth."""
+    """u, v and the entries of P = ∂(u, v)/∂(x, y, z), row by row (docs/cameras.md); the caller checks the depth."""
     inverse_z = 1.0 / z
     a, b = x * inverse_z, y * inverse_z
     xd, yd, jxx, jxy, jyy = distort(a, b, k1, k2, p1, p2, k3)
@@ -59,7 +60,7 @@ def intrinsics_jacobian(
     sign: float,
     J: NDArray[np.float64],
 ) -> None:
-    """J = sign · ∂(u, v)/∂ intrinsics, (2, 4, 6, 8 or 9), at the normalised point (a, b), distorted (xd, yd) (SPEC.md 3.4)."""
+    """J = sign · ∂(u, v)/∂ intrinsics, (2, 4, 6, 8 or 9), at the normalised point (a, b), distorted (xd, yd)."""
     count = J.shape[1]
     J[0, 0] = sign * xd
     J[1, 0] = 0.0
@@ -192,7 +193,7 @@ class Pinhole:
 
     @property
     def K_line(self) -> NDArray[np.float64]:
-        """det(K) K⁻ᵀ (3, 3): the image line l of a line's moment m in the camera frame, l = K_line m (SPEC.md 6.1)."""
+        """det(K) K⁻ᵀ (3, 3): the image line l of a line's moment m in the camera frame, l = K_line m."""
         fx, fy, cx, cy = self.fx, self.fy, self.cx, self.cy
         return np.array([[fy, 0.0, 0.0], [0.0, fx, 0.0], [-fy * cx, -fx * cy, fx * fy]])
 
@@ -213,7 +214,7 @@ class Pinhole:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Pixels (..., 2), ∂pixel/∂point (..., 2, 3) [px/m], ∂pixel/∂parameters (..., 2, n), and validity (...).
 
-        As `project`; the Jacobians of a point that is not seen are NaN (SPEC.md 3.1, 3.4).
+        As `project`; the Jacobians of a point that is not seen are NaN (docs/cameras.md).
         """
         points, lead = as_batch("p_camera", p_camera, (3,))
         count = len(self.parameters)

@@ -1,6 +1,6 @@
 """Directions of the pose that a scan does not determine, and the update without them.
 
-The information of points about the pose is S = Σ w h hᵀ, h = [s × C, u] with C = Rᵀu (SPEC.md 9.7). The normals u come from
+The information of points about the pose is S = Σ w h hᵀ, h = [s × C, u] with C = Rᵀu. The normals u come from
 noisy points of the map. A row is linear in its normal, h = M u, so noise of the normals alone gives a direction the information
 
     N = Σ w M Cov(u) Mᵀ,      E[S] = S of the true normals + N

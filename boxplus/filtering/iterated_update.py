@@ -1,5 +1,6 @@
-"""The iterated update of the error-state Kalman filter (SPEC.md 9.8, 9.9): a prior and a measurement give a posterior.
+"""The iterated update of the error-state Kalman filter: a prior and a measurement give a posterior.
 
+Derivation: docs/lidar_inertial_odometry.md, section 7.
 What was measured is not known here: planes of a growing map, a fixed one, features of an image. A measurement is asked for
 its information at one iterate after the other, and says itself which directions of the pose it determines; in the others
 the posterior keeps the prior.
@@ -17,7 +18,7 @@ from boxplus.filtering.degeneracy import PoseDirections, project_out_weak
 from boxplus.filtering.nav_state import TANGENT, boxplus_into
 from boxplus.filtering.update_step import map_step, move_covariance
 
-_CONVERGED = 1e-3  # every component of the step, rad and m (SPEC.md 9.8)
+_CONVERGED = 1e-3  # every component of the step, rad and m (docs/lidar_inertial_odometry.md, section 7)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The navigation state of FAST-LIO2 and its manifold, 24 degrees of freedom (SPEC.md 9.1).
+"""The navigation state of FAST-LIO2 and its manifold, 24 degrees of freedom (docs/lidar_inertial_odometry.md, section 1).
 
 x = (R, p, v, b_ω, b_a, g, R_imu_lidar, p_imu_lidar): pose and velocity of the IMU in the world, gyro and accelerometer
 bias, gravity (pointing down), pose of the LiDAR in the IMU frame. The tangent has the same order, three components a

@@ -1,4 +1,7 @@
-"""Point-to-plane residuals of a scan and the information they carry about the state (SPEC.md 9.6 step 3, 9.7)."""
+"""Point-to-plane residuals of a scan and the information they carry about the state.
+
+Derivation: docs/lidar_inertial_odometry.md, sections 5 and 6.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ def pose_row(
     with_extrinsic: bool,
     h: NDArray[np.float64],
 ) -> None:
-    """h = [s × C, u, ℓ × R_LᵀC, C] with C = Rᵀu: how uᵀ y moves with the state (SPEC.md 9.7)."""
+    """h = [s × C, u, ℓ × R_LᵀC, C] with C = Rᵀu: how uᵀ y moves with the state (docs/lidar_inertial_odometry.md, section 6)."""
     lx, ly, lz = lidar
     sx, sy, sz = imu
     ux, uy, uz = u

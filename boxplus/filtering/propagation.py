@@ -1,4 +1,4 @@
-"""IMU propagation of the navigation state and its covariance (SPEC.md 9.2, 9.3, 9.5)."""
+"""IMU propagation of the navigation state and its covariance (docs/lidar_inertial_odometry.md, sections 2 and 3)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def propagate_step(
     density: NDArray[np.float64],
     node: NDArray[np.float64],
 ) -> None:
-    """One step with the input held over `dt`; `x` (36,) and `cov` (24, 24) are replaced (SPEC.md 9.2, 9.3).
+    """One step with the input held over `dt`; `x` (36,) and `cov` (24, 24) are replaced.
 
     `density` (4,): power spectral densities of gyro noise, accelerometer noise, gyro bias walk, accelerometer bias walk
     (squares of the values per √Hz), so the result does not depend on the IMU rate. `node` (22,) receives the state at the

@@ -1,4 +1,4 @@
-"""One Gauss-Newton step of the iterated update, in information form (SPEC.md 9.8, 9.9).
+"""One Gauss-Newton step of the iterated update, in information form (docs/lidar_inertial_odometry.md, section 7).
 
 A measurement enters only through its information over the twelve components it touches, `A = Hᵀ R⁻¹ H` (12, 12) and
 `b = Hᵀ R⁻¹ z` (12,): the cost is linear in the number of points, and nothing here knows what was measured.
@@ -44,7 +44,7 @@ def map_step(
     delta: NDArray[np.float64],
     cov: NDArray[np.float64],
 ) -> bool:
-    """One Gauss-Newton step of min Σ h²/r + ‖x ⊟ x_prior‖² (SPEC.md 9.8).
+    """One Gauss-Newton step of min Σ h²/r + ‖x ⊟ x_prior‖² (docs/lidar_inertial_odometry.md, section 7).
 
     Args:
         x, x_prior: (36,) the current iterate and the prior.
@@ -91,7 +91,7 @@ def map_step(
 
 @kernel
 def move_covariance(cov: NDArray[np.float64], delta: NDArray[np.float64]) -> None:
-    """cov <- L cov Lᵀ, L = diag(J_r(δ_θ), I, J_r(δ_θL), I): to the tangent space at x ⊞ δ; then symmetrise (SPEC.md 9.9)."""
+    """cov <- L cov Lᵀ, L = diag(J_r(δ_θ), I, J_r(δ_θL), I): to the tangent space at x ⊞ δ; then symmetrise."""
     J_theta = np.empty((3, 3))
     J_theta_L = np.empty((3, 3))
     right_jacobian_into(delta[T_THETA], delta[T_THETA + 1], delta[T_THETA + 2], J_theta)

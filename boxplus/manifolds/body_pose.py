@@ -1,4 +1,4 @@
-"""The pose of a body as inertial and visual-inertial estimation moves it (SPEC.md 0): q ← q ⊗ Exp(θ), p ← p + δp.
+"""The pose of a body as inertial and visual-inertial estimation moves it (docs/conventions.md): q ← q ⊗ Exp(θ), p ← p + δp.
 
 Every sensor on a body is told on this one variable: T_world_body = (q, p), (7,) wxyz and xyz, tangent [θ, δp] [rad, m]. It is
 equal to `Product(UnitQuaternion, Euclidean(3))`, because it is one.

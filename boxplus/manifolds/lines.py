@@ -1,4 +1,4 @@
-"""Straight lines in space in the orthonormal representation (SPEC.md 6.1, 6.3; Bartoli and Sturm, 2005).
+"""Straight lines in space in the orthonormal representation (docs/residuals/line_reprojection.md; Bartoli and Sturm, 2005).
 
 A line through the point p with direction d has Plücker coordinates L = [m; d], m = p × d, defined up to scale. It is stored as
 [qw, qx, qy, qz, phi]: the quaternion of U = [u₁, u₂, u₃] = [m/‖m‖, d/‖d‖, u₁ × u₂] and phi = atan2(‖d‖, ‖m‖), so that
@@ -70,7 +70,7 @@ def to_plucker(line: ArrayLike) -> NDArray[np.float64]:
 def from_plucker(L: ArrayLike) -> NDArray[np.float64]:
     """Stored lines (..., 5) of Plücker coordinates [m; d] (..., 6) of any scale; m is first made orthogonal to d.
 
-    Where m = 0, the line goes through the origin and any u₁ orthogonal to d serves (SPEC.md 6, singular cases).
+    Where m = 0, the line goes through the origin and any u₁ orthogonal to d serves.
 
     Raises:
         InputError: not finite, or a line without direction (d = 0).

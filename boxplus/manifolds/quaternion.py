@@ -1,4 +1,4 @@
-"""Unit quaternions, Hamilton, stored wxyz (SPEC.md 1.3). q and −q are the same rotation.
+"""Unit quaternions, Hamilton, stored wxyz (docs/manifolds.md). q and −q are the same rotation.
 
 The kernels take and return scalars, for the inner loops of residuals; the functions below them are batch-first.
 """
@@ -69,7 +69,7 @@ def rotation_entries(
 
 @kernel(inline=True)
 def half_angle(angle_sq: float) -> tuple[float, float]:
-    """cos(θ/2) and sin(θ/2)/θ from θ²; by their series below the switch of the other coefficients (SPEC.md 1.1)."""
+    """cos(θ/2) and sin(θ/2)/θ from θ²; by their series below the switch of the other coefficients (docs/manifolds.md)."""
     if angle_sq < SERIES_SWITCH:
         t = 0.25 * angle_sq
         c = 1.0 - t / 2.0 * (
@@ -83,7 +83,7 @@ def half_angle(angle_sq: float) -> tuple[float, float]:
 
 @kernel(inline=True)
 def exp_scalars(wx: float, wy: float, wz: float) -> tuple[float, float, float, float]:
-    """Exp_q of a rotation vector as (w, x, y, z): [cos θ/2, sin(θ/2) axis] (SPEC.md 1.3)."""
+    """Exp_q of a rotation vector as (w, x, y, z): [cos θ/2, sin(θ/2) axis] (docs/manifolds.md)."""
     c, s = half_angle(wx * wx + wy * wy + wz * wz)
     return c, s * wx, s * wy, s * wz
 

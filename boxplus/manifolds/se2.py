@@ -1,7 +1,7 @@
 """Rigid motions of the plane SE(2), stored [theta, x, y], theta in [−π, π].
 
 Tangents are ξ = [w, vx, vy], rotation first [rad, m]. SE(2) is the part of SE(3) that turns about z and moves in x, y, and so
-are its Exp, Log and Jacobians (SPEC.md 1.5, 1.6). `SE2` moves a pose on the right (local).
+are its Exp, Log and Jacobians (docs/manifolds.md). `SE2` moves a pose on the right (local).
 """
 
 from __future__ import annotations

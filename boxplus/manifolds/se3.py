@@ -1,4 +1,4 @@
-"""Rigid motions SE(3), stored [qw, qx, qy, qz, x, y, z] (SPEC.md 1.5). T_ab maps coordinates in b to coordinates in a.
+"""Rigid motions SE(3), stored [qw, qx, qy, qz, x, y, z] (docs/manifolds.md). T_ab maps coordinates in b to coordinates in a.
 
 Tangents are ξ = [w, v], rotation first [rad, m]. Kernels take rows (7,) and write into arrays of their caller, which may be
 their inputs; the functions below them are batch-first. `SE3` moves a pose on the right (local), `SE3Left` on the left (global).

@@ -1,8 +1,9 @@
-"""Jacobians of SE(3) in tangents [w, v] (SPEC.md 1.6).
+"""Jacobians of SE(3) in tangents [w, v] (docs/manifolds.md).
 
 A pose is a rotation over dual numbers: ad(w, v) = [[W, 0], [V, W]] multiplies as W + εV does. So the lower left block of
 J_l(w, v) is the derivative of J_l(w) along v, and that of J_l⁻¹(w, v) the derivative of J_l⁻¹(w): the same numbers as
-SPEC.md's Q and −J_l⁻¹ Q J_l⁻¹, without their products of 3×3 matrices. Derivatives of B, C, D are with respect to θ².
+the block Q of the literature and −J_l⁻¹ Q J_l⁻¹, without their products of 3×3 matrices.
+Derivatives of B, C, D are with respect to θ².
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ D_SERIES_SWITCH_SQ = 0.25  # θ² [rad²] below which D and its derivative come 
 
 @kernel(inline=True)
 def jacobian_coefficients(angle_sq: float) -> tuple[float, float, float, float]:
-    """B, C of SPEC.md 1.1 and their derivatives with respect to θ²."""
+    """B, C of docs/manifolds.md and their derivatives with respect to θ²."""
     a, b, c = exp_coefficients(angle_sq)
     t = angle_sq
     if t < SERIES_SWITCH:
@@ -40,7 +41,7 @@ def jacobian_coefficients(angle_sq: float) -> tuple[float, float, float, float]:
 
 @kernel(inline=True)
 def inverse_jacobian_coefficients(angle_sq: float) -> tuple[float, float]:
-    """D of SPEC.md 1.1 and its derivative with respect to θ²; regular at π."""
+    """D of docs/manifolds.md and its derivative with respect to θ²; regular at π."""
     t = angle_sq
     if t < D_SERIES_SWITCH_SQ:
         d_high = 1.0 / 47900160.0 + t * (691.0 / 1307674368000.0 + t / 74724249600.0)

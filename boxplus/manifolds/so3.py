@@ -1,4 +1,4 @@
-"""Rotations SO(3): Exp, Log and their Jacobians (SPEC.md 1.1, 1.2, 1.4).
+"""Rotations SO(3): Exp, Log and their Jacobians (docs/manifolds.md).
 
 Kernels take scalars or write into arrays of their caller; the functions without underscore are batch-first NumPy fronts.
 A rotation vector `w` is axis times angle [rad]. Matrices compose by `@`, invert by transposing and are their own adjoint:
@@ -19,14 +19,14 @@ from boxplus.manifolds._batch import as_batch, map_batch
 from boxplus.manifolds._kernel_manifold import KernelManifold, checked_rows
 from boxplus.manifolds.manifold import Manifold
 
-SERIES_SWITCH = 1.0  # angle [rad] below which A, B, C come from their series (SPEC.md 1.1)
+SERIES_SWITCH = 1.0  # angle [rad] below which A, B, C come from their series (docs/manifolds.md)
 D_SERIES_SWITCH = 0.5
 _ROTATION_TOLERANCE = 1e-3  # matrices this far from orthonormal come from rounded files, not from a mistake
 
 
 @kernel(inline=True)
 def exp_coefficients(angle_sq: float) -> tuple[float, float, float]:
-    """A = sin θ/θ, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ from θ² (SPEC.md 1.1)."""
+    """A = sin θ/θ, B = (1 − cos θ)/θ², C = (θ − sin θ)/θ³ from θ² (docs/manifolds.md)."""
     if angle_sq < SERIES_SWITCH:
         t = angle_sq
         a = 1.0 - t / 6.0 * (
@@ -52,7 +52,7 @@ def exp_coefficients(angle_sq: float) -> tuple[float, float, float]:
 
 @kernel(inline=True)
 def inverse_jacobian_coefficient(angle_sq: float) -> float:
-    """D = (1 − θ/2 cot(θ/2))/θ² from θ² (SPEC.md 1.1); regular at π."""
+    """D = (1 − θ/2 cot(θ/2))/θ² from θ² (docs/manifolds.md); regular at π."""
     if angle_sq < D_SERIES_SWITCH * D_SERIES_SWITCH:
         t = angle_sq
         high = 1.0 / 1209600.0 + t * (1.0 / 47900160.0 + t * 691.0 / 1307674368000.0)
@@ -97,7 +97,7 @@ def right_jacobian_inverse_into(wx: float, wy: float, wz: float, J: NDArray[np.f
 
 @kernel(inline=True)
 def quaternion_scalars(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of R with w ≥ 0, by the largest element (Shepperd; SPEC.md 1.2)."""
+    """Unit quaternion (w, x, y, z) of R with w ≥ 0, by the largest element (Shepperd; docs/manifolds.md)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace >= R[0, 0] and trace >= R[1, 1] and trace >= R[2, 2]:
         w, x, y, z = 1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -121,7 +121,7 @@ def quaternion_into(R: NDArray[np.float64], q_wxyz: NDArray[np.float64]) -> None
 
 @kernel
 def log_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Rotation vector of the unit quaternion (w, x, y, z), angle in [0, π] (SPEC.md 1.2)."""
+    """Rotation vector of the unit quaternion (w, x, y, z), angle in [0, π] (docs/manifolds.md)."""
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     norm_sq = x * x + y * y + z * z

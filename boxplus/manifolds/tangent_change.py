@@ -1,4 +1,4 @@
-"""The one place where a Jacobian goes over from one ⊞ of a pose to another (DESIGN section 4).
+"""The one place where a Jacobian goes over from one ⊞ of a pose to another (docs/manifolds.md).
 
 A pose (7,) moves on the right, `SE3`; on the left, `SE3Left`; or with its rotation on the right and its translation by
 addition, `BodyPose`. To first order the same motion is, with T = (R, t),

@@ -1,4 +1,4 @@
-"""A plane through a handful of points, by principal components (SPEC.md 9.6, step 2)."""
+"""A plane through a handful of points, by principal components (docs/lidar_inertial_odometry.md, section 5)."""
 
 from __future__ import annotations
 

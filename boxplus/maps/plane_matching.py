@@ -1,4 +1,4 @@
-"""Find the plane of the map that each point of a scan lies on (SPEC.md 9.6, steps 1 and 2)."""
+"""Find the plane of the map that each point of a scan lies on (docs/lidar_inertial_odometry.md, section 5)."""
 
 from __future__ import annotations
 

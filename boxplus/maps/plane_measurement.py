@@ -1,4 +1,7 @@
-"""The LiDAR measurement: a scan against the map, point to plane, as information about the state (SPEC.md 9.6 to 9.8)."""
+"""The LiDAR measurement: a scan against the map, point to plane, as information about the state.
+
+Derivation: docs/lidar_inertial_odometry.md, sections 5 to 7.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The box around the sensor within which the map is kept (SPEC.md 9.10)."""
+"""The box around the sensor within which the map is kept (docs/lidar_inertial_odometry.md, section 9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton: H δ = −g (SPEC.md 2.1)."""
+"""Gauss-Newton: H δ = −g (docs/least_squares.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compare a residual's Jacobians with differences on the manifold (SPEC.md 11)."""
+"""Compare a residual's Jacobians with differences on the manifold."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def check_jacobian(
     step: float | Sequence[ArrayLike] = _STEP,
     tolerance: float = TOLERANCE,
 ) -> JacobianReport:
-    """Compare every Jacobian of a residual group with fourth-order central differences on the manifold (SPEC.md 11).
+    """Compare every Jacobian of a residual group with fourth-order central differences on the manifold.
 
     An entry that disagrees at the step given is compared again at other steps, and its smallest difference counts: a wrong
     Jacobian is wrong at every step, while rounding and curvature are not.

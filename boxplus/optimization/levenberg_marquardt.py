@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt with Nielsen's damping (SPEC.md 2.2; Madsen, Nielsen, Tingleff 2004, section 3.2)."""
+"""Levenberg-Marquardt with Nielsen's damping (docs/least_squares.md; Madsen, Nielsen, Tingleff 2004, section 3.2)."""
 
 from __future__ import annotations
 

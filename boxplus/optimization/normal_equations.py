@@ -1,4 +1,4 @@
-"""H = JᵀJ and g = Jᵀr of whitened residual groups, as the blocks of a sparse symmetric matrix (SPEC.md 2.1).
+"""H = JᵀJ and g = Jᵀr of whitened residual groups, as the blocks of a sparse symmetric matrix (docs/least_squares.md).
 
 Every block of H gathers the residuals that touch it, in the order of the residuals, so that threads never share a block and
 the bits do not depend on their number.

@@ -1,4 +1,4 @@
-"""Schur elimination: variables that meet no other of their kind are solved for in closed form (SPEC.md 2.1).
+"""Schur elimination: variables that meet no other of their kind are solved for in closed form (docs/least_squares.md).
 
 With E the eliminated variables (the points of a bundle adjustment) and F the kept ones, H = [[F, W], [Wᵀ, C]] and C is
 block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F − Z Zᵀ.

@@ -30,7 +30,7 @@ class SolverOptions(BaseModel):
     )
     initial_damping: float = Field(1e-5, gt=0, description="λ at the start of Levenberg-Marquardt, relative to the diagonal of H")
     damping: Literal["diagonal", "identity"] = Field(
-        "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start as in SPEC 2.2"
+        "diagonal", description="λ diag(H), which does not depend on units, or λ max(diag H) I at the start"
     )
     initial_radius: float = Field(1e4, gt=0, description="trust region of the dogleg at the start, in tangents scaled by diag(H)")
     examine: bool = Field(

@@ -11,7 +11,7 @@ Jacobians on the right side, T ← T Exp([w, v]), with e_k the axes and R_ij e_k
     ∂/∂[w, v]_j: column k of R_j: −R_j [e_k]×, 0;         translation: 0, R_j
     ∂/∂[w, v]_i: column k:         R_i [R_ij e_k]×, 0;     translation: R_i [t_ij]×, −R_i
 
-Smooth everywhere, also at half a turn. Source: SPEC.md 5 for the frames; SE-Sync, eq. (10), for the objective and the weights.
+Smooth everywhere, also at half a turn. Source: SE-Sync, eq. (10), for the objective and the weights.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def apply(A: Matrix3, x: float, y: float, z: float) -> Vector3:
 
 @kernel(fastmath=True, inline=True)
 def polynomial(c: float, a: float, b: float, x: float, y: float, z: float) -> Matrix3:
-    """c I + a [w]x + b [w]x² of w = (x, y, z): Exp, its Jacobians and ⟨q⟩_L, ⟨q⟩_R are of this form (SPEC.md 1.2 to 1.4)."""
+    """c I + a [w]x + b [w]x² of w = (x, y, z): Exp, its Jacobians and ⟨q⟩_L, ⟨q⟩_R are of this form (docs/manifolds.md)."""
     return (
         c - b * (y * y + z * z),
         b * x * y - a * z,

@@ -1,4 +1,4 @@
-"""Distance of points from planes (SPEC.md 9.6, 9.7).
+"""Distance of points from planes (docs/lidar_inertial_odometry.md, sections 5 and 6).
 
 Residual [m], for a point p of the source and a plane of the target through q with unit normal u, (R, t) = T_target_source:
 
@@ -7,7 +7,7 @@ Residual [m], for a point p of the source and a plane of the target through q wi
 Jacobian with T_target_source moved on the right, T ← T Exp([w, v]), C = Rᵀ u:  ∂e/∂[w, v] = [(p × C)ᵀ  Cᵀ].
 The sign of u is irrelevant: e and its Jacobian flip together.
 
-Source: Chen and Medioni, Object Modelling by Registration of Multiple Range Images, IVC 1992; SPEC.md 9.7.
+Source: Chen and Medioni, Object Modelling by Registration of Multiple Range Images, IVC 1992.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Residual [m], for a point p of the source and its counterpart q of the target, (
 
 Jacobian with T_target_source moved on the right, T ← T Exp([w, v]):  ∂e/∂[w, v] = R [−[p]×  I].
 
-Source: Besl and McKay, A Method for Registration of 3-D Shapes, PAMI 1992; the derivative as SPEC.md 1.5 and 9.7.
+Source: Besl and McKay, A Method for Registration of 3-D Shapes, PAMI 1992; derivatives as of a point to a plane.
 """
 
 from __future__ import annotations

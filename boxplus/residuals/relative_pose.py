@@ -1,4 +1,4 @@
-"""The relative pose error of a pose graph (SPEC.md 5; source equations (107)-(128) with the errata)."""
+"""The relative pose error of a pose graph (docs/residuals/relative_pose.md)."""
 
 from __future__ import annotations
 
@@ -86,16 +86,16 @@ def linearize_rows(
 
 
 class RelativePose(Residual):
-    """e = Log(Z_ij⁻¹ T_world_i⁻¹ T_world_j), [w, v] [rad, m], of measured poses Z_ij of j in i (SPEC.md 5).
+    """e = Log(Z_ij⁻¹ T_world_i⁻¹ T_world_j), [w, v] [rad, m], of measured poses Z_ij of j in i (docs/residuals/relative_pose.md).
 
-    On the right side, e_i = −J_r⁻¹(e) Ad(T_j⁻¹ T_i) and e_j = J_r⁻¹(e) (SPEC.md 5.1). Where the rotation error is half a turn the
+    On the right side, e_i = −J_r⁻¹(e) Ad(T_j⁻¹ T_i) and e_j = J_r⁻¹(e). Where the rotation error is half a turn the
     sign of its axis is arbitrary and the Jacobian jumps: residual and Jacobians stay finite there, and `at_half_turn` tells.
 
     Args:
         measured: Z_ij (N, 7) [qw, qx, qy, qz, x, y, z], mapping coordinates in j to coordinates in i.
         sigma, covariance, information: noise of [w, v], as for `Whitening.of`. Information that stands in a file
             translation first has to be reordered.
-        jacobian: "first_order" replaces J_r⁻¹(e) by I + ½ ad(e), whose error stays below ‖e‖²/6 (SPEC.md 1.6).
+        jacobian: "first_order" replaces J_r⁻¹(e) by I + ½ ad(e), whose error stays below ‖e‖²/6 (docs/manifolds.md).
 
     Raises:
         InputError: wrong shapes, quaternions not of unit length, noise that is not positive.
@@ -133,6 +133,6 @@ class RelativePose(Residual):
         evaluate_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
 
     def at_half_turn(self, *x: ArrayLike) -> NDArray[np.bool_]:
-        """Which residuals (N,) have a rotation error within 1e-6 rad of π, the singular case of SPEC.md 5.3."""
+        """Which residuals (N,) have a rotation error within 1e-6 rad of π, the singular case."""
         angle = np.linalg.norm(self.evaluate(*x)[:, :3], axis=1)
         return np.asarray(angle >= np.pi - HALF_TURN_MARGIN)

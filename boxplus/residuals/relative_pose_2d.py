@@ -1,4 +1,4 @@
-"""The relative pose error of a pose graph in the plane (SPEC.md 5 on SE(2))."""
+"""The relative pose error of a pose graph in the plane (docs/residuals/relative_pose.md on SE(2))."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def linearize_rows(
 class RelativePose2D(Residual):
     """e = Log(Z_ij⁻¹ T_world_i⁻¹ T_world_j), [w, vx, vy] [rad, m], of measured poses Z_ij of j in i.
 
-    Jacobians on the right side as in SPEC.md 5.1: −J_r⁻¹(e) Ad(T_j⁻¹ T_i) and J_r⁻¹(e) of SE(2). The rotation error is wrapped
+    Jacobians on the right side as in space: −J_r⁻¹(e) Ad(T_j⁻¹ T_i) and J_r⁻¹(e) of SE(2). The rotation error is wrapped
     to [−π, π]; at half a turn its sign is arbitrary, residual and Jacobians stay finite.
 
     Args:

@@ -1,4 +1,4 @@
-"""The square root of a residual's information: r is whitened to W r with WᵀW = Ω = Σ⁻¹ (SPEC.md 2.1)."""
+"""The square root of a residual's information: r is whitened to W r with WᵀW = Ω = Σ⁻¹ (docs/least_squares.md)."""
 
 from __future__ import annotations
 

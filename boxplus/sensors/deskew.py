@@ -1,4 +1,4 @@
-"""Motion compensation: every point is moved to the instant the scan ends (SPEC.md 9.5, step 4).
+"""Motion compensation: every point is moved to the instant the scan ends (docs/lidar_inertial_odometry.md, section 3).
 
 Between two nodes a point moves by out = M (Exp(ω s) (R_L ℓ + p_L)) + c₀ + c₁ s + c₂ s² with M = R_Lᵀ R_endᵀ R_node. The time
 between nodes is cut into pieces in which the platform turns by little; in each, rotation and shift are cubic polynomials in
@@ -38,7 +38,7 @@ def deskew_into(
     x_end: NDArray[np.float64],
     out: NDArray[np.float32],
 ) -> None:
-    """Move every point to where the LiDAR would have seen it at the end of the scan (SPEC.md 9.5, step 4).
+    """Move every point to where the LiDAR would have seen it at the end of the scan (docs/lidar_inertial_odometry.md, section 3).
 
     Args:
         p_lidar: (n, 3), LiDAR frame, each at its own time.

@@ -1,4 +1,4 @@
-"""Voxel filter of a scan: a centroid and a representative point for every occupied voxel (SPEC.md 9.11, step 5).
+"""Voxel filter of a scan: a centroid and a representative point for every occupied voxel (docs/lidar_inertial_odometry.md).
 
 The centroid carries the least noise and is what the scan is measured with. At an edge or a corner it lies off every
 surface, so what the map takes is a point that was really seen: the one nearest to the centroid.

@@ -19,7 +19,7 @@ class ImuSamples:
     Attributes:
         time_ns: (N,) int64, absolute time in nanoseconds.
         gyro: (N, 3) float64, angular velocity [rad/s].
-        accel: (N, 3) float64, specific force [m/s²]; +9.81 upwards at rest (SPEC.md section 0).
+        accel: (N, 3) float64, specific force [m/s²]; +9.81 upwards at rest (docs/conventions.md).
     """
 
     time_ns: NDArray[np.int64]

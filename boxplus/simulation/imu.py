@@ -25,7 +25,7 @@ _WEIGHTS = np.array([0.8, 0.5, 0.33166247903554])  # squares add up to one
 class ImuModel(BaseModel):
     """Errors of an IMU; the default is the ADIS16448 as characterised for the EuRoC recordings.
 
-    A sample reads a_m = R_world_imuᵀ (a − g) + b_a + n_a and ω_m = ω + b_w + n_w (SPEC.md section 0), and is clipped at the
+    A sample reads a_m = R_world_imuᵀ (a − g) + b_a + n_a and ω_m = ω + b_w + n_w (docs/conventions.md), and is clipped at the
     limits of the sensor. White noise of density σ has standard deviation σ √rate a sample.
     """
 

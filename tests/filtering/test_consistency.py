@@ -1,4 +1,4 @@
-"""The filter's covariance against its errors: average NEES over seeded runs with honest noise (SPEC.md 9, 11).
+"""The filter's covariance against its errors: average NEES over seeded runs with honest noise (docs/lidar_inertial_odometry.md).
 
 Planes known exactly, points with independent noise: whatever the filter claims must then be true. (In odometry the map is made
 from the same estimates; what its covariance means there is said in docs/lidar_inertial_odometry.md.)

@@ -1,4 +1,7 @@
-"""Directions that a scan does not determine: found as such, left untouched, and nothing else is (SPEC.md 9.8)."""
+"""Directions that a scan does not determine: found as such, left untouched, and nothing else is.
+
+Derivation: docs/lidar_inertial_odometry.md, section 7.
+"""
 
 from __future__ import annotations
 

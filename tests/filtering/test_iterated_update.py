@@ -1,4 +1,7 @@
-"""The iterated update as a whole: closed form, policy of the searches, and what is left alone (SPEC.md 9.8, 9.9)."""
+"""The iterated update as a whole: closed form, policy of the searches, and what is left alone.
+
+Derivation: docs/lidar_inertial_odometry.md, section 7.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The navigation state: the ⊞ axioms where they are delicate, packing, and the check of transforms (SPEC.md 9.1, 11)."""
+"""The navigation state: the ⊞ axioms where they are delicate, packing, and the check of transforms.
+
+Derivation: docs/lidar_inertial_odometry.md, section 1.
+"""
 
 import numpy as np
 import pytest

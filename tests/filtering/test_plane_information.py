@@ -1,4 +1,7 @@
-"""The rows of the point-to-plane measurement against differences on the manifold, far from zero residual (SPEC.md 9.7, 11)."""
+"""The rows of the point-to-plane measurement against differences on the manifold, far from zero residual.
+
+Derivation: docs/lidar_inertial_odometry.md, section 6.
+"""
 
 from __future__ import annotations
 

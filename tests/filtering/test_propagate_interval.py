@@ -1,4 +1,4 @@
-"""The forward pass over a scan: clipping, the input of each step, holding, gaps (SPEC.md 9.5)."""
+"""The forward pass over a scan: clipping, the input of each step, holding, gaps (docs/lidar_inertial_odometry.md, section 3)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _forward(
 def _reference(
     x: NavState, cov: np.ndarray, time: np.ndarray, gyro: np.ndarray, accel: np.ndarray, duration: float
 ) -> tuple[NavState, np.ndarray, list[float]]:
-    """The same in the words of SPEC.md 9.5: the mean of the two samples around each step, the nearest one outside of them."""
+    """The same in words: the mean of the two samples around each step, the nearest one outside of them."""
     bounds = [0.0, *[t for t in time if 0.0 < t < duration], duration]
     packed, cov = x.pack(), cov.copy()
     for begin, end in pairwise(bounds):

@@ -1,4 +1,7 @@
-"""One step of the IMU propagation: Jacobians, noise, and the motions that have closed solutions (SPEC.md 9.2, 9.3)."""
+"""One step of the IMU propagation: Jacobians, noise, and the motions that have closed solutions.
+
+Derivation: docs/lidar_inertial_odometry.md, section 2.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The iterated update against the textbook gain and against a general solver of the same problem (SPEC.md 9.8, 9.9, 11)."""
+"""The iterated update against the textbook gain and against a general solver of the same problem.
+
+Derivation: docs/lidar_inertial_odometry.md, section 7.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ def _step(x: NavState, prior: NavState, cov: np.ndarray, A: np.ndarray, b: np.nd
 
 
 def _inverse_jacobian(d: np.ndarray) -> np.ndarray:
-    """J of SPEC.md 9.8 inverted: the right Jacobians of the two rotations."""
+    """J of docs/lidar_inertial_odometry.md, section 7 inverted: the right Jacobians of the two rotations."""
     return block_diag(so3.right_jacobian(d[:3]), np.eye(15), so3.right_jacobian(d[18:21]), np.eye(3))
 
 

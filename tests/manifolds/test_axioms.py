@@ -1,4 +1,4 @@
-"""The ten ⊞ axioms on every manifold (Hertzberg et al. 2013; SPEC.md 1, 11), at identity, 1e-8, the switches of the series,
+"""The ten ⊞ axioms on every manifold (Hertzberg et al. 2013; docs/manifolds.md), at identity, 1e-8, the switches of the series,
 generic, π − 1e-6 and π.
 """
 

@@ -1,4 +1,4 @@
-"""Lines in the orthonormal representation against points and Plücker coordinates (SPEC.md 6.1, 6.3)."""
+"""Lines in the orthonormal representation against points and Plücker coordinates (docs/residuals/line_reprojection.md)."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_the_moment_is_made_orthogonal_first(seed: int) -> None:
 
 @given(seeds)
 def test_derivative_of_the_coordinates(seed: int) -> None:
-    """∂L/∂[θ, δ] of SPEC.md 6.3: what this ⊞ has to mean for the line residual."""
+    """∂L/∂[θ, δ] of docs/residuals/line_reprojection.md: what this ⊞ has to mean for the line residual."""
     line = Line3D.random(np.random.default_rng(seed), 1)[0]
     U = quaternion.to_matrix(line[:4])
     w1, w2 = np.cos(line[4]), np.sin(line[4])

@@ -1,4 +1,4 @@
-"""SE(3) and SE(2) against the matrix exponential, their Jacobians against integrals of it (SPEC.md 1.5, 1.6)."""
+"""SE(3) and SE(2) against the matrix exponential, their Jacobians against integrals of it (docs/manifolds.md)."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def _xi(angle: float, seed: int) -> NDArray[np.float64]:
 
 
 def _ad(xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """ad(ξ) for [w, v] (SPEC.md 1.5), the order in which the source's (128) is wrong."""
+    """ad(ξ) for [w, v] (docs/manifolds.md)."""
     zero = np.zeros((3, 3))
     return np.block([[so3.hat(xi[:3]), zero], [so3.hat(xi[3:]), so3.hat(xi[:3])]])
 
@@ -42,7 +42,7 @@ def _left_jacobian(ad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _spec_q(w: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Q(w, v) as SPEC.md 1.6 writes it, closed forms of the coefficients."""
+    """Q(w, v) as docs/manifolds.md writes it, closed forms of the coefficients."""
     W, V, t = so3.hat(w), so3.hat(v), float(np.linalg.norm(w))
     C = (t - np.sin(t)) / t**3
     c2 = (t**2 + 2 * np.cos(t) - 2) / (2 * t**4)
@@ -92,7 +92,7 @@ def test_adjoint_moves_a_tangent_to_the_other_side(angle: float, seed: int) -> N
     T, xi = se3.exp(_xi(angle, seed)), _xi(0.3, seed + 1)
     assert np.allclose(se3.adjoint(T), expm(_ad(_xi(angle, seed))), atol=1e-12)
     assert np.allclose(se3.compose(T, se3.exp(xi)), se3.compose(se3.exp(se3.adjoint(T) @ xi), T), atol=1e-12)
-    # The right step ξ and the left step Ad ξ are the same motion (errata 107-127).
+    # The right step ξ and the left step Ad ξ are the same motion.
     assert np.allclose(SE3Left.boxminus(SE3.boxplus(T, xi), T), se3.adjoint(T) @ xi, atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""SO(3) and quaternions against SciPy, finite differences and the ⊞ axioms (SPEC.md 1, 11)."""
+"""SO(3) and quaternions against SciPy, finite differences and the ⊞ axioms (docs/manifolds.md)."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Planes through five points against the singular value decomposition (SPEC.md 9.6, step 2)."""
+"""Planes through five points against the singular value decomposition (docs/lidar_inertial_odometry.md, section 5)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _patch(seed: int, noise: float, count: int = 5, extent: tuple[float, float] 
 
 
 def _accepted(singular: np.ndarray, largest_distance: float) -> bool | None:
-    """The rule of SPEC.md 9.6, or None where rounding may decide."""
+    """The rule of docs/lidar_inertial_odometry.md, section 5, or None where rounding may decide."""
     if abs(singular[1] / singular[0] - COLLINEAR_RATIO) < 1e-4 or abs(largest_distance - LIMIT) < 1e-5:
         return None
     return bool(singular[1] > COLLINEAR_RATIO * singular[0] and largest_distance < LIMIT)

@@ -1,4 +1,4 @@
-"""Matching a scan with planes of the map against brute force (SPEC.md 9.6)."""
+"""Matching a scan with planes of the map against brute force (docs/lidar_inertial_odometry.md, section 5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A scan against a map: the information it gives, its gradient, and the count of every point (SPEC.md 9.6 to 9.8)."""
+"""A scan against a map: the information it gives, its gradient, and the count of every point.
+
+Derivation: docs/lidar_inertial_odometry.md, sections 5 to 7.
+"""
 
 from __future__ import annotations
 

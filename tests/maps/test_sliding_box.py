@@ -1,4 +1,7 @@
-"""The box around the sensor: what it drops is exactly old minus new, and it never oscillates (SPEC.md 9.10)."""
+"""The box around the sensor: what it drops is exactly old minus new, and it never oscillates.
+
+Derivation: docs/lidar_inertial_odometry.md, section 9.
+"""
 
 from __future__ import annotations
 

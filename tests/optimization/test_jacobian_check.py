@@ -51,7 +51,7 @@ class _Distance(Residual):
 
 
 class _MixedSides(RelativePose):
-    """Announces the left update and gives the right one's Jacobians: the mistake of the source (errata, 107-127)."""
+    """Announces the left update and gives the right one's Jacobians: the mistake of the source."""
 
     def __init__(self, measured: NDArray[np.float64]) -> None:
         super().__init__(measured)

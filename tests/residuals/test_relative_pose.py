@@ -1,4 +1,4 @@
-"""Relative pose errors in space and plane, and priors (SPEC.md 5)."""
+"""Relative pose errors in space and plane, and priors (docs/residuals/relative_pose.md)."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_jacobians_on_every_side(sides: tuple[Manifold, Manifold]) -> None:
 
 
 def test_jacobians_are_those_of_the_specification() -> None:
-    """SPEC.md 5.1 in both its forms, and 5.2 on the left, each from its own formula."""
+    """docs/residuals/relative_pose.md in both its forms, and 5.2 on the left, each from its own formula."""
     rng = np.random.default_rng(2)
     Z, T_i, T_j = (SE3.random(rng, 20) for _ in range(3))
     linear = RelativePose(Z).linearize(T_i, T_j)
@@ -64,7 +64,7 @@ def test_jacobians_are_those_of_the_specification() -> None:
 
 
 def test_the_left_jacobians_are_not_those_of_the_right_update() -> None:
-    # The source derives on the left and announces the right (errata 107-127): the check tells them apart.
+    # The source derives on the left and announces the right: the check tells them apart.
     rng = np.random.default_rng(2)
     Z, T_i, T_j = (SE3.random(rng, 3) for _ in range(3))
     residual = RelativePose(Z)

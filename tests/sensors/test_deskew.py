@@ -1,4 +1,7 @@
-"""Motion compensation against its formula in NumPy and against exact simulated motion (SPEC.md 9.5)."""
+"""Motion compensation against its formula in NumPy and against exact simulated motion.
+
+Derivation: docs/lidar_inertial_odometry.md, section 3.
+"""
 
 from __future__ import annotations
 

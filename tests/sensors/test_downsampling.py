@@ -1,4 +1,4 @@
-"""The voxel filter against a dictionary of voxels (SPEC.md 9.11, step 5)."""
+"""The voxel filter against a dictionary of voxels (docs/lidar_inertial_odometry.md)."""
 
 from __future__ import annotations
 

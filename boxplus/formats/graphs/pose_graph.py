@@ -32,7 +32,7 @@ _LAYOUT = {2: "theta, x, y", 3: "qw, qx, qy, qz, x, y, z"}
 class PoseGraph:
     """n poses `T_world_body` and m measurements of `T_i⁻¹ T_j`.
 
-    The error of an edge is `Log(Z⁻¹ T_i⁻¹ T_j)` (SPEC.md 5), and chi2 the sum of `eᵀ Ω e` with the information Ω in the
+    The error of an edge is `Log(Z⁻¹ T_i⁻¹ T_j)`, and chi2 the sum of `eᵀ Ω e` with the information Ω in the
     order of the tangent, rotation first: [wx, wy, wz, vx, vy, vz] in 3D, [w, vx, vy] in 2D [rad, m].
 
     Attributes:

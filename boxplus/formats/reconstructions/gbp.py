@@ -56,7 +56,7 @@ def read_gbp(path: str | Path) -> GbpProblem:
 
 
 def _quaternions(rotation_vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Exp_q of (m, 3) rotation vectors (SPEC.md 1.3), wxyz."""
+    """Exp_q of (m, 3) rotation vectors (docs/manifolds.md), wxyz."""
     half = 0.5 * np.linalg.norm(rotation_vectors, axis=1, keepdims=True)
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation_vectors])
 

@@ -1,4 +1,4 @@
-"""Invariants of an ikd-tree (SPEC 10.2), checked node by node in Python: for tests and for doubt."""
+"""Invariants of an ikd-tree (docs/ikd_tree.md), checked node by node in Python: for tests and for doubt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rebuilding subtrees of an ikd-tree: small ones at once, the copy of large ones in slices (SPEC 10.4, 10.6).
+"""Rebuilding subtrees of an ikd-tree: small ones at once, the copy of large ones in slices (docs/ikd_tree.md).
 
 The copy of a large subtree is a snapshot of the moment its rebuild began (`save_leaf` sees to that), while the tree stays
 in use and all later operations are logged.

@@ -4,7 +4,7 @@ A pending lazy label is carried down the traversal instead of being pushed into 
 skipped, below a slot labelled *live* the marks of the leaves do not count. Squared distances are plain float32 sums
 `dx² + dy² + dz²` (no contraction), the distance to a box is formed the same way and therefore never exceeds the distance
 to a point in it, not even by rounding: pruning is exact. Neighbours are ordered by (distance², x, y, z), so that equal
-distances do not depend on the shape of the tree (SPEC 10.7).
+distances do not depend on the shape of the tree (docs/ikd_tree.md).
 """
 
 from __future__ import annotations

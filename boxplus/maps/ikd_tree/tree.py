@@ -276,7 +276,7 @@ class IkdTree:
         The balance (I6) is not asked for while a rebuild is running or noted.
 
         Raises:
-            InvariantError: an invariant of SPEC 10.2 is violated.
+            InvariantError: an invariant of docs/ikd_tree.md is violated.
         """
         self._rebuilder.wait()
         pending = self._rebuilder.running or self._job["queued"] > 0

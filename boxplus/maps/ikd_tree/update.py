@@ -1,7 +1,7 @@
 """Single updates of an ikd-tree: insert a point; delete, revive or drop a box.
 
 All boxes are half open, `lo ≤ x < hi`, in float32 relative to the tree's origin. Every update descends with push-down of
-the lazy labels, so a leaf it touches knows the state of its points; on the way back the counts are pulled up (SPEC 10.3).
+the lazy labels, so a leaf it touches knows the state of its points; on the way back the counts are pulled up (docs/ikd_tree.md).
 
 While a rebuild is copying its subtree, an update first copies the leaf it is about to change (`save_leaf`): the copy is
 the subtree as it was when the rebuild began, whenever its slices run.
@@ -153,7 +153,7 @@ def save_leaf(pool: Pool, work: Work, index: np.uint32, live: np.uint32) -> None
 
 @kernel(borrow=True)
 def unbalanced(pool: Pool, work: Work, ref: np.uint32) -> bool:
-    """Whether an inner node violates the balance criterion (SPEC 10.4)."""
+    """Whether an inner node violates the balance criterion (docs/ikd_tree.md)."""
     size = np.uint32(pool.counts[ref]["size"])
     if size <= work.job[0]["check"]:
         return False

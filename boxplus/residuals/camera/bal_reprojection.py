@@ -5,7 +5,7 @@ P = R p_world + t in the camera frame, p = −P / P_z and s = 1 + k1 |p|² + k2 
 
     e = pixel − f s p
 
-Jacobians, with Π = ∂(f s p)/∂P, which is the P of SPEC.md 3.1 for this camera:
+Jacobians, with Π = ∂(f s p)/∂P, which is the P of docs/cameras.md for this camera:
 
     ∂e/∂[w, v]      = −Π [−[P]× I]              T_camera_world on the left, T ← Exp([w, v]) T
     ∂e/∂[f, k1, k2] = −[s p, f |p|² p, f |p|⁴ p]
@@ -15,7 +15,7 @@ Singular: |P_z| ≤ z_min (|P_x| + |P_y|), a point in the plane of the camera, i
 so that z_min is a share. Their files hold points behind cameras, which the model projects all the same, mirrored; the sign of P_z
 is not asked for here. `adjust_bundle` does ask, counts them and repairs them.
 
-Source: SPEC.md 3.1 to 3.4; https://grail.cs.washington.edu/projects/bal.
+Source: docs/cameras.md and docs/residuals/reprojection.md; https://grail.cs.washington.edu/projects/bal.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reprojection error of a point given by its bearing and inverse depth in an anchor camera (SPEC.md 8.3).
+"""Reprojection error of a point given by its bearing and inverse depth in an anchor camera (docs/residuals/inverse_depth.md).
 
 The point is one variable, b = [x, y, ρ] = [X/Z, Y/Z, 1/Z] in the anchor. Residual [px], with the ray m = [x, y, 1],
 T = T_observer_world T_anchor_world⁻¹ = (R, t) and Y = R m + ρ t, which is the point in the observer times ρ and is projected
@@ -15,13 +15,13 @@ Jacobians, with P = ∂π/∂Y, both poses moved on the left, T ← Exp([w, v]) 
     ∂e/∂[w, v] of the observer = −P [−[Y]×  ρ I]
     ∂e/∂[w, v] of the anchor   = −P [R [m]×  −ρ R]
     ∂e/∂[x, y]                 = −P [r₁ r₂]      columns of R
-    ∂e/∂ρ                      = −P t            (without distortion −f (t_x − ũ t_z)/(ρ Z') etc., as in SPEC.md 8.3)
+    ∂e/∂ρ                      = −P t            (without distortion −f (t_x − ũ t_z)/(ρ Z') etc.)
 
 Singular: ρ < 10⁻⁶ 1/m, also negative, stands for a point at infinity: Y = R m, and ∂e/∂ρ is the limit above, so that a
 solver finds its way back. No parallax (t = 0) leaves a zero derivative: unobservable. A depth up to z_min of the camera
 (0.05 m) in the observer, for a point at infinity a direction that does not point forward, is invalid.
 
-Source: SPEC.md 8.3; Civera et al., Inverse depth parametrization for monocular SLAM, 2008.
+Source: docs/residuals/inverse_depth.md; Civera et al., Inverse depth parametrization for monocular SLAM, 2008.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Reprojection error through a warp, with the intrinsics as a variable: a pixel at an inverse depth seen again (SPEC.md 8.2).
+"""Reprojection error through a warp, with the intrinsics as a variable: a pixel at an inverse depth seen again.
 
+Derivation: docs/residuals/photometric.md.
 Both views share c = [fx, fy, cx, cy], no distortion. The point is one variable, [u₁, v₁, ρ]: its pixel in the anchor and one over
 its depth there. With m = [(u₁ − cx)/fx, (v₁ − cy)/fy, 1], T = T_observer_world T_anchor_world⁻¹ = (R, t) and Y = R m + ρ t, the
 residual is [px]
@@ -8,7 +9,7 @@ residual is [px]
 
 The anchor's own measurement is the same residual with the anchor as its observer, pixel − [u₁, v₁]; see `inverse_depth`.
 
-Jacobians: those of `inverse_depth` by both poses and ρ, and with ũ = Y_x/Y_z, ṽ = Y_y/Y_z, κ = 1/Y_z (Z/Z' in SPEC.md)
+Jacobians: those of `inverse_depth` by both poses and ρ, and with ũ = Y_x/Y_z, ṽ = Y_y/Y_z, κ = 1/Y_z
 
     ∂e/∂[u₁, v₁] = −P [r₁/fx  r₂/fy]    P = ∂pixel/∂Y, r₁ and r₂ columns of R
     ∂e/∂fx = −[ũ + κ (r₃₁ ũ − r₁₁) m₁,  κ fy/fx (r₃₁ ṽ − r₂₁) m₁]
@@ -18,7 +19,7 @@ Jacobians: those of `inverse_depth` by both poses and ρ, and with ũ = Y_x/Y_z,
 
 Singular: as `inverse_depth`; and fx or fy that is not positive is invalid.
 
-Source: SPEC.md 8.2, 8.3.
+Source: docs/residuals/photometric.md and docs/residuals/inverse_depth.md.
 """
 
 from __future__ import annotations

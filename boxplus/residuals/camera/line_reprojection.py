@@ -1,5 +1,6 @@
-"""Reprojection error of a straight line: signed distances of a segment's end points to the projected line (SPEC.md 6).
+"""Reprojection error of a straight line: signed distances of a segment's end points to the projected line.
 
+Derivation: docs/residuals/line_reprojection.md.
 A line is its moment and direction L = [m; d], m = p × d, held as (U, φ) on `Line3D`: U = [u₁, u₂, u₃] and
 L = [cos φ u₁; sin φ u₂]. With T_camera_world = (R, t):
 
@@ -18,7 +19,7 @@ invalid. A segment shorter than 1 px gives two equal rows and is refused or drop
 where `Line3D` is made; one through the world origin (w₁ = 0) is not singular. Motion along the line is not constrained,
 and one view does not determine a line.
 
-Source: SPEC.md 6.1 to 6.5; Bartoli and Sturm, Structure from motion using lines, 2005.
+Source: docs/residuals/line_reprojection.md; Bartoli and Sturm, Structure from motion using lines, 2005.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Camera residuals on the pose of the body that carries the camera, so that all sensors of a body share one variable.
 
-A camera residual is derived by T_camera_world on the left (SPEC.md 3, 6, 8.3). Here that pose is made of two variables,
+A camera residual is derived by T_camera_world on the left (docs/residuals/on_body.md). Here that pose is made of two variables,
 
     T_camera_world = (T_world_body T_body_camera)⁻¹,    T_world_body = (R, p),  T_body_camera = (R_c, p_c),
 

@@ -1,5 +1,6 @@
-"""Photometric error: the grey value of a pixel in image 1 against that where it lands in image 2 (SPEC.md 4, 8.2, 8.3).
+"""Photometric error: the grey value of a pixel in image 1 against that where it lands in image 2.
 
+Derivation: docs/residuals/photometric.md and docs/residuals/inverse_depth.md.
 With the ray m of pixel p₁, its inverse depth ρ in view 1, the projection π and the affine brightness (a, b):
 
     e = I₁(p₁) − (eᵃ I₂(p₂) + b),   p₂ = π(R m + ρ t),   (R, t) = T_21
@@ -14,7 +15,7 @@ Jacobians, ∇I₂ the exact gradient of the bilinear interpolant at p₂ and P_
 I₁(p₁) depends on none of them. The gradient jumps where p₂ crosses a pixel centre. Invalid, as a whole patch: one of the four
 pixels around p₂ is outside of the image, or the point is at z' ≤ z_min. ρ < 1e-6 1/m is a point at infinity.
 
-Source: Engel, Koltun and Cremers, Direct Sparse Odometry, PAMI 2018; signs and entries corrected in SPEC.md 4 and 8.
+Source: Engel, Koltun and Cremers, Direct Sparse Odometry, PAMI 2018; signs and entries corrected (see the page).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""One pixel warped from one image into another, and the rows of the photometric error (SPEC.md 4.1, 8.2, 8.3).
+"""One pixel warped from one image into another, and the rows of the photometric error.
 
+Derivation: docs/residuals/photometric.md and docs/residuals/inverse_depth.md.
 The point X' = R m/ρ + t is used as Y = ρ X' = R m + ρ t, which projects to the same pixel and is regular at ρ = 0, a point at
-infinity. With P_Y = ∂π/∂Y the derivatives of SPEC.md become
+infinity. With P_Y = ∂π/∂Y the derivatives of the page become
 
     ∂p₂/∂[w, v] = P_Y [−[Y]x  ρ I],   ∂p₂/∂ρ = P_Y t,   ∂p₂/∂c = ∂π/∂c + P_Y R ∂m/∂c
 """
@@ -18,7 +19,7 @@ from boxplus.cameras.pinhole import project_point
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.residuals.camera.photometric_sampling import sample_bilinear
 
-LEAST_INVERSE_DEPTH = 1e-6  # 1/m; below it a point is at infinity (SPEC.md 8.3)
+LEAST_INVERSE_DEPTH = 1e-6  # 1/m; below it a point is at infinity (docs/residuals/inverse_depth.md)
 _LEAST_Y_Z = 1e-6  # of a ray with z = 1: a point at infinity 90° off the optical axis
 
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]

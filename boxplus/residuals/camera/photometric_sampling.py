@@ -1,4 +1,4 @@
-"""Grey values between pixels: bilinear interpolation and the exact gradient of the interpolant (SPEC.md 4.2).
+"""Grey values between pixels: bilinear interpolation and the exact gradient of the interpolant (docs/residuals/photometric.md).
 
 Images are (height, width) float32; u runs right, v down, pixel centres are at integers. The gradient jumps at integer
 coordinates, where the interpolant has a kink.

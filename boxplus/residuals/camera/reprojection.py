@@ -1,4 +1,4 @@
-"""Reprojection error of a point in a calibrated camera (SPEC.md 3).
+"""Reprojection error of a point in a calibrated camera (docs/residuals/reprojection.md).
 
 Residual [px], with X' = T_camera_world p_world and the projection π of the camera, its distortion included:
 
@@ -12,7 +12,7 @@ Jacobians, with P = ∂π/∂X' and R = R_camera_world:
 Singular: a depth X'_z ≤ z_min of the camera (0.05 m) is invalid and never projected; in a camera of wide angle, a distance up
 to `nearest` and a direction in which its formula does not hold.
 
-Source: SPEC.md 3.1 to 3.3.
+Source: docs/cameras.md and docs/residuals/reprojection.md.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def write_pose_point(
     J_pose: NDArray[np.float64],
     J_point: NDArray[np.float64],
 ) -> None:
-    """−P [−[X']× I] and −P R for the rows of residual n, at X' = (x, y, z); P and R row by row (SPEC.md 3.2, 3.3)."""
+    """−P [−[X']× I] and −P R for the rows of residual n, at X' = (x, y, z); P and R row by row."""
     p00, p01, p02, p10, p11, p12 = P
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R
     J_pose[n, 0, 0] = p01 * z - p02 * y

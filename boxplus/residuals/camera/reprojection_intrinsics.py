@@ -1,5 +1,6 @@
-"""Reprojection error of a point in a camera whose intrinsics are a variable too (SPEC.md 3.2 to 3.4).
+"""Reprojection error of a point in a camera whose intrinsics are a variable too.
 
+Derivation: docs/residuals/reprojection.md and docs/cameras.md.
 Residual [px], with X' = T_camera_world p_world and c = [fx, fy, cx, cy, then k1, k2, p1, p2, k3 as far as the model goes]:
 
     e = pixel − π(X'; c)
@@ -12,7 +13,7 @@ and −∂π/∂k likewise, as `boxplus.cameras.projection.intrinsics_jacobian_a
 
 Singular: as `reprojection`.
 
-Source: SPEC.md 3.1 to 3.4.
+Source: docs/cameras.md and docs/residuals/reprojection.md.
 """
 
 from __future__ import annotations

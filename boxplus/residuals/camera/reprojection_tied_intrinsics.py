@@ -7,7 +7,7 @@ The intrinsics c of `reprojection_intrinsics` are an affine function of fewer nu
 so that nothing but the numbers that are really free is estimated. B has full rank. Pose and point as in
 `reprojection_intrinsics`; singular cases too.
 
-Source: SPEC.md 3.1 to 3.4.
+Source: docs/cameras.md and docs/residuals/reprojection.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""IMU error between two keyframes (SPEC.md 7.5).
+"""IMU error between two keyframes (docs/residuals/imu_preintegration.md).
 
 States: pose (q, p) of the IMU in the world, and [v, b_a, b_g]; T the duration, R = R(q_i), g gravity pointing down. With α̂, β̂,
 γ̂ corrected for the bias (7.4) and E = γ̂⁻¹ ⊗ q_i⁻¹ ⊗ q_j, its sign such that w ≥ 0, the residual (15) is
@@ -13,10 +13,10 @@ being the offset assumed there; to first order (`Preintegration.time_jacobian`)
 
     ∂e/∂δ_u = ‖g‖ [−½ T² Rᵀ B(u),  0,  −T Rᵀ B(u)],    ∂e/∂t_d = [−α_t,  −J_l⁻¹(Log E) J_r(δθ) θ_t,  −β_t]
 
-Its Jacobians are those of SPEC.md 7.5, with the columns of a pose in the order of its tangent, [θ, p]; q is moved on the right
+Its Jacobians are derived there, with the columns of a pose in the order of its tangent, [θ, p]; q is moved on the right
 and p is added to. `2 E_xyz` saturates at 2 and loses rank at a half turn; Log(E) does neither.
 
-Source: Forster et al., TRO 2017; Qin, Li and Shen, VINS-Mono, TRO 2018; corrections to the derivation in SPEC.md 7.
+Source: Forster et al., TRO 2017; Qin, Li and Shen, VINS-Mono, TRO 2018; corrected on that page.
 """
 
 from __future__ import annotations
@@ -273,7 +273,7 @@ class ImuPreintegration(Residual):
         self._set(preintegration)
 
     def refresh(self, velocity_bias_i: ArrayLike, time_offset_s: float | None = None) -> int:
-        """Integrate anew, at these biases and this time offset, what moved too far from those of its integration (SPEC.md 7.4).
+        """Integrate anew, at these biases and this time offset, what moved too far from those of its integration.
 
         Residuals and whitening jump a little, so that it is called between solves, not within one.
 

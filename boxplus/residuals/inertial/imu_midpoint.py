@@ -1,9 +1,10 @@
-"""The midpoint recursion of preintegration with its covariance and bias Jacobians, in one pass over the samples (SPEC.md 7).
+"""The midpoint recursion of preintegration with its covariance and bias Jacobians, in one pass over the samples.
 
-SPEC.md 7.2 perturbs the rotation on the right, γ Exp(θ). Here the recursion runs in φ = R(γ) θ, the same error seen in the
+Derivation: docs/residuals/imu_preintegration.md.
+That page perturbs the rotation on the right, γ Exp(θ). Here the recursion runs in φ = R(γ) θ, the same error seen in the
 frame of the first keyframe, where the blocks of F become sparse: F_φφ = I and F_βφ = −δt [ā]x, with K = F_φg = −δt R₀ J_l(ω̄ δt),
 F_βa = −δt/2 (R₀ + R₁), F_βg = −δt/2 [R₁ a₁]x K; and α' = α + δt/2 (β + β') holds for errors as for values. The columns of the
-gyroscope's noise are those of its bias. At the end θ = Rᵀ φ. The result is that of SPEC.md 7.2, not an approximation of it.
+gyroscope's noise are those of its bias. At the end θ = Rᵀ φ. The result is the same, not an approximation of it.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def integrate_interval(
         time_ns: (S,); gyro, accel: (S, 3).
         first: last sample that is not after begin_ns.
         variances: densities squared of gyroscope, accelerometer, gyroscope bias, accelerometer bias.
-        merged: whether neighbouring steps share the noise of their common sample (SPEC.md 7.3).
+        merged: whether neighbouring steps share the noise of their common sample (docs/residuals/imu_preintegration.md).
         alpha, beta: (3,); gamma_wxyz: (4,); P: (15, 15), order α, θ, β, b_a, b_g; J: (9, 6), α, θ, β by b_a, b_g. Written.
         R_work: (3, 3).
 

@@ -1,7 +1,7 @@
-"""IMU samples between keyframes, summed up once and for all keyframe states (SPEC.md 7).
+"""IMU samples between keyframes, summed up once and for all keyframe states (docs/residuals/imu_preintegration.md).
 
 Source: Forster et al., On-Manifold Preintegration, TRO 2017; Qin, Li and Shen, VINS-Mono, TRO 2018; midpoint recursion and
-its exact derivatives as in SPEC.md 7.1 to 7.4.
+its exact derivatives as in docs/residuals/imu_preintegration.md.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from boxplus.residuals.inertial.sample_checks import checked_bias, checked_inter
 
 _log = logging.getLogger(__name__)
 
-GAP_S = 0.1  # between samples; the midpoint rule is inaccurate above it (SPEC.md 7, singular cases)
-REINTEGRATE_ACCEL = 0.1  # m/s², change of bias above which the linear correction is given up (SPEC.md 7.4)
+GAP_S = 0.1  # between samples; the midpoint rule is inaccurate above it (docs/residuals/imu_preintegration.md, singular cases)
+REINTEGRATE_ACCEL = 0.1  # m/s², change of bias above which the linear correction is given up
 REINTEGRATE_GYRO = 0.01  # rad/s
 SPARE_NS = 50_000_000  # of samples kept on both sides of intervals that were selected, by which they may still be shifted
 
@@ -48,7 +48,7 @@ class Preintegration:
     Attributes:
         intervals_ns: (N, 2) int64, begin and end.
         alpha: (N, 3) [m]; beta: (N, 3) [m/s]; gamma_wxyz: (N, 4).
-        covariance: (N, 15, 15), error order [α, θ, β, b_a, b_g], θ on the right of γ (SPEC.md 7.2).
+        covariance: (N, 15, 15), error order [α, θ, β, b_a, b_g], θ on the right of γ (docs/residuals/imu_preintegration.md).
         bias_jacobian: (N, 9, 6), ∂[α, θ, β]/∂[b_a, b_g].
         bias_accel: (N, 3) [m/s²] and bias_gyro: (N, 3) [rad/s] that were subtracted.
         noise, mode: what the covariance was computed with; see `integrate`.
@@ -98,7 +98,7 @@ class Preintegration:
             intervals_ns: (N, 2) int64 begin and end of every interval; the whole stream when left out.
             bias_accel, bias_gyro: (3,) or (N, 3), the best guess so far.
             mode: `merged` treats the sample that two neighbouring steps share as one noise, as it is; `independent` as
-                two, which makes standard deviations about √2 too small (as VINS-Mono; SPEC.md 7.3).
+                two, which makes standard deviations about √2 too small (as VINS-Mono; docs/residuals/imu_preintegration.md).
 
         Raises:
             InputError: wrong shapes or types, samples that are not finite or not in order of time, fewer than two
@@ -154,7 +154,7 @@ class Preintegration:
     def corrected(
         self, bias_accel: ArrayLike, bias_gyro: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """α (N, 3), γ wxyz (N, 4) and β (N, 3) for other biases (3,) or (N, 3), to first order (SPEC.md 7.4)."""
+        """α (N, 3), γ wxyz (N, 4) and β (N, 3) for other biases (3,) or (N, 3), to first order."""
         change_a = checked_bias("bias_accel", bias_accel, len(self)) - self.bias_accel
         change_g = checked_bias("bias_gyro", bias_gyro, len(self)) - self.bias_gyro
         moved = (self.bias_jacobian @ np.hstack([change_a, change_g])[:, :, None])[:, :, 0]

@@ -1,4 +1,4 @@
-"""Bundle adjustment: cameras and points that explain best where the points were seen (SPEC.md 3)."""
+"""Bundle adjustment: cameras and points that explain best where the points were seen (docs/residuals/reprojection.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment on straight lines, and on points with them (SPEC.md 6)."""
+"""Bundle adjustment on straight lines, and on points with them (docs/residuals/line_reprojection.md)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Points from the rays that see them, and the pose of a camera from the points it sees: linear, as a start (SPEC.md 3).
+"""Points from the rays that see them, and the pose of a camera from the points it sees: linear, as a start.
 
+Derivation: docs/residuals/reprojection.md.
 A point p is taken where the squared distances to its rays, each divided by the distance from the camera, are least:
 Σ w (I − d dᵀ)(p − c) = 0 with the centres c, unit directions d and w = 1/‖p − c‖², which makes distances angles (Hartley and
 Sturm, Triangulation, 1997). A pose is the direct linear transform from bearings (Hartley and Zisserman, Multiple view geometry,

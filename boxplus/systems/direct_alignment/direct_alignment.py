@@ -1,4 +1,4 @@
-"""Direct alignment of two images, one of them with depth: the pose that makes grey values agree (SPEC.md 4).
+"""Direct alignment of two images, one of them with depth: the pose that makes grey values agree (docs/residuals/photometric.md).
 
 Source: Steinbrücker, Sturm and Cremers, Real-Time Visual Odometry from Dense RGB-D Images, ICCV-W 2011; and those of
 `tracking.py`, which does it.

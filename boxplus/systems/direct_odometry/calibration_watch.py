@@ -5,7 +5,7 @@ fx and fy growing by the factor 1 + κ:
 
     ∂p₂/∂κ = (p₂ − c) − P_Y R [m_x, m_y, 0]ᵀ,     ∂p₂/∂c_x = [1, 0]ᵀ − P_Y R [1/fx, 0, 0]ᵀ,     ∂e/∂q ≈ −∇I₁ ∂p₂/∂q
 
-with Y = R m + ρ t and P_Y = ∂π/∂Y (SPEC.md 8.2). The pose takes what it can; what is left says q, with the covariance of the
+with Y = R m + ρ t and P_Y = ∂π/∂Y. The pose takes what it can; what is left says q, with the covariance of the
 scatter between cells of the image (see `tracking.py`). Frames are combined by their information, and the standard deviation
 grows by how much they disagree. Depths are held: those of a stereo pair would change with the intrinsics, which is not looked at.
 """

@@ -53,7 +53,7 @@ class Estimate:
     Attributes:
         time_ns: the instant the estimate holds for: the last point of the scan, absolute [ns].
         state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
-        covariance: (24, 24) float64 of the tangent `[θ, p, v, b_ω, b_a, g, θ_L, p_L]` at `state` (SPEC.md 9.1): rotations
+        covariance: (24, 24) float64 of the tangent `[θ, p, v, b_ω, b_a, g, θ_L, p_L]` at `state`: rotations
             perturbed on the right (IMU frame) [rad], position and velocity along the world's axes. It is the filter's, which
             takes the map for exact: the pose is meant relative to the map around it.
         pose_covariance: (6, 6) float64 of the pose `[θ, p]`, order and axes as above, relative to the first pose: with what the

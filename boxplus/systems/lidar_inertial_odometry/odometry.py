@@ -1,4 +1,4 @@
-"""LiDAR-inertial odometry: FAST-LIO2 (Xu et al., IEEE T-RO 2022), corrected as in SPEC.md section 9."""
+"""LiDAR-inertial odometry: FAST-LIO2 (Xu et al., IEEE T-RO 2022), corrected as in docs/lidar_inertial_odometry.md."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ class LidarInertialOdometry(Snapshots):
         del self._waiting[: max(oldest, 0)]
 
     def _process(self, frame: Frame) -> Estimate:
-        """One scan, line by line as in SPEC.md 9.11."""
+        """One scan, line by line as in docs/lidar_inertial_odometry.md."""
         clock = Stopwatch()
         if begins_blind(frame, self.config.max_imu_gap):
             frame = self._see_motion(frame)

@@ -1,5 +1,6 @@
-"""Pose-graph optimisation: the poses that agree best with the relative poses measured between them (SPEC.md 5).
+"""Pose-graph optimisation: the poses that agree best with the relative poses measured between them.
 
+Derivation: docs/residuals/relative_pose.md.
 Two objectives: `logarithm`, Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j), the statistically right one; and `chordal`, that of SE-Sync
 (Rosen et al., IJRR 2019), κ ‖R_j − R_i R_ij‖² + τ ‖t_j − t_i − R_i t_ij‖², to compare with its certified optima.
 """

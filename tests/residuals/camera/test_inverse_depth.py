@@ -73,7 +73,7 @@ class TestInverseDepth:
 
     def test_pose_jacobians_at_infinity(self, camera: Pinhole) -> None:
         anchors, observers, rho, seen = views(5)
-        # The derivative by ρ is one-sided there (SPEC.md 8.3), and tested below.
+        # The derivative by ρ is one-sided there (docs/residuals/inverse_depth.md), and tested below.
         residual = InverseDepthReprojection(camera, random_pixels(6))
         infinite = point(camera, seen, 0.0 * rho)
         linear = residual.linearize(anchors, observers, infinite)

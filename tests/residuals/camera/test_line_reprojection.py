@@ -1,4 +1,4 @@
-"""Line reprojection: against NumPy, against central differences, at the singular cases of SPEC.md 6."""
+"""Line reprojection: against NumPy, against central differences, at the singular cases of docs/residuals/line_reprojection.md."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_each_observation_may_have_its_own_calibration() -> None:
 
 
 def test_moving_an_end_point_along_the_line_changes_nothing() -> None:
-    """The residual does not constrain motion along the line (SPEC.md 6)."""
+    """The residual does not constrain motion along the line (docs/residuals/line_reprojection.md)."""
     poses, line, p_camera = seen_lines(9, 30)
     pixels = CAMERA.project(p_camera)[0]
     along = pixels[:, 0] + np.random.default_rng(10).uniform(0.1, 3.0, (30, 1)) * (pixels[:, 1] - pixels[:, 0])

@@ -1,4 +1,4 @@
-"""The photometric error: plain NumPy, differences inside of pixel cells, and the formulas of SPEC.md 4, 8.2 and 8.3."""
+"""The photometric error: plain NumPy, differences inside of pixel cells, and the formulas of its page in docs/."""
 
 from __future__ import annotations
 

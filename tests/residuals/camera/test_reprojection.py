@@ -76,7 +76,7 @@ class TestReprojection:
         assert_jacobians(Reprojection(camera, random_pixels(3, 40)), *poses_and_points(4, 40))
 
     def test_pose_jacobian_is_that_of_the_specification(self) -> None:
-        """Written out without distortion (SPEC.md 3.2)."""
+        """Written out without distortion (docs/residuals/reprojection.md)."""
         poses, points = poses_and_points(5, 20)
         camera = CAMERAS[0]
         J = Reprojection(camera, random_pixels(6, 20)).linearize(poses, points).jacobians[0]

@@ -1,4 +1,4 @@
-"""IMU streams for tests, and SPEC.md 7.1 to 7.3 written down as they stand: the oracle of the kernel."""
+"""IMU streams for tests, and docs/residuals/imu_preintegration.md written down as they stand: the oracle of the kernel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def random_stream(seed: int, count: int, shortest_ns: int = 3_000_000, longest_n
 def dense_preintegration(
     stream: Stream, bias_accel: NDArray[np.float64], bias_gyro: NDArray[np.float64], noise: ImuNoise, merged: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """α, R(γ), β, P (15, 15) and J (15, 15) by the dense matrices of SPEC.md 7.2."""
+    """α, R(γ), β, P (15, 15) and J (15, 15) by the dense matrices of docs/residuals/imu_preintegration.md."""
     time_ns, gyro, accel = stream
     alpha, beta, R0 = np.zeros(3), np.zeros(3), np.eye(3)
     J, P = np.eye(15), np.zeros((15, 15))

@@ -1,4 +1,4 @@
-"""Preintegration: the kernel against SPEC.md 7 in dense matrices, derivatives, real flights, and what is refused."""
+"""Preintegration: the kernel against its recursion in dense matrices, derivatives, real flights, and what is refused."""
 
 from __future__ import annotations
 

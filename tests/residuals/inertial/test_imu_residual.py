@@ -1,4 +1,4 @@
-"""The IMU error: SPEC.md 7.5 in NumPy, its Jacobians, and the scale of what is whitened."""
+"""The IMU error: docs/residuals/imu_preintegration.md in NumPy, its Jacobians, and the scale of what is whitened."""
 
 from __future__ import annotations
 

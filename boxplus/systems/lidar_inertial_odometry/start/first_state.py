@@ -46,7 +46,7 @@ _TWICE = 4.0  # the batch and then the filter see the same scans: its covariance
 
 
 def _gravity_rotation(up_imu: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shortest rotation that takes the measured `up_imu` (3,) to +z (SPEC.md 9.4)."""
+    """Shortest rotation that takes the measured `up_imu` (3,) to +z (docs/lidar_inertial_odometry.md, section 10)."""
     up = up_imu / np.linalg.norm(up_imu)
     if up[2] < -1.0 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])

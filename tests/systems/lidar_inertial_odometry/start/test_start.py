@@ -1,4 +1,7 @@
-"""The first state at rest and in motion, and what is said when there is none yet (SPEC.md 9.4)."""
+"""The first state at rest and in motion, and what is said when there is none yet.
+
+Derivation: docs/lidar_inertial_odometry.md, section 10.
+"""
 
 from __future__ import annotations
 
