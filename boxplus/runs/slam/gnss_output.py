@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import math
+from pathlib import Path
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.recording import Recording
@@ -70,6 +72,22 @@ def write_georeference(folder: SlamFolder, found: Georeference, config: Georefer
             lines.append(f"{time_ns // 10**9}.{time_ns % 10**9:09d},{east:.4f},{north:.4f},{up:.4f}")
         with atomic_file(folder.trajectory_utm) as file:
             file.write(("\n".join(lines) + "\n").encode())
+
+
+def read_origin(folder: Path) -> EnuFrame | None:
+    """The origin in the `georeference.yaml` of a run; None where it has none.
+
+    Raises:
+        InputError: the file is not of that form.
+    """
+    path = SlamFolder(folder).georeference
+    if not path.is_file():
+        return None
+    try:
+        origin = yaml.safe_load(path.read_text(encoding="utf-8"))["origin"]
+        return EnuFrame(float(origin["latitude_deg"]), float(origin["longitude_deg"]), float(origin["height_m"]))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
+        raise InputError("an origin in georeference.yaml", f"{path}: {error}", "keep what 'boxplus slam' wrote") from error
 
 
 def gnss_facts(topic: str, found: Georeference, correction: Correction) -> GnssFacts:

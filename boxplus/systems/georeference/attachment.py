@@ -71,28 +71,39 @@ def attach(
     """
     left_out = Counter(fixes.rejected)
     t = fixes.time_ns + round(config.time_offset_s * 1e9)
-    after = np.clip(np.searchsorted(time_ns, t, side="right"), 1, max(len(time_ns) - 1, 1))
-    inside = (t >= time_ns[0]) & (t <= time_ns[-1]) if len(time_ns) > 1 else np.zeros(len(t), dtype=np.bool_)
-    after = np.minimum(after, len(time_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    gap = (time_ns[after] - time_ns[before]).astype(np.float64)
-    follows = gap <= _LONGEST_GAP_NS
+    inside, follows, T_odo, v_odo = poses_between(time_ns, T_odo_imu, t)
     _count(left_out, "outside of the odometry's time", ~inside)
     _count(left_out, "in a gap of the odometry", inside & ~follows)
     keep = np.flatnonzero(inside & follows)
     chosen = keep[_one_each(t[keep], config.interval)]
     if len(keep) > len(chosen):
         left_out["one of several within the interval"] = len(keep) - len(chosen)
-    t, before, after, gap = t[chosen], before[chosen], after[chosen], np.maximum(gap[chosen], 1.0)
-    A, B = T_odo_imu[before], T_odo_imu[after]
-    between = se3.log(se3.compose(se3.inverse(A), B))
-    T_odo = se3.compose(A, se3.exp(((t - time_ns[before]) / gap)[:, None] * between))
-    v_odo = (B[:, 4:] - A[:, 4:]) / (gap[:, None] * 1e-9)
+    t, T_odo, v_odo = t[chosen], T_odo[chosen], v_odo[chosen]
     map_of = np.argmin(np.abs(map_time_ns[None, :] - t[:, None]), axis=1)
     T_map_odo = se3.inverse(T_odo_map[map_of])
     v_map = np.einsum("nab,nb->na", quaternion.to_matrix(T_map_odo[:, :4]), v_odo)
     covariance = _filled(fixes.covariance[chosen], config)
     return AttachedFixes(t, fixes.lat_lon_alt[chosen], covariance, map_of, se3.compose(T_map_odo, T_odo), v_map, left_out)
+
+
+def poses_between(
+    time_ns: NDArray[np.int64], T: Floats, at_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats, Floats]:
+    """Poses and velocities at other times, between poses (K, 7) at ascending times (K,), at least one.
+
+    Returns:
+        (N,) within the times; (N,) between poses no more than a second apart; (N, 7) poses and (N, 3) velocities [m/s] along the
+        axes of the world, which mean something where both are true.
+    """
+    after = np.clip(np.searchsorted(time_ns, at_ns, side="right"), 1, max(len(time_ns) - 1, 1))
+    inside = (at_ns >= time_ns[0]) & (at_ns <= time_ns[-1]) & (len(time_ns) > 1)
+    after = np.minimum(after, len(time_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    gap = np.maximum((time_ns[after] - time_ns[before]).astype(np.float64), 1.0)
+    A, B = T[before], T[after]
+    share = np.clip((at_ns - time_ns[before]) / gap, 0.0, 1.0)
+    found = se3.compose(A, se3.exp(share[:, None] * se3.log(se3.compose(se3.inverse(A), B))))
+    return np.asarray(inside), gap <= _LONGEST_GAP_NS, found, (B[:, 4:] - A[:, 4:]) / (gap[:, None] * 1e-9)
 
 
 def _one_each(t: NDArray[np.int64], interval: float) -> NDArray[np.intp]:

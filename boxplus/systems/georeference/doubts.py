@@ -14,6 +14,8 @@ from boxplus.systems.georeference.fit import Fit
 
 _MANY_GATED = 0.15
 _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
+_WINDOW = 5  # fixes on either side of a jump
+_STANDS_OUT = 5.0  # times the usual difference between them
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
@@ -43,6 +45,31 @@ def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
     for a, b in runs_of(~found.is_used):
         counts["off for a stretch (multipath)" if b - a > 2 else "off alone"] += b - a
     return counts
+
+
+def jump_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
+    """(since the first fix [s], metres on the ground) of the largest step in the errors of fixes that are used, if it stands out.
+
+    Means over a few fixes before and after every instant, over which the odometry does not drift; their usual difference is what
+    noise makes of it.
+    """
+    used = np.flatnonzero(found.is_used)
+    if len(used) < 4 * _WINDOW:
+        return None
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(found.errors[used, :2], axis=0)])
+    means = (sums[_WINDOW:] - sums[:-_WINDOW]) / _WINDOW
+    steps = np.linalg.norm(means[_WINDOW:] - means[:-_WINDOW], axis=1)
+    seconds = (attached.time_ns[used] - attached.time_ns[0]) * 1e-9
+    ends = np.arange(len(steps)) + _WINDOW
+    lasts = seconds[ends + _WINDOW - 1] - seconds[ends - _WINDOW]
+    is_near = lasts <= max(2.0 * float(np.median(lasts)), _LASTING)  # in a longer gap the odometry drifts
+    if not is_near.any():
+        return None
+    largest = int(np.argmax(np.where(is_near, steps, 0.0)))
+    noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
+    if steps[largest] < max(_STANDS_OUT * float(np.median(steps[is_near])), _SIGMAS * noise):
+        return None
+    return float(seconds[ends[largest]]), float(steps[largest])
 
 
 def doubts_of(
@@ -76,6 +103,12 @@ def doubts_of(
                 f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
                 "another datum or base station, or the odometry is wrong there"
             )
+    jump = jump_of(attached, found)
+    if jump is not None:
+        warnings.append(
+            f"fixes jump by {jump[1]:.1f} m against the odometry at {jump[0]:.0f} s and are used on both sides: another datum or "
+            "base station from there on, or multipath too small to be told; the map lies between the two"
+        )
     if found.noise_scale > _NOISY:
         warnings.append(f"fixes scatter {found.noise_scale:.1f} times as much as they claim; they are believed that much less")
     if found.tension > _BENT:

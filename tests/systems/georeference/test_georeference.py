@@ -67,6 +67,11 @@ def test_what_is_wrong_with_the_fixes_is_refused_with_evidence(laps: Drive, rece
     assert result.fit is None and result.frame is None
 
 
+def test_a_datum_that_changes_a_little_is_not_taken_in_silence(laps: Drive) -> None:
+    jumped = found(laps, GOOD.model_copy(update={"sigma": 0.6, "slow_sigma": 0.5, "claimed": 1.0, "jump": (3.0, 2.0, 0.0)}))
+    assert jumped.refusal is None and any("jump by" in text for text in jumped.warnings)
+
+
 def test_fixes_of_another_vehicle_are_refused(laps: Drive) -> None:
     other = drive([[0, 0], [100, 0], [100, -120], [220, -120]], seed=4)
     result = georeference(laps.graph, other.fixes(GOOD), laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
