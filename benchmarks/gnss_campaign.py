@@ -45,9 +45,9 @@ CASES = {
     "states nothing": Case({"claimed": None}, "map"),
     "claims 1 cm": Case({"claimed": 0.01}, "map"),
     "no lever arm": Case({}, "map", with_lever=False),
-    "multipath": Case({"multipath": 4}, "map"),
-    "much multipath": Case({"multipath": 10, "multipath_s": 8.0}, "map"),
-    "small multipath": Case({"multipath": 4, "multipath_m": 4.0}, "map"),
+    "multipath": Case({"multipath": 3, "multipath_s": 6.0}, "map"),
+    "much multipath": Case({"multipath": 10, "multipath_s": 10.0}, "said"),
+    "small multipath": Case({"multipath": 3, "multipath_s": 6.0, "multipath_m": 4.0}, "map"),
     "tunnels": Case({"tunnels": 2}, "map"),
     "0.3 s late": Case({"delay_s": 0.3}, "said"),
     "18 s late": Case({"delay_s": 18.0}, "refusal"),
@@ -63,7 +63,7 @@ def route(seed: int) -> NDArray[np.float64]:
     """A walk along the streets of a grid, 40 to 120 m to the next corner, never straight back."""
     random = np.random.default_rng([seed, 31])
     corners, heading = [np.zeros(2)], int(random.integers(4))
-    for _ in range(int(random.integers(4, 12))):
+    for _ in range(int(random.integers(8, 17))):
         direction = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[heading]
         corners.append(corners[-1] + random.uniform(40.0, 120.0) * direction)
         heading = (heading + int(random.choice([-1, 1]))) % 4

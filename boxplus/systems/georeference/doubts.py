@@ -15,7 +15,9 @@ from boxplus.systems.georeference.fit import Fit
 _MANY_GATED = 0.15
 _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
 _WINDOW = 5  # fixes on either side of a jump
-_STANDS_OUT = 5.0  # times the usual difference between them
+_EDGE = 3  # fixes at either end of a stretch
+_FADES = 0.5  # of the step at one end of a gated stretch, that at the other where it only fades
+_STANDS_OUT = 4.0  # times the usual difference between them
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
@@ -51,8 +53,11 @@ def jump_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
     """(since the first fix [s], metres on the ground) of the largest step in the errors of fixes that are used, if it stands out.
 
     Means over a few fixes before and after every instant, over which the odometry does not drift; their usual difference is what
-    noise makes of it.
+    noise makes of it. Or the beginning (the end) of a stretch of gated fixes whose other end is none: the map was bent to them.
     """
+    fading = _fading_of(attached, found)
+    if fading is not None:
+        return fading
     used = np.flatnonzero(found.is_used)
     if len(used) < 4 * _WINDOW:
         return None
@@ -70,6 +75,21 @@ def jump_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
     if steps[largest] < max(_STANDS_OUT * float(np.median(steps[is_near])), _SIGMAS * noise):
         return None
     return float(seconds[ends[largest]]), float(steps[largest])
+
+
+def _fading_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
+    """A gated stretch that multipath does not explain, which ends as suddenly as it began."""
+    errors, n = found.errors[:, :2], len(attached)
+    for a, b in runs_of(~found.is_used):
+        if b - a < _EDGE or a < _EDGE or b > n - _EDGE:
+            continue
+        inside = errors[a : a + _EDGE].mean(axis=0), errors[b - _EDGE : b].mean(axis=0)
+        outside = errors[a - _EDGE : a].mean(axis=0), errors[b : b + _EDGE].mean(axis=0)
+        begin, end = (float(np.linalg.norm(i - o)) for i, o in zip(inside, outside, strict=True))
+        if min(begin, end) < _FADES * max(begin, end):
+            at = a if begin > end else b
+            return float((attached.time_ns[at] - attached.time_ns[0]) * 1e-9), max(begin, end)
+    return None
 
 
 def doubts_of(
@@ -106,8 +126,8 @@ def doubts_of(
     jump = jump_of(attached, found)
     if jump is not None:
         warnings.append(
-            f"fixes jump by {jump[1]:.1f} m against the odometry at {jump[0]:.0f} s and are used on both sides: another datum or "
-            "base station from there on, or multipath too small to be told; the map lies between the two"
+            f"fixes jump by {jump[1]:.1f} m against the odometry at {jump[0]:.0f} s and are used on both sides: another datum "
+            "or base station from there on, or multipath too small to be told; the map lies between the two"
         )
     if found.noise_scale > _NOISY:
         warnings.append(f"fixes scatter {found.noise_scale:.1f} times as much as they claim; they are believed that much less")
