@@ -152,5 +152,7 @@ def _rows(summary: RunSummary) -> list[tuple[str, str]]:
     if timing.scan_ms is not None:
         rows.append(("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms"))
     rows.append(("speed", speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)))
+    for lidar in summary.lidars[1:]:
+        rows.append((f"LiDAR {lidar.topic}", f"{lidar.merged_points:,} points merged; against the first: {lidar.checked}"))
     rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))
     return rows

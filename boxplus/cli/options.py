@@ -10,9 +10,10 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ValidationError
 
-from boxplus.recordings.options import RecordingOptions
+from boxplus.errors import BoxplusError
+from boxplus.recordings.options import OtherLidar, RecordingOptions
 
-_TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None}
+_TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None, tuple[OtherLidar, ...] | None: list[str] | None}
 """What a command line can take, for what it cannot."""
 
 _PANEL = "Reading the recording (found from the data unless given)"
@@ -45,6 +46,9 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
                 options = model(**given)
             except ValidationError as error:
                 first = error.errors()[0]
+                cause = first.get("ctx", {}).get("error")
+                if isinstance(cause, BoxplusError):
+                    raise cause from error
                 name = _flag(str(first["loc"][0]))
                 raise typer.BadParameter(f"{first['msg']} (got {first['input']!r})", param_hint=name) from error
             command(**words, options=options)

@@ -7,10 +7,12 @@ from .cameras.info import ImuStream as ImuStream
 from .cameras.open import open_camera_recording as open_camera_recording
 from .cameras.options import CameraRecordingOptions as CameraRecordingOptions
 from .info import Evidence as Evidence
+from .info import OtherLidarInfo as OtherLidarInfo
 from .info import PointTimeReading as PointTimeReading
 from .info import RecordingInfo as RecordingInfo
 from .info import Topic as Topic
 from .open import open_recording as open_recording
+from .options import OtherLidar as OtherLidar
 from .options import RecordingOptions as RecordingOptions
 from .recording import Event as Event
 from .recording import Recording as Recording

@@ -9,7 +9,7 @@ import numpy as np
 
 from boxplus.recordings import point_time
 from boxplus.recordings.bag_gnss import bag_fixes
-from boxplus.recordings.bag_probe import CLOUD_PARSERS, find_out
+from boxplus.recordings.bag_probe import CLOUD_PARSERS
 from boxplus.recordings.clouds import coordinates, view_points
 from boxplus.recordings.container import Container, interval
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
@@ -21,6 +21,7 @@ from boxplus.recordings.messages import (
 )
 from boxplus.recordings.open_container import open_container
 from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.other_lidars import LidarEvent, find_out_all, merged_events
 from boxplus.recordings.recording import Event, Recording, Tally
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
@@ -35,14 +36,17 @@ def open_bag(path: Path, options: RecordingOptions) -> Recording:
     """Open a bag and find out how to read it. Raises RecordingError and AmbiguityError as `open_recording` does."""
     container = open_container(path)
     try:
-        info = find_out(path, container, options)
+        info = find_out_all(path, container, options)
     except BaseException:
         container.close()
         raise
     start_ns, stop_ns = interval(container, options.start_s, options.duration_s)
 
     def read(tally: Tally) -> Iterator[Event]:
-        return _events(container, info, options, start_ns, stop_ns, tally)
+        events = _events(container, info, options, start_ns, stop_ns, tally)
+        if info.other_lidars:
+            return merged_events(events, info, tally)
+        return (event if isinstance(event, ImuSamples) else event[1] for event in events)
 
     def read_fixes() -> GnssFixes:
         return bag_fixes(container, info.gnss_topic, start_ns, stop_ns)
@@ -79,10 +83,13 @@ class _ImuBlock:
 
 def _events(
     container: Container, info: RecordingInfo, options: RecordingOptions, start_ns: int, stop_ns: int, tally: Tally
-) -> Iterator[Event]:
+) -> Iterator[LidarEvent]:
     container.damage.clear()
     imu = _ImuBlock(info)
-    for channel, _, data in container.messages(frozenset((info.lidar_topic, info.imu_topic)), start_ns, stop_ns):
+    lidars = {info.lidar_topic: (0, info.point_time, options)}
+    for number, (found, other) in enumerate(zip(info.other_lidars, options.other_lidars or (), strict=True), 1):
+        lidars[found.topic] = number, found.point_time, options.alone(other)
+    for channel, _, data in container.messages(frozenset((*lidars, info.imu_topic)), start_ns, stop_ns):
         tally.done += 1
         scan = None
         try:
@@ -90,7 +97,8 @@ def _events(
                 stamp_ns, _, gyro, accel = parse_imu(data, channel.encoding)
                 imu.add(stamp_ns, gyro, accel)
             else:
-                scan = scan_from_cloud(CLOUD_PARSERS[channel.type](data, channel.encoding), info.point_time, options, tally)
+                lidar, reading, own = lidars[channel.topic]
+                scan = scan_from_cloud(CLOUD_PARSERS[channel.type](data, channel.encoding), reading, own, tally)
         except MalformedMessageError as error:
             what = "IMU message" if channel.topic == info.imu_topic else "cloud"
             reason = str(error) if len(tally.rejected) < _MOST_REASONS else "other reasons"
@@ -98,7 +106,7 @@ def _events(
         if (scan is not None or len(imu) >= _LARGEST_IMU_BLOCK) and len(block := imu.take(tally)):
             yield block
         if scan is not None:
-            yield scan
+            yield lidar, scan
     if len(block := imu.take(tally)):
         yield block
     tally.damage += container.damage

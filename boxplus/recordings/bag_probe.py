@@ -137,6 +137,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
         gnss_topic=gnss.topic if gnss is not None else "",
         p_imu_antenna=p_imu_antenna,
         evidence=evidence,
+        stamp_delay_s=lidar_delay * 1e-9,
     )
 
 
@@ -210,7 +211,11 @@ def _choose_lidar(candidates: list[Channel], probes: dict[str, _CloudProbe], opt
         timed = [channel for channel in candidates if options.point_time_field in probes[channel.topic].fields]
     if len(timed) == 1:
         return timed[0]
-    raise AmbiguityError("one LiDAR topic", f"several: {_listed(timed or candidates)}", "choose one with --lidar-topic")
+    raise AmbiguityError(
+        "one LiDAR topic",
+        f"several: {_listed(timed or candidates)}",
+        "choose one with --lidar-topic; --other-lidars merges another one with it",
+    )
 
 
 def _chosen(key: str, chosen: Channel, candidates: list[Channel], given: str | None) -> Evidence:
@@ -269,31 +274,39 @@ def _probe_cloud(probe: _CloudProbe, cloud: CloudMessage, received_ns: int, opti
             probe.times.append(times)
 
 
-def _extrinsic(
-    container: Container, transforms: list[Transform], imu_frame: str, lidar_frame: str
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None, str, Evidence]:
+def static_chain(
+    container: Container, transforms: list[Transform], target: str, source: str
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]], list[str]] | None:
+    """T_target_source (4, 4) from the static transforms, those known first, and the frames on the way; None: not connected."""
+    found = chain(transforms, target, source)
     topics = frozenset(
         c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static") and c.count
     )
+    if found is not None or not topics:
+        return found
+    later: list[Transform] = []
+    for number, (channel, _, data) in enumerate(container.messages(topics, container.start_ns, container.end_ns + 1)):
+        if number >= _MOST_TRANSFORM_MESSAGES:
+            break
+        try:
+            later += parse_transforms(data, channel.encoding)
+        except MalformedMessageError:
+            continue
+    return chain(later, target, source)
+
+
+def _extrinsic(
+    container: Container, transforms: list[Transform], imu_frame: str, lidar_frame: str
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None, str, Evidence]:
     key = "T_imu_lidar"
     if imu_frame == lidar_frame:
         text = f"LiDAR and IMU both name the frame {imu_frame!r}, which says nothing about their mounting: give --T-imu-lidar"
         return None, "", Evidence(key, "unknown", "warning", text)
-    found = chain(transforms, imu_frame, lidar_frame)
-    if found is None and topics:
-        later: list[Transform] = []
-        for number, (channel, _, data) in enumerate(container.messages(topics, container.start_ns, container.end_ns + 1)):
-            if number >= _MOST_TRANSFORM_MESSAGES:
-                break
-            try:
-                later += parse_transforms(data, channel.encoding)
-            except MalformedMessageError:
-                continue
-        found = chain(later, imu_frame, lidar_frame)
+    found = static_chain(container, transforms, imu_frame, lidar_frame)
     if found is None:
         what = (
             f"the static transforms do not connect {imu_frame!r} and {lidar_frame!r}"
-            if topics
+            if any(c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static") and c.count for c in container.channels)
             else "the recording has no static transforms"
         )
         return (

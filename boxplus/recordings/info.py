@@ -65,6 +65,27 @@ class PointTimeReading:
     anchor: Literal["stamp", "first", "last", "clock"]
 
 
+@dataclass(frozen=True, slots=True)
+class OtherLidarInfo:
+    """A LiDAR that is merged with the first one.
+
+    Attributes:
+        topic, frame: its topic, and the name of its frame.
+        point_time: how its point times are read.
+        T_lidar_other: (4, 4) float64, its coordinates to those of the first LiDAR; source: where that comes from.
+        time_offset_s: added to its times [s].
+        messages: that will be read.
+    """
+
+    topic: str
+    frame: str
+    point_time: PointTimeReading
+    T_lidar_other: NDArray[np.float64]
+    source: str
+    time_offset_s: float
+    messages: int
+
+
 def no_imu(given: bool) -> Evidence:
     """What is said of a recording without an IMU, or one that is to be read without it."""
     why = "left out, as asked for" if given else "the recording holds none"
@@ -91,6 +112,8 @@ class RecordingInfo:
         gnss_topic: stream of positions by satellite in use; empty where there is none.
         p_imu_antenna: (3,) the antenna in the IMU's frame [m], or None when the recording does not say.
         evidence: every decision with its reasons; grows while a damaged file is read.
+        stamp_delay_s: median time from the stamp of a cloud to its reception, where it is known [s].
+        other_lidars: those that are merged with the first one.
     """
 
     path: Path
@@ -110,3 +133,5 @@ class RecordingInfo:
     gnss_topic: str = ""
     p_imu_antenna: NDArray[np.float64] | None = None
     evidence: list[Evidence] = field(default_factory=list)
+    stamp_delay_s: float = 0.0
+    other_lidars: list[OtherLidarInfo] = field(default_factory=list)

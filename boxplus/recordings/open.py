@@ -35,7 +35,12 @@ def open_recording(path: str | Path, options: RecordingOptions | None = None) ->
 def _open(path: Path, options: RecordingOptions) -> Recording:
     if not path.exists():
         raise RecordingError("a recording", f"no file or folder {path}", "check the path")
-    if path.is_dir() and (path / "velodyne_points").is_dir():
+    kitti = path.is_dir() and (path / "velodyne_points").is_dir()
+    if options.other_lidars and (kitti or path.suffix.lower() in (".pcap", ".pcapng")):
+        raise RecordingError(
+            "a bag (ROS 1, ROS 2, MCAP) for several LiDARs", f"{path.name}", "leave other_lidars out, or convert it to a bag"
+        )
+    if kitti:
         return open_kitti(path, options)
     if path.suffix.lower() in (".pcap", ".pcapng"):
         return open_pcap(path, options)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from boxplus.errors import RecordingError
+from boxplus.errors import InputError, RecordingError
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 TimeReference = Literal["scan_start", "scan_end", "absolute"]
@@ -23,6 +25,53 @@ ANY_GNSS, NO_GNSS = "auto", "none"
 """Values of `gnss_topic`: the only one there is, and none."""
 
 
+class OtherLidar(BaseModel):
+    """A LiDAR beside the first one, to be merged with it (docs/several_lidars.md). Only its topic has to be given.
+
+    A text stands for its topic, or, in braces, for all of it in YAML: `{topic: /rear, time_offset_s: 0.05}`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    topic: str = Field(description="topic of its clouds")
+    T_lidar_other: tuple[tuple[float, ...], ...] | None = Field(
+        default=None,
+        description="its pose in the frame of the first LiDAR, 4×4 row-major: p_first = T_lidar_other p_other; None takes it "
+        "from the static transforms",
+    )
+    time_offset_s: float = Field(
+        default=0.0, ge=-10.0, le=10.0, description="added to all its times to bring them to the clock of the first LiDAR [s]"
+    )
+    point_time_field: str | None = Field(default=None, description="as for the first LiDAR")
+    point_time_unit: TimeUnit | None = Field(default=None, description="as for the first LiDAR")
+    point_time_reference: TimeReference | None = Field(default=None, description="as for the first LiDAR")
+    min_range: float | None = Field(default=None, ge=0.0, description="None: that of the first LiDAR [m]")
+    max_range: float | None = Field(default=None, gt=0.0, description="None: that of the first LiDAR [m]")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_text(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        if not value.lstrip().startswith("{"):
+            return {"topic": value}
+        try:
+            return yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise InputError(
+                "another LiDAR as a topic or as {topic: …, key: value} in YAML", repr(value), "see docs/several_lidars.md"
+            ) from error
+
+    @field_validator("T_lidar_other")
+    @classmethod
+    def _rigid(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        from boxplus.filtering.nav_state import check_transform  # here, as commands that read no recording start faster without
+
+        if value is None:
+            return None
+        return tuple(tuple(float(x) for x in row) for row in check_transform("T_lidar_other", np.array(value)))
+
+
 class RecordingOptions(BaseModel):
     """How to read a recording. None means: find it from the data, and refuse when two readings fit.
 
@@ -31,7 +80,11 @@ class RecordingOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    lidar_topic: str | None = Field(default=None, description="topic of the LiDAR (bags only)")
+    lidar_topic: str | None = Field(default=None, description="topic of the LiDAR, of several the first one (bags only)")
+    other_lidars: tuple[OtherLidar, ...] | None = Field(
+        default=None,
+        description="LiDARs to merge with the first one: topics, or {topic: …, T_lidar_other: …, time_offset_s: …} (bags only)",
+    )
     imu_topic: str | None = Field(default=None, description="topic of the IMU (bags only); 'none': the LiDAR alone, without one")
     gnss_topic: str = Field(
         default=ANY_GNSS,
@@ -58,6 +111,28 @@ class RecordingOptions(BaseModel):
     max_range: float = Field(default=1000.0, gt=0.0, description="points farther than this are dropped [m]")
     start_s: float = Field(default=0.0, ge=0.0, description="skip this much at the beginning of the recording [s]")
     duration_s: float | None = Field(default=None, gt=0.0, description="read at most this much [s]")
+
+    @model_validator(mode="after")
+    def _each_once(self) -> RecordingOptions:
+        if not self.other_lidars:
+            return self
+        topics = [other.topic for other in self.other_lidars]
+        if self.lidar_topic is None:
+            raise InputError(
+                "lidar_topic (--lidar-topic) beside other_lidars: the LiDAR whose frame and scans are those of the result",
+                f"only the others, {', '.join(topics)}",
+                "name the first LiDAR",
+            )
+        if len({self.lidar_topic, *topics}) != 1 + len(topics):
+            raise InputError("every LiDAR once", f"{self.lidar_topic}, {', '.join(topics)}", "leave the repeated ones out")
+        return self
+
+    def alone(self, other: OtherLidar) -> RecordingOptions:
+        """How one of the other LiDARs would be read as the only one, by its own clock."""
+        own = other.model_dump(include={"point_time_field", "point_time_unit", "point_time_reference"})
+        ranges = {"min_range": other.min_range, "max_range": other.max_range}
+        own |= {name: value for name, value in ranges.items() if value is not None}
+        return self.model_copy(update={**own, "lidar_topic": other.topic, "other_lidars": None, "lidar_time_offset_s": 0.0})
 
 
 def check_start(start_s: float, duration_s: float) -> None:

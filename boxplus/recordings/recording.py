@@ -15,6 +15,7 @@ from boxplus.recordings.info import Evidence, RecordingInfo
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.sensors.scan_merger import LidarShare, ScanMerger
 
 _LOG = logging.getLogger(__name__)
 
@@ -29,11 +30,13 @@ class Tally:
         rejected: dropped points and messages by reason (`points: not finite`, `messages: malformed cloud`).
         done: messages read so far, for the progress.
         damage: what of the file could not be read, one sentence each.
+        merger: of several LiDARs.
     """
 
     rejected: Counter[str] = field(default_factory=Counter)
     done: int = 0
     damage: list[str] = field(default_factory=list)
+    merger: ScanMerger | None = None
 
     def count_scan(self, scan: Scan) -> None:
         """Add the points a scan dropped on construction."""
@@ -166,6 +169,16 @@ class Recording(EventStream[RecordingInfo, Event]):
         self._lidar_shift_ns = round(offset_s * 1e9)
         text = "given; added to all times of the LiDAR, to bring them to the IMU's clock"
         self.info.evidence.append(Evidence("lidar_time_offset", f"{offset_s * 1e3:+.1f} ms", "ok", text))
+
+    @property
+    def lidars(self) -> list[LidarShare]:
+        """What each of several LiDARs has given so far in the current iteration, the first one first; empty for one alone."""
+        return [] if self._tally.merger is None else self._tally.merger.shares
+
+    @property
+    def time_steps(self) -> list[str]:
+        """Where the times of one of several LiDARs stepped back for good: one sentence each."""
+        return [] if self._tally.merger is None else self._tally.merger.time_steps
 
     def _taken(self, event: Event, tally: Tally) -> Event:
         if isinstance(event, Scan):

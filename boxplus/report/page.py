@@ -55,6 +55,7 @@ def _body(data: RunData) -> str:
         parts.append(figure_section("Biases", "With one standard deviation.", figures.biases(data)))
         parts.append(figure_section("Gravity", text, figures.gravity(data)))
     parts.append(_extrinsic(data))
+    parts.append(_lidars(data))
     text = "Points of a scan after the voxel filter, and the root mean square distance of the used ones from their planes."
     parts.append(figure_section("Points", text, figures.points(data)))
     parts.append(_input(data))
@@ -150,6 +151,27 @@ def _extrinsic(data: RunData) -> str:
 def matrix_text(T: Matrix) -> str:
     """A matrix in rows."""
     return "\n".join("  ".join(f"{value: .5f}" for value in row) for row in T)
+
+
+def _lidars(data: RunData) -> str:
+    """Of several LiDARs what each gave, and whether it fits the first one; nothing for one alone."""
+    lidars = data.summary.lidars
+    if not lidars:
+        return ""
+    rows = [
+        (
+            lidar.topic,
+            f"{lidar.scans:,}",
+            f"{lidar.merged_points:,} of {lidar.points:,}",
+            _gap_text(lidar.silences),
+            "–" if lidar.checked is None else f"{lidar.checked} ({lidar.windows} windows)",
+            lidar.checked_text or "",
+        )
+        for lidar in lidars
+    ]
+    text = "Merged by the time of each point, in the frame of the first; how the others lie in it is held while running."
+    table = html_table(rows, ("LiDAR", "scans", "points merged", "silent", "against the first", "evidence"))
+    return f"<section><h2>LiDARs</h2><p>{escape(text)}</p>{table}</section>"
 
 
 def _input(data: RunData) -> str:

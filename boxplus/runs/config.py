@@ -64,6 +64,11 @@ def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
         if info.point_time.field is not None:
             found["point_time_unit"], found["point_time_reference"] = info.point_time.unit, info.point_time.reference
         found["gyro_unit"], found["accel_unit"] = info.gyro_unit, info.accel_unit
+        for other, read in zip(found["other_lidars"] or (), info.other_lidars, strict=False):
+            other["T_lidar_other"] = read.T_lidar_other.tolist()
+            other["point_time_field"] = read.point_time.field or NO_POINT_TIME
+            if read.point_time.field is not None:
+                other["point_time_unit"], other["point_time_reference"] = read.point_time.unit, read.point_time.reference
     head = (
         "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config FILE' repeats it.\n"
         "# For another recording delete the lines of section 'recording' that shall be found anew.\n"

@@ -155,7 +155,8 @@ def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) 
             if begin_ns is None and np.nanmax(np.linalg.norm(event.gyro, axis=1), initial=0.0) > _TURNING_RAD_S:
                 begin_ns = now_ns
         elif len(event):
-            scans.append(thinned(event, _MOST_POINTS))
+            # Of several LiDARs the first alone: a wrong pose of another one must not look like a wrong one of the first.
+            scans.append(thinned(event if event.lidar is None else event.of_lidar(0), _MOST_POINTS))
         since_s = (now_ns - (first_ns if begin_ns is None else begin_ns)) * 1e-9
         if since_s > (search_s if begin_ns is None else length_s):
             break

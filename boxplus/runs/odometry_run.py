@@ -18,6 +18,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.checkpoint import run_identity
 from boxplus.runs.config import RunConfig, dump_run_config
 from boxplus.runs.extrinsic import Extrinsic, choose_extrinsic
+from boxplus.runs.lidar_facts import lidar_facts, lidar_warnings, watch_of
 from boxplus.runs.resumable_run import ResumableRun
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_folder import RunFolder, claim_run_folder
@@ -115,6 +116,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         self._view = view
         alone = not recording.info.imu_topic
         self._odometry = LidarOdometry(config.odometry) if alone else LidarInertialOdometry(config.odometry)
+        self._watch = watch_of(recording)
         self._tiles: TileWriter | None = None
         if extrinsic.warning:
             self._statistics.warnings.add(extrinsic.warning)
@@ -124,13 +126,13 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
 
     def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
         """See `ResumableRun.snapshot`."""
-        return self._odometry.snapshot(), {"registered": self._registered}
+        return self._odometry.snapshot(), {"registered": self._registered, "watch": self._watch}
 
     def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
         """See `ResumableRun.restore`."""
         self._odometry.restore(odometry)
         self._statistics = cast(RunStatistics, self.counts)
-        self._registered = run["registered"]
+        self._registered, self._watch = run["registered"], run["watch"]
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -146,6 +148,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
     def push(self, event: Scan | ImuSamples) -> list[Estimate]:
         """See `RunLoop.push`."""
         self._statistics.add_event(event)
+        if self._watch is not None and isinstance(event, Scan):
+            self._watch.add_scan(event)
         return self._odometry.push_scan(event) if isinstance(event, Scan) else self._odometry.push_imu(event)
 
     def flush(self) -> list[Estimate]:
@@ -166,10 +170,20 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 self._tiles.append(estimate.points_world(), estimate.intensity)
             self._registered += len(estimate.p_lidar)
         self._statistics.add(estimate)
+        if self._watch is not None:
+            for text in self._watch.add_estimate(estimate):
+                self._statistics.warnings.add(text, estimate.time_ns)
         self.status = estimate.status
         self.seconds["writing"] += time.perf_counter() - began
         if self._view is not None:
             self._view.show(estimate)
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        if self._watch is not None and state == "finished":
+            for text in self._watch.finish():
+                self._statistics.warnings.add(text)
+        super().at_end(state)
 
     def finish(self) -> None:
         """Merge the map."""
@@ -201,6 +215,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         """See `RunLoop.summarize`."""
         statistics, start, info = self._statistics, self._odometry.start, self._recording.info
         origin = statistics.first_time_ns
+        lidars = lidar_facts(self._recording, self._watch, origin)
         return RunSummary(
             versions=versions("rosbags"),
             state=state,
@@ -226,6 +241,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 T_imu_lidar_start=self._extrinsic.T_imu_lidar.tolist(),
                 T_imu_lidar_end=statistics.T_imu_lidar.tolist() if statistics.count else None,
             ),
+            lidars=lidars,
             start=None if start is None else StartFacts(kind=start.kind, text=start.text, duration_s=start.duration_s),
             scans=statistics.count,
             status=dict(statistics.status),
@@ -235,7 +251,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             path_length_m=statistics.path_length_m,
             scans_read=statistics.scans_read,
             imu_samples_read=statistics.imu_samples_read,
-            contradiction=self._odometry.contradiction or self._extrinsic.contradiction or None,
+            contradiction=self._contradiction,
             rejected={
                 "recording": self._recording.rejected,
                 "odometry": dict(self._odometry.counters),
@@ -255,6 +271,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             peak_memory_mb=peak_memory_mb(),
             warnings=[
                 *(WarningFacts(text=text, count=1) for text in self._odometry.time_steps),
+                *lidar_warnings(lidars, self._recording.time_steps),
                 *statistics.status_warnings(),
                 *statistics.warnings.facts(origin),
                 *(
@@ -264,6 +281,13 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 ),
             ],
         )
+
+    @property
+    def _contradiction(self) -> str | None:
+        """Of the LiDARs among each other first: what else is contradicted may follow from it."""
+        of_lidars = None if self._watch is None else self._watch.contradiction
+        rest = self._odometry.contradiction or self._extrinsic.contradiction or None
+        return of_lidars if rest is None else rest if of_lidars is None else f"{of_lidars}; {rest}"
 
     def _timing(self) -> TimingFacts:
         return TimingFacts(

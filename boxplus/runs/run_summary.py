@@ -35,6 +35,24 @@ class ExtrinsicFacts(Part):
     T_imu_lidar_end: Matrix | None = None
 
 
+class LidarFacts(Part):
+    """One of several LiDARs that were merged; the first one comes first."""
+
+    topic: str
+    T_lidar_other: Matrix = Field(description="its pose in the frame of the first one, held while running")
+    source: str = Field(description="where that comes from")
+    time_offset_s: float = Field(0.0, description="added to its times")
+    scans: int = Field(0, description="that were read")
+    points: int = Field(0, description="of these")
+    merged_points: int = Field(0, description="that became part of a scan")
+    absent_scans: int = Field(0, description="merged scans without a point of it")
+    silences: list[Gap] = Field(default=[], description="when it gave nothing, though another one did")
+    checked: str | None = Field(None, description="against the first one: agree, contradicted or unverified")
+    checked_text: str | None = None
+    windows: int = Field(0, description="stretches of some seconds in which it could be checked")
+    windows_contradicted: int = 0
+
+
 class TimingFacts(Part):
     """Where the time went."""
 
@@ -66,6 +84,7 @@ class RunSummary(RunFacts):
     resumed: int = Field(0, description="how often the run went on after it had been killed or interrupted")
     recording: RecordingFacts
     extrinsic: ExtrinsicFacts
+    lidars: list[LidarFacts] = Field(default=[], description="of several that were merged; empty for one alone")
     scans: int = 0
     scans_read: int = 0
     scan_gaps: list[Gap] = Field(default=[])

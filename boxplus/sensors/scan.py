@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,7 @@ class Scan:
         intensity: (N,) float32 or None, in the sensor's own unit.
         start_ns, end_ns: first and last instant of the sweep (of its points, rejected ones included).
         rejected: how many points were dropped on construction, by reason.
+        lidar: (N,) uint8, which LiDAR saw each point, where several were merged (docs/several_lidars.md); None: all the same.
     """
 
     p_lidar: NDArray[np.float32]
@@ -30,6 +31,7 @@ class Scan:
     start_ns: int
     end_ns: int
     rejected: Mapping[str, int] = field(default_factory=dict)
+    lidar: NDArray[np.uint8] | None = None
 
     @classmethod
     def from_arrays(
@@ -102,8 +104,29 @@ class Scan:
 
     def shifted(self, offset_ns: int) -> Scan:
         """The same scan, this much later [ns]."""
-        start_ns, end_ns = self.start_ns + offset_ns, self.end_ns + offset_ns
-        return Scan(self.p_lidar, self.time_ns + offset_ns, self.intensity, start_ns, end_ns, self.rejected)
+        return replace(self, time_ns=self.time_ns + offset_ns, start_ns=self.start_ns + offset_ns, end_ns=self.end_ns + offset_ns)
+
+    def where(self, keep: NDArray[np.bool_]) -> Scan:
+        """Only the points chosen by (N,) bool; start, end and what was dropped on construction stay."""
+        return replace(
+            self,
+            p_lidar=self.p_lidar[keep],
+            time_ns=self.time_ns[keep],
+            intensity=None if self.intensity is None else self.intensity[keep],
+            lidar=None if self.lidar is None else self.lidar[keep],
+        )
+
+    def of_lidar(self, index: int) -> Scan:
+        """Only what this one of several LiDARs saw; without `lidar` all points are those of the first one, 0."""
+        return self.where(np.full(len(self), index == 0) if self.lidar is None else self.lidar == index)
+
+    def without_strays(self, longest_ns: int = 1_000_000_000) -> Scan:
+        """A scan that takes longer than this has points with impossible times: only those near the median time are kept [ns]."""
+        if self.end_ns - self.start_ns <= longest_ns or not len(self):
+            return self
+        middle = int(np.partition(self.time_ns, len(self) // 2)[len(self) // 2])
+        kept = self.where(np.abs(self.time_ns - middle) < longest_ns // 2)
+        return replace(kept, start_ns=int(kept.time_ns.min()), end_ns=int(kept.time_ns.max()))
 
     def __len__(self) -> int:
         return int(self.time_ns.size)

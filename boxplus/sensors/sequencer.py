@@ -15,7 +15,6 @@ from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 _GYRO_LIMIT, _ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
-_LONGEST_SCAN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +135,10 @@ class Sequencer:
         if not len(scan):
             self.rejected["scan without a valid point"] += 1
             return
-        if scan.end_ns - scan.start_ns > _LONGEST_SCAN_NS:
-            scan = self._without_strays(scan)
+        without_strays = scan.without_strays()
+        if len(without_strays) < len(scan):
+            self.rejected["point with a time far from its scan"] += len(scan) - len(without_strays)
+        scan = without_strays
         newest = self._newest_scan_end_ns
         if newest is not None and self._scans_taken == len(self._scans) == 1 and newest - scan.end_ns > self._max_jump_ns:
             # The first scan of all was the one that is wrong: nothing else is near it.
@@ -163,15 +164,6 @@ class Sequencer:
         self._scan_steps.went_on()
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)
-
-    def _without_strays(self, scan: Scan) -> Scan:
-        """A scan that takes impossibly long: only its points within half a second of the median time; the others are counted."""
-        middle = int(np.partition(scan.time_ns, len(scan) // 2)[len(scan) // 2])
-        near = np.abs(scan.time_ns - middle) < _LONGEST_SCAN_NS // 2
-        self.rejected["point with a time far from its scan"] += int((~near).sum())
-        time = scan.time_ns[near]
-        intensity = None if scan.intensity is None else scan.intensity[near]
-        return Scan(scan.p_lidar[near], time, intensity, int(time.min()), int(time.max()), scan.rejected)
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
         """The frames that are complete by now; with `flush`, also those that never will be."""

@@ -8,6 +8,7 @@ from boxplus.simulation.motions.spline import Motion, SplineTrajectory, Trajecto
 from boxplus.simulation.motions.thrust import ThrustTrajectory
 from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import SCENARIOS, Scenario, make_scenario, mounting
+from boxplus.simulation.several_lidars import MountedLidar
 from boxplus.simulation.simulation import Simulation, SimulationConfig, simulate
 from boxplus.simulation.worlds.world import World, box, cylinder, rectangle, sphere
 
@@ -17,6 +18,7 @@ __all__ = [
     "Fault",
     "ImuModel",
     "Motion",
+    "MountedLidar",
     "RosetteLidar",
     "Scenario",
     "Simulation",

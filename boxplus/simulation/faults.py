@@ -96,10 +96,6 @@ def _begins(scan: Scan, inside: _Inside) -> bool:
     return bool(inside(np.array([scan.start_ns]))[0])
 
 
-def _shifted(scan: Scan, shift_ns: int) -> Scan:
-    return replace(scan, time_ns=scan.time_ns + shift_ns, start_ns=scan.start_ns + shift_ns, end_ns=scan.end_ns + shift_ns)
-
-
 def _emptied(scan: Scan) -> Scan:
     intensity = None if scan.intensity is None else scan.intensity[:0]
     return Scan(scan.p_lidar[:0], scan.time_ns[:0], intensity, scan.start_ns, scan.end_ns)
@@ -142,7 +138,7 @@ def repeat_stamps(start_s: float = 10.0, duration_s: float = 0.3) -> Fault:
         def scan(scan: Scan, inside: _Inside) -> Scan:
             if not _begins(scan, inside):
                 return scan
-            return _shifted(scan, frozen.setdefault("scan", scan.start_ns) - scan.start_ns)
+            return scan.shifted(frozen.setdefault("scan", scan.start_ns) - scan.start_ns)
 
         def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
             chosen = inside(samples.time_ns)
@@ -161,7 +157,7 @@ def backward_stamps(start_s: float = 10.0, duration_s: float = 0.3, jump_s: floa
     jump_ns = round(jump_s * 1e9)
 
     def scan(scan: Scan, inside: _Inside) -> Scan:
-        return _shifted(scan, -jump_ns) if _begins(scan, inside) else scan
+        return scan.shifted(-jump_ns) if _begins(scan, inside) else scan
 
     def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
         return replace(samples, time_ns=samples.time_ns - jump_ns * inside(samples.time_ns))
@@ -272,6 +268,12 @@ def clock_offset(offset_s: float = 0.1) -> Fault:
         return replace(samples, time_ns=samples.time_ns + shift_ns)
 
     return Fault("clock_offset", f"IMU stamps {offset_s:+g} s off", _Change(imu=imu))
+
+
+def lidar_clock_offset(offset_s: float = 0.05) -> Fault:
+    """The stamps of the LiDAR lie `offset_s` too late (too early when negative); the messages arrive as ever."""
+    shift_ns = round(offset_s * 1e9)
+    return Fault("lidar_clock_offset", f"LiDAR stamps {offset_s:+g} s off", _Change(lambda scan, _: scan.shifted(shift_ns)))
 
 
 def clock_drift(rate: float = 0.01) -> Fault:

@@ -7,7 +7,7 @@ not change when messages arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
-from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation.bag_writer import (
     FIX_TYPE,
@@ -29,7 +28,17 @@ from boxplus.simulation.bag_writer import (
 )
 from boxplus.simulation.faults import Fault
 from boxplus.simulation.gnss import GnssConfig
-from boxplus.simulation.live_recording import GNSS_TOPIC, IMU_FRAME, IMU_TOPIC, LIDAR_FRAME, LIDAR_TOPIC, as_recording, fixes_of
+from boxplus.simulation.live_recording import (
+    GNSS_TOPIC,
+    IMU_FRAME,
+    IMU_TOPIC,
+    LIDAR_FRAME,
+    LIDAR_TOPIC,
+    as_recording,
+    fixes_of,
+    measured_events,
+)
+from boxplus.simulation.several_lidars import MountedLidar
 from boxplus.simulation.simulation import Simulation
 
 POINT = np.dtype(
@@ -54,6 +63,7 @@ def write_recording(
     fault: Fault | None = None,
     progress: Callable[[float], None] | None = None,
     gnss: GnssConfig | None = None,
+    others: tuple[MountedLidar, ...] = (),
 ) -> Path:
     """Write a simulation to disk, scan by scan.
 
@@ -66,6 +76,7 @@ def write_recording(
         fault: what goes wrong.
         progress: called with the share of the recording that is written, 0 to 1.
         gnss: a receiver that takes part, with its lever arm among the static transforms; see `as_recording`.
+        others: LiDARs on board beside the simulation's own; each has a topic and a static transform.
 
     Returns:
         The path that was written.
@@ -84,9 +95,9 @@ def write_recording(
     make_folder(target.parent)
     stem = target.with_suffix("") if format == "ros1" else target
     try:
-        topics = _TOPICS if gnss is None else {**_TOPICS, GNSS_TOPIC: FIX_TYPE}
-        with BagWriter(target, format, topics) as bag:
-            _write_messages(bag, simulation, fault, progress, gnss)
+        topics = _TOPICS | {mounted.topic: _CLOUD for mounted in others}
+        with BagWriter(target, format, topics if gnss is None else topics | {GNSS_TOPIC: FIX_TYPE}) as bag:
+            _write_messages(bag, simulation, fault, progress, gnss, others)
     except OSError as error:
         raise output_error(target, error) from error
     with atomic_file(f"{stem}.gt.tum") as file:
@@ -103,12 +114,12 @@ def _write_messages(
     fault: Fault | None,
     progress: Callable[[float], None] | None,
     gnss: GnssConfig | None,
+    others: tuple[MountedLidar, ...],
 ) -> None:
     T_imu_lidar = as_recording(simulation, fault).info.T_imu_lidar
-    measured = _Measured(simulation)
-    events = measured.events() if fault is None else fault.events(measured.events())
-    if T_imu_lidar is not None:
-        children = {LIDAR_FRAME: T_imu_lidar}
+    declared = {LIDAR_FRAME: T_imu_lidar} | {mounted.frame: mounted.T_declared for mounted in others}
+    children = {frame: T for frame, T in declared.items() if T is not None}
+    if children:
         if gnss is not None:
             children[_ANTENNA_FRAME] = np.eye(4)
             children[_ANTENNA_FRAME][:3, 3] = gnss.lever
@@ -117,46 +128,23 @@ def _write_messages(
         fixes = fixes_of(simulation, gnss)
         for time_ns, place, covariance in zip(fixes.time_ns.tolist(), fixes.lat_lon_alt, fixes.covariance, strict=True):
             bag.write(GNSS_TOPIC, simulation.start_ns, bag.fix(time_ns, _ANTENNA_FRAME, place, covariance))
-    for event in events:
+    models = [(LIDAR_TOPIC, LIDAR_FRAME, simulation.scenario.lidar), *((m.topic, m.frame, m.lidar) for m in others)]
+    scans = 0
+    for measured in measured_events(simulation, fault, others):
+        event, at_ns = measured.event, measured.at_ns
         if isinstance(event, Scan):
-            cloud = _cloud(bag, event, simulation.scenario.lidar.ring(event.p_lidar))
-            bag.write(LIDAR_TOPIC, measured.at_ns + _SCAN_DELAY_NS, cloud)
+            topic, frame, lidar = models[measured.lidar]
+            bag.write(topic, at_ns + _SCAN_DELAY_NS, _cloud(bag, event, lidar.ring(event.p_lidar), frame))
+            scans += measured.lidar == 0
             if progress is not None:
-                progress(measured.scans / simulation.scan_count)
+                progress(scans / simulation.scan_count)
             continue
-        columns = (event.time_ns, event.gyro, event.accel, measured.sample_times(event))
-        for time_ns, gyro, accel, at_ns in zip(*(column.tolist() for column in columns), strict=True):
-            bag.write(IMU_TOPIC, at_ns + IMU_DELAY_NS, bag.imu(time_ns, IMU_FRAME, gyro, accel))
+        columns = (event.time_ns, event.gyro, event.accel, measured.sample_times())
+        for time_ns, gyro, accel, sample_ns in zip(*(column.tolist() for column in columns), strict=True):
+            bag.write(IMU_TOPIC, sample_ns + IMU_DELAY_NS, bag.imu(time_ns, IMU_FRAME, gyro, accel))
 
 
-class _Measured:
-    """The events of a simulation, and when the one that a fault has just turned into another was measured.
-
-    Attributes:
-        at_ns: end of the last event [ns].
-        scans: scans so far.
-    """
-
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
-        self._sample_ns = np.empty(0, np.int64)
-        self.at_ns = simulation.start_ns
-        self.scans = 0
-
-    def events(self) -> Iterator[Scan | ImuSamples]:
-        for event in self._simulation.events():
-            if isinstance(event, Scan):
-                self.at_ns, self.scans = event.end_ns, self.scans + 1
-            else:
-                self.at_ns, self._sample_ns = int(event.time_ns[-1]), event.time_ns
-            yield event
-
-    def sample_times(self, samples: ImuSamples) -> NDArray[np.int64]:
-        """When each of the samples was measured; by their stamps where some of the block are missing."""
-        return self._sample_ns if len(self._sample_ns) == len(samples) else samples.time_ns
-
-
-def _cloud(bag: BagWriter, scan: Scan, ring: NDArray[np.uint16]) -> Any:
+def _cloud(bag: BagWriter, scan: Scan, ring: NDArray[np.uint16], frame: str) -> Any:
     """PointCloud2 of a scan; points a fault turned into NaN, which a `Scan` does not keep, are written as NaN at the end."""
     lost = scan.rejected.get("not finite", 0)
     points = np.zeros(len(scan) + lost, POINT)
@@ -173,7 +161,7 @@ def _cloud(bag: BagWriter, scan: Scan, ring: NDArray[np.uint16]) -> Any:
     ]
     return bag.message(
         _CLOUD,
-        header=bag.header(scan.start_ns, LIDAR_FRAME),
+        header=bag.header(scan.start_ns, frame),
         height=1,
         width=len(points),
         fields=fields,

@@ -22,6 +22,7 @@ from boxplus.runs.inspection.agreement_checks import Compared, check_agreement
 from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.gnss_checks import check_gnss
 from boxplus.runs.inspection.imu_checks import check_finite, check_rest, check_saturation, first_second, quiet_stretch
+from boxplus.runs.inspection.lidar_checks import examine_other_lidars
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
@@ -109,13 +110,17 @@ def diagnose(
         _examine_cameras(path, options, camchain, frame_rate_hz, diagnosis, report)
         report(1.0)
         return diagnosis
+    # Of several LiDARs the first one by itself, then the others and all together.
+    first, share = options.model_copy(update={"other_lidars": None}), 0.6 if options.other_lidars else 1.0
     try:
-        recording = open_recording(path, options)
+        recording = open_recording(path, first)
     except RecordingError as error:
         diagnosis.evidence.append(Evidence("recording", "cannot be read", "error", str(error)))
         return diagnosis
     with recording:
-        _examine(recording, options, T_imu_lidar, diagnosis, report)
+        _examine(recording, first, T_imu_lidar, diagnosis, lambda done: report(share * done))
+    if options.other_lidars:
+        diagnosis.evidence += examine_other_lidars(path, options, lambda done: report(share + (1.0 - share) * done))
     report(1.0)
     return diagnosis
 

@@ -77,7 +77,8 @@ def thinned(scan: Scan, most: int) -> Scan:
     stride = -(-len(scan) // most)
     if stride <= 1:
         return scan
-    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns)
+    lidar = None if scan.lidar is None else scan.lidar[::stride].copy()
+    return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns, lidar=lidar)
 
 
 def undistorted(scan: Scan, nodes: NDArray[np.float64], at_ns: int) -> NDArray[np.float32]:

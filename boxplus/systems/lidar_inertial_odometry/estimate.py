@@ -72,6 +72,7 @@ class Estimate:
         timing_s: seconds spent, by stage of the pipeline.
         p_lidar: (N, 3) float32, all points of the scan in the LiDAR frame at `time_ns`, corrected for motion.
         intensity: (N,) float32 or None.
+        lidar: (N,) uint8, which LiDAR saw each point, where several were merged; else None.
     """
 
     time_ns: int
@@ -92,6 +93,7 @@ class Estimate:
     timing_s: Mapping[str, float]
     p_lidar: NDArray[np.float32]
     intensity: NDArray[np.float32] | None
+    lidar: NDArray[np.uint8] | None = None
 
     @property
     def T_world_imu(self) -> NDArray[np.float64]:

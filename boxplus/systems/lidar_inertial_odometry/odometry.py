@@ -346,6 +346,7 @@ class LidarInertialOdometry(Snapshots):
             timing_s=dict(timing_s or {}),
             p_lidar=p_lidar,
             intensity=frame.scan.intensity,
+            lidar=frame.scan.lidar,
         )
 
 

@@ -288,6 +288,7 @@ class LidarOdometry(Snapshots):
             timing_s=dict(timing_s or {}),
             p_lidar=p_lidar,
             intensity=scan.intensity,
+            lidar=scan.lidar,
         )
 
 

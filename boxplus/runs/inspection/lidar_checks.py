@@ -1,0 +1,101 @@
+"""Findings about several LiDARs: each by itself, and each of the others against the first one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.info import Evidence, Verdict
+from boxplus.recordings.open import open_recording
+from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.recording import Recording
+from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
+from boxplus.runs.lidar_facts import watch_of
+from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text
+from boxplus.systems.lidar_odometry.odometry import LidarOdometry
+from boxplus.systems.several_lidars.judgement import PairJudgement
+
+_LONGEST_S = 120.0
+"""Of a recording, to look for stretches in which the LiDARs can be compared."""
+_WINDOWS = 3
+_VERDICTS: dict[str, Verdict] = {"agree": "ok", "contradicted": "error", "unverified": "warning"}
+
+
+def examine_other_lidars(path: Path, options: RecordingOptions, report: Callable[[float], None]) -> list[Evidence]:
+    """The findings about all LiDARs beside the first one; whatever is wrong becomes a finding.
+
+    Args:
+        path, options: of the recording; with other LiDARs.
+        report: called with the share done, 0 to 1.
+    """
+    others = options.other_lidars or ()
+    found: list[Evidence] = []
+    for k, other in enumerate(others):
+        try:
+            with open_recording(path, options.alone(other)) as recording:
+                log = StreamLog()
+                for event in recording:
+                    log.add(event)
+                    report(0.5 * (k + recording.progress) / len(others))
+                own = check_rejected(recording.rejected)
+        except RecordingError as error:
+            return [*found, Evidence(f"recording of {other.topic}", "cannot be read", "error", str(error))]
+        own += [*check_rate("lidar", np.array(log.scan_start_ns, np.int64), gap_factor=1.5), *check_points(log)]
+        found += [replace(evidence, key=f"{evidence.key} of {other.topic}") for evidence in own]
+    try:
+        with open_recording(path, options) as recording:
+            names = tuple(f" of {other.topic}" for other in others)
+            found += [evidence for evidence in recording.info.evidence if evidence.key.endswith(names)]
+            found += compare_lidars(recording, lambda done: report(0.5 + 0.5 * done))
+    except RecordingError as error:
+        found.append(Evidence("other_lidars", "cannot be merged", "error", str(error)))
+    return found
+
+
+def compare_lidars(recording: Recording, report: Callable[[float], None]) -> list[Evidence]:
+    """Each other LiDAR of a merged recording against the first one, which by itself tells the motion: no IMU takes part."""
+    watch = watch_of(recording)
+    if watch is None:
+        return []
+    watch.every_s = 0.0
+    odometry = LidarOdometry()
+    first_ns: int | None = None
+    for event in recording:
+        if not isinstance(event, Scan):
+            continue
+        first_ns = event.start_ns if first_ns is None else first_ns
+        report(min((event.end_ns - first_ns) * 1e-9 / min(_LONGEST_S, max(recording.info.duration_s, 1.0)), 1.0))
+        watch.add_scan(event)
+        for estimate in odometry.push_scan(event.of_lidar(0)):
+            watch.add_estimate(estimate)
+        judged = watch.judgements().values()
+        if (event.end_ns - first_ns) * 1e-9 > _LONGEST_S or min(windows for _, windows, _ in judged) >= _WINDOWS:
+            break
+    watch.finish()
+    found = [_finding(name, *judgement) for name, judgement in watch.judgements().items()]
+    lost = {reason: count for reason, count in recording.rejected.items() if reason.startswith(("points of ", "scans of "))}
+    found += [Evidence("merging", f"{count} left out", "warning", reason) for reason, count in lost.items()]
+    return found
+
+
+def _finding(name: str, judgement: PairJudgement | None, windows: int, contradicted: int) -> Evidence:
+    key = f"agreement of {name}"
+    if judgement is None:
+        text = "the LiDARs could not be compared: the recording is too short, or the first one by itself does not tell the motion"
+        return Evidence(key, "unverified", "warning", text)
+    verdict = judgement.verdict
+    if verdict == "agree" and contradicted:
+        text = f"in {contradicted} of {windows} stretches it contradicts the first one; in the last {judgement.text}"
+        return Evidence(key, "contradicted at times", "error", text)
+    text = judgement.text if verdict == "unverified" else f"{judgement.text}; over {windows} stretches of some seconds"
+    if verdict == "contradicted" and judgement.T_first_other is not None:
+        T = judgement.T_first_other
+        arm = ", ".join(f"{value:.3f}" for value in T[:3, 3])
+        text += f"; T_lidar_other that fits: rotation {matrix_text(T[:3, :3])}, translation ({arm}) m"
+    value = verdict if not judgement.cause else f"{verdict}: {judgement.cause}"
+    return Evidence(key, value, _VERDICTS[verdict], text)
