@@ -59,10 +59,16 @@ def minimize(
             return "converged", _flat(slope, options), history
         if options.time_limit_s is not None and last.time_s >= options.time_limit_s:
             return "stopped", f"time limit of {options.time_limit_s:g} s reached", history
+        before = strategy.parameter
         step = strategy.propose(problem)
         if step is None:
             return "stalled", _stall(strategy, rejected, lost), history
         parameter, cost = strategy.parameter, problem.cost.cost
+        # After rejections, and where damping had to grow for H to be factorised, little is expected because the step was made
+        # small, not because the minimum is near.
+        made_small = rejected or parameter > before > 0.0
+        if not made_small and 0.0 <= step.predicted < options.expected_tolerance * cost:
+            return "converged", f"the next step is expected to lower the cost by {step.predicted:.2g} at most", history
         size = float(np.abs(step.delta).max(initial=0.0))
         values = problem.moved(step.delta)
         tried = problem.linearize(values)

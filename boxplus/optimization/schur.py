@@ -7,6 +7,7 @@ block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F �
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,6 +207,7 @@ def _gathers_of(
             continue
         slot, number = found
         selected = np.flatnonzero(number >= 0)
-        squares.append(Gather.sorted_by(group, slot, slot, number[selected], np.arange(count) * e * e, selected))
-        slopes.append(Gather.sorted_by(group, slot, slot, number[selected], np.arange(count) * e, selected))
+        slope = Gather.sorted_by(group, slot, slot, number[selected], np.arange(count) * e, selected)
+        slopes.append(slope)
+        squares.append(replace(slope, target=slope.target * e))
     return squares, slopes

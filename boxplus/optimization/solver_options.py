@@ -24,6 +24,12 @@ class SolverOptions(BaseModel):
     max_iterations: int = Field(100, ge=0, description="steps tried at most, rejected ones included")
     time_limit_s: float | None = Field(None, gt=0, description="[s] no further step is begun after this time")
     cost_tolerance: float = Field(1e-9, ge=0, description="converged when a step changes the cost by less than this share of it")
+    expected_tolerance: float = Field(
+        0.0,
+        ge=0,
+        description="converged when the next step is expected to lower the cost by less than this share of it: it is not tried, "
+        "which saves a linearisation; for a window that is solved again and again",
+    )
     step_tolerance: float = Field(1e-10, ge=0, description="converged when no tangent moves by more than this")
     gradient_tolerance: float = Field(
         1e-10, ge=0, description="converged when no column of J encloses an angle with r whose |cos| exceeds this"

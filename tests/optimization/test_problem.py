@@ -87,6 +87,19 @@ def test_accepted_cost_never_rises_and_history_tells_the_story(scene):
     assert str(solution.iterations) in solution.summary()
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("share", (1e-1, 1e-3, 1e-6))
+def test_a_step_of_which_little_is_expected_is_not_tried(method, share):
+    scene = make_scene()
+    whole = scene.problem.solve(method=method, cost_tolerance=1e-12)
+    short = scene.problem.solve(method=method, cost_tolerance=1e-12, expected_tolerance=share)
+    assert short.status == "converged" and "is expected to lower the cost" in short.reason
+    assert short.iterations < whole.iterations
+    # Steps shrink from the first that is left out on: what is left of the cost is less than twice what that one promises.
+    assert whole.cost <= short.cost < whole.cost * (1.0 + 2.0 * share)
+    assert short.cost == scene.problem.cost(short)
+
+
 @pytest.mark.parametrize("linear_solver", ("sparse", "schur"))
 def test_the_number_of_threads_does_not_change_a_bit(linear_solver):
     results = []

@@ -130,6 +130,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._time_offset_s = 0.0
         self._troubled_ns: int | None = None
         self._causes: list[str] = []
+        self._longest_gap_s = config.odometry.max_imu_gap
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -161,7 +162,10 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if state == "finished" and (not self.counts.count or self._odometry.contradiction is not None or lost):
             self.stage = "looking for the cause"
             self.show_progress()
-            self._causes = likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)
+            longest = max((gap.duration_s for gap in self.counts.imu_gaps()), default=0.0)
+            if longest > self._longest_gap_s:
+                self._causes.append(f"a gap of {longest:.2f} s in the samples of the IMU")
+            self._causes += likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
         """See `RunLoop.push`."""

@@ -43,8 +43,8 @@ _HUBER = 1.5  # standard deviations
 _LEAVING = 2  # keyframes at most, for every one that is new
 # A tilt of the whole window against the accelerometer's bias is 1e-8 of what the IMU knows from frame to frame, and decides
 # where it goes: more damping than that would hold it where it is, while the covariance says it is known.
-_SOLVER: dict[str, Any] = {"cost_tolerance": 1e-3, "initial_damping": 1e-10, "examine": False}
-
+# A step that is hardly expected to lower the cost is left to the next frame, which begins there.
+_SOLVER: dict[str, Any] = {"cost_tolerance": 1e-3, "expected_tolerance": 3e-3, "initial_damping": 1e-10, "examine": False}
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15

@@ -29,6 +29,7 @@ _OUTLIERS = 3.0
 _OFFSET_S = 0.005
 _ANGLE_DEG = 1.5
 _UNLIKE, _FAR_OFF = 0.5, 3.0
+_HALF_TURN_DEG = 170.0
 _COARSE = 5  # of the offsets looked at for another reading of the gyroscope
 _READINGS = {
     "the gyroscope's rates have the opposite sign, or it counts in a left-handed frame": -1.0,
@@ -229,4 +230,6 @@ def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidenc
         verdict = "error" if apart > 4.0 * max(_ANGLE_DEG, std) else "warning"
         fits = inverted < _ANGLE_DEG < apart
         text += ": the inverse of what is stated fits" if fits else ": the stated mounting does not fit this recording"
+        if apart > _HALF_TURN_DEG:
+            text += ", or the gyroscope's rates have the opposite sign: with hardly a turn about one axis both look alike"
     return [*evidence, Evidence(rotation_key, f"{apart:.2f} deg apart", verdict, text)]

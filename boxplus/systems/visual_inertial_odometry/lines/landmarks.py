@@ -218,6 +218,8 @@ class LineLandmarks:
 
     def ends(self, bodies: Variables, mountings: Floats) -> tuple[Ints, Floats]:
         """Numbers (k,) of the lines, and the ends (k, 6) [m] of what the first camera saw of them last, in the world."""
+        if not len(self):
+            return np.zeros(0, np.int64), np.zeros((0, 6))
         own = np.flatnonzero(self._camera == 0)
         row = self.block.rows_of(self._line[own])
         last = np.full(len(self), -1)
