@@ -16,6 +16,7 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_UNTRUSTED, EXIT_INTERRUPTED = 1, 2, 3, 130
 _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
     "slam": ("boxplus.cli.slam:slam", "The same with loops closed: corrected trajectory and map beside the odometry's own."),
+    "refine": ("boxplus.cli.refine:refine_command", "Refine a finished run of lio: all poses, planes and IMU samples at once."),
     "vio": ("boxplus.cli.vio:vio", "Turn a recording of cameras and an IMU into a trajectory, landmarks and a report."),
     "vo": ("boxplus.cli.vo:vo", "Turn a recording of an RGB-D or a stereo camera into a trajectory and a report."),
     "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),

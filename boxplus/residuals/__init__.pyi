@@ -22,6 +22,10 @@ from .inertial.imu import ImuPreintegration as ImuPreintegration
 from .inertial.imu_noise import ImuNoise as ImuNoise
 from .inertial.imu_preintegration import Preintegration as Preintegration
 from .marginal_prior import MarginalPrior as MarginalPrior
+from .planes.plane_cluster import Plane as Plane
+from .planes.plane_cluster import PlaneCluster as PlaneCluster
+from .planes.pose_quadratic import PoseQuadratic as PoseQuadratic
+from .planes.pose_quadratic import add_plane_forms as add_plane_forms
 from .point_to_plane import PointToPlane as PointToPlane
 from .point_to_point import PointToPoint as PointToPoint
 from .prior import Prior as Prior

@@ -139,6 +139,23 @@ def _point_to_plane(rng: np.random.Generator) -> Case:
     return residuals.PointToPlane(*_points(rng)), [SE3.random(rng, 1)[0]]
 
 
+def _plane_cluster(rng: np.random.Generator) -> Case:
+    points = np.concatenate([rng.normal(size=(COUNT, 12, 3)), np.ones((COUNT, 12, 1))], axis=2)
+    clusters = np.swapaxes(points, 1, 2) @ points
+    T = POSES[2].random(rng, COUNT)
+    return residuals.PlaneCluster(clusters, rng.normal(size=3)), [
+        T,
+        POSES[2].random(rng, 1)[0],
+        residuals.Plane.random(rng, COUNT),
+    ]
+
+
+def _pose_quadratic(rng: np.random.Generator) -> Case:
+    roots = rng.normal(size=(COUNT, 5, 13))
+    forms = np.swapaxes(roots, 1, 2) @ roots
+    return residuals.PoseQuadratic(forms, rng.normal(size=(COUNT, 3))), [POSES[2].random(rng, COUNT)]
+
+
 def _gicp(rng: np.random.Generator) -> Case:
     covariance = np.tile(np.diag([1.0, 1.0, 0.01]), (COUNT, 1, 1))
     return residuals.Gicp(*_points(rng)[:2], covariance, covariance), [SE3.random(rng, 1)[0]]
@@ -189,8 +206,10 @@ CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "MarginalPrior": _marginal,
     "OnBody": _on_body,
     "Photometric": _photometric,
+    "PlaneCluster": _plane_cluster,
     "PointToPlane": _point_to_plane,
     "PointToPoint": _point_to_point,
+    "PoseQuadratic": _pose_quadratic,
     "Prior": _prior,
     "RelativePose": _relative(residuals.RelativePose, SE3),
     "RelativePose2D": _relative(residuals.RelativePose2D, SE2),

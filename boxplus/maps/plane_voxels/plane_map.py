@@ -1,0 +1,291 @@
+"""Planes in voxels of 4 m that are split down to 0.5 m until what they hold is one plane, and the points of scans on them.
+
+Source: adaptive voxelisation of Liu and Zhang, BALM, RA-L 2021, section III-C.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from boxplus._jit import kernel
+from boxplus.maps.plane_voxels.voxel_sums import (
+    COUNT,
+    EMPTY,
+    SQUARES,
+    SUM,
+    SUMS,
+    VoxelSums,
+    clusters,
+    coordinates,
+    key_of,
+    moments,
+    pack,
+    shifted,
+    slot_of,
+)
+
+_SPLITS = 3  # a voxel is halved so often
+_FLATTEST = 0.02  # share of a voxel's edge that a plane extends over in its shorter direction, at least (standard deviation)
+_WORSE = 2.0  # variance of a large plane over that of the small ones in it, at most
+_NEGLIGIBLE_M = 0.003
+_FEWEST = 6  # points that a plane is fitted to anew
+_PARALLEL = 0.97  # cosine between two planes that may be one
+_BESIDE = 0.4  # of a voxel, between the middles of its points and of those of its neighbour, along the plane
+_GATE = 4.0  # standard deviations of a plane's thickness within which a point lies on it
+
+
+class PlaneVoxelConfig(BaseModel):
+    """How planes are found; lengths in metres."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    smallest_voxel: float = Field(0.5, gt=0, description="edge of the smallest voxels, in an eighth of a large one each way [m]")
+    plane_ratio: float = Field(25.0, gt=1, description="variance within a plane, in its shorter direction, over that across it")
+    plane_thickness: float = Field(0.1, gt=0, description="standard deviation across a plane, at most [m]")
+    plane_points: int = Field(20, ge=6, description="points on a plane, at least")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneMap:
+    """Planes of a recording.
+
+    Attributes:
+        planes: (P, 4) unit normal n and offset d of nᵀ(x − c) + d = 0; centres: (P, 3) c.
+        thickness: (P,) standard deviation of the points across each [m].
+        cell: edge of the smallest voxels [m].
+        keys, plane_of: table of these voxels, and the plane of each, −1 for none.
+    """
+
+    planes: NDArray[np.float64]
+    centres: NDArray[np.float64]
+    thickness: NDArray[np.float64]
+    cell: float
+    keys: NDArray[np.int64]
+    plane_of: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.planes)
+
+    def refitted(self, clusters: NDArray[np.float64]) -> PlaneMap:
+        """With planes through all the points that lie on them: Σ [x; 1][x; 1]ᵀ (P, 4, 4) in the world, from their centres."""
+        count = np.maximum(clusters[:, 3, 3], 1.0)
+        mean = clusters[:, :3, 3] / count[:, None]
+        values, vectors = np.linalg.eigh(clusters[:, :3, :3] / count[:, None, None] - mean[:, :, None] * mean[:, None, :])
+        planes, centres, thickness = self.planes.copy(), self.centres.copy(), self.thickness.copy()
+        seen = clusters[:, 3, 3] >= _FEWEST
+        planes[seen, :3], planes[seen, 3] = vectors[seen, :, 0], 0.0
+        centres[seen] += mean[seen]
+        thickness[seen] = np.sqrt(np.maximum(values[seen, 0], 0.0))
+        return replace(self, planes=planes, centres=centres, thickness=thickness)
+
+    def clusters_of(
+        self, points: NDArray[np.float32], R: NDArray[np.float64], p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The planes that points (n, 3), placed by R and p, lie on, and Σ [x; 1][x; 1]ᵀ (k, 4, 4) of those on each, as given."""
+        # A plane that was found by half of its points, beside a face of its voxel, is thinner than it will be.
+        usual = float(np.median(self.thickness)) if len(self) else 0.0
+        gate = _GATE * np.maximum(self.thickness, max(usual, _NEGLIGIBLE_M))
+        sums = np.zeros((len(self), SUMS))
+        touched = np.empty(len(self), dtype=np.int64)
+        count = _on_planes(points, R, p, self.cell, self.keys, self.plane_of, self.planes, self.centres, gate, sums, touched)
+        found = np.sort(touched[:count])
+        return found, clusters(sums[found])
+
+
+def find_planes(voxels: VoxelSums, config: PlaneVoxelConfig) -> PlaneMap:
+    """The planes of the points in `voxels` (of `config.smallest_voxel`) that at least two groups of points lie on."""
+    slots = voxels.filled()
+    cells, sums, groups = coordinates(voxels.keys[slots]), voxels.sums[slots], voxels.groups[slots]
+    cell = voxels.cell
+    fine = _thickness_of(sums)
+    plane_of = np.full(len(slots), -1, dtype=np.int32)
+    planes, centres, thickness = [np.zeros((0, 4))], [np.zeros((0, 3))], [np.zeros(0)]
+    found = 0
+    open_cells = np.arange(len(slots))
+    for level in range(_SPLITS, -1, -1):
+        if not len(open_cells):
+            break
+        edge = cell * (1 << level)
+        parents, parent_of = np.unique(cells[open_cells] >> level, axis=0, return_inverse=True)
+        parent_of = parent_of.reshape(-1)
+        middles = (parents + 0.5) * edge
+        here = shifted(sums[open_cells], (cells[open_cells] + 0.5) * cell - middles[parent_of])
+        total: NDArray[np.float64] = np.stack(
+            [np.bincount(parent_of, weights=here[:, k], minlength=len(parents)) for k in range(SUMS)], axis=1
+        )
+        mean, covariance = moments(total)
+        values, vectors = np.linalg.eigh(covariance)
+        first = np.full(len(parents), np.iinfo(np.int32).max, dtype=np.int32)
+        last = np.full(len(parents), -1, dtype=np.int32)
+        np.minimum.at(first, parent_of, groups[open_cells, 0])
+        np.maximum.at(last, parent_of, groups[open_cells, 1])
+        inner = _mean_by(parent_of, fine[open_cells], sums[open_cells, COUNT], len(parents))
+        is_plane = (
+            (total[:, COUNT] >= config.plane_points)
+            & (config.plane_ratio * values[:, 0] < values[:, 1])
+            & (values[:, 0] < config.plane_thickness**2)
+            & (values[:, 1] > (_FLATTEST * edge) ** 2)
+            & (values[:, 0] <= _WORSE * inner + _NEGLIGIBLE_M**2)
+            & (first < last)
+        )
+        number = np.full(len(parents), -1, dtype=np.int32)
+        number[is_plane] = found + np.arange(np.count_nonzero(is_plane))
+        plane_of[open_cells] = number[parent_of]
+        found += int(np.count_nonzero(is_plane))
+        planes.append(np.hstack([vectors[is_plane, :, 0], np.zeros((np.count_nonzero(is_plane), 1))]))
+        centres.append(mean[is_plane] + middles[is_plane])
+        thickness.append(np.sqrt(np.maximum(values[is_plane, 0], 0.0)))
+        open_cells = open_cells[number[parent_of] < 0]
+    all_planes, all_centres = np.concatenate(planes), np.concatenate(centres)
+    all_thickness = np.concatenate(thickness)
+    gone = _doubles(cells, sums, plane_of, all_planes[:, :3], all_thickness, cell)
+    plane_of[np.isin(plane_of, gone)] = -1
+    table = np.full(len(voxels.keys), -1, dtype=np.int32)
+    table[slots] = plane_of
+    return PlaneMap(all_planes, all_centres, all_thickness, cell, voxels.keys, table)
+
+
+def _doubles(
+    cells: NDArray[np.int64],
+    sums: NDArray[np.float64],
+    plane_of: NDArray[np.int32],
+    normals: NDArray[np.float64],
+    thickness: NDArray[np.float64],
+    cell: float,
+) -> NDArray[np.int64]:
+    """The weaker one of two planes that share a surface which lies in a face between voxels, half of its points on each side."""
+    own = np.flatnonzero(plane_of >= 0)
+    axis = np.argmax(np.abs(normals), axis=1)[plane_of[own]]
+    beyond = cells[own].copy()
+    beyond[np.arange(len(own)), axis] += 1
+    packed, keys = pack(cells), pack(beyond)
+    place = np.minimum(np.searchsorted(packed, keys), len(packed) - 1)
+    there = packed[place] == keys
+    a, b = own[there], place[there]
+    p, q = plane_of[a], plane_of[b]
+    both = (q >= 0) & (p != q)
+    a, b, p, q = a[both], b[both], p[both], q[both]
+    mean = sums[:, SUM:SQUARES] / np.maximum(sums[:, COUNT], 1.0)[:, None] + (cells + 0.5) * cell
+    apart = mean[b] - mean[a]
+    across = np.einsum("ni,ni->n", normals[p], apart)
+    aside = np.linalg.norm(apart - across[:, None] * normals[p], axis=1)
+    same = (
+        (np.abs(np.einsum("ni,ni->n", normals[p], normals[q])) > _PARALLEL)
+        & (np.abs(across) < _GATE * (thickness[p] + thickness[q]))
+        & (aside < _BESIDE * cell)
+    )
+    points = np.bincount(plane_of[own], sums[own, COUNT], len(normals))
+    p, q = p[same], q[same]
+    return np.unique(np.where(points[p] < points[q], p, q)).astype(np.int64)
+
+
+def _thickness_of(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) variance across the plane through the points of each voxel, infinite where there are too few."""
+    variance = np.full(len(sums), np.inf)
+    enough = sums[:, COUNT] >= 8.0
+    count = sums[enough, COUNT]
+    variance[enough] = np.linalg.eigvalsh(moments(sums[enough])[1])[:, 0] * count / (count - 3.0)
+    return variance
+
+
+def _mean_by(
+    parent_of: NDArray[np.int64], values: NDArray[np.float64], weights: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """(count,) weighted means of the finite values; infinite where there are none."""
+    finite = np.isfinite(values)
+    total = np.bincount(parent_of[finite], weights[finite] * values[finite], count)
+    weight = np.bincount(parent_of[finite], weights[finite], count)
+    return np.where(weight > 0.0, total / np.maximum(weight, 1.0), np.inf)
+
+
+@kernel(inline=True)
+def _plane_at(x: float, y: float, z: float, cell: float, keys: NDArray[np.int64], plane_of: NDArray[np.int32]) -> int:
+    """The plane of the voxel that a point lies in; −1 for none."""
+    key = key_of(x, y, z, cell)
+    if key == EMPTY:
+        return -1
+    slot = slot_of(key, keys)
+    return int(plane_of[slot]) if keys[slot] == key else -1
+
+
+@kernel
+def _member_of(
+    x: float,
+    y: float,
+    z: float,
+    cell: float,
+    keys: NDArray[np.int64],
+    plane_of: NDArray[np.int32],
+    planes: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    gate: NDArray[np.float64],
+    widest: float,
+) -> int:
+    """The only plane whose voxels hold the foot of a point that is near enough; −1 for none or several."""
+    member, at = -1, (x, y, z)
+    for side in range(4):
+        a, b, c = x, y, z
+        if side > 0:
+            # Over the nearest face of the voxel on one axis, where a plane beyond it may be near enough.
+            inside = at[side - 1] / cell - np.floor(at[side - 1] / cell)
+            if min(inside, 1.0 - inside) * cell > widest:
+                continue
+            step = cell if inside > 0.5 else -cell
+            a, b, c = x + step * (side == 1), y + step * (side == 2), z + step * (side == 3)
+        plane = _plane_at(a, b, c, cell, keys, plane_of)
+        if plane < 0 or plane == member:
+            continue
+        u, q = planes[plane], centres[plane]
+        distance = u[0] * (x - q[0]) + u[1] * (y - q[1]) + u[2] * (z - q[2]) + u[3]
+        if not abs(distance) <= gate[plane]:
+            continue
+        foot = _plane_at(x - distance * u[0], y - distance * u[1], z - distance * u[2], cell, keys, plane_of)
+        if foot == plane:
+            if member >= 0:
+                return -1
+            member = plane
+    return member
+
+
+@kernel
+def _on_planes(
+    points: NDArray[np.float32],
+    R: NDArray[np.float64],
+    p: NDArray[np.float64],
+    cell: float,
+    keys: NDArray[np.int64],
+    plane_of: NDArray[np.int32],
+    planes: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    gate: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    touched: NDArray[np.int64],
+) -> int:
+    count, widest = 0, gate.max() if gate.shape[0] else 0.0
+    for n in range(points.shape[0]):
+        a, b, c = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
+        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
+        plane = _member_of(x, y, z, cell, keys, plane_of, planes, centres, gate, widest)
+        if plane < 0:
+            continue
+        total = sums[plane]
+        if total[0] == 0.0:
+            touched[count] = plane
+            count += 1
+        total[0] += 1.0
+        total[1] += a
+        total[2] += b
+        total[3] += c
+        total[4] += a * a
+        total[5] += a * b
+        total[6] += a * c
+        total[7] += b * b
+        total[8] += b * c
+        total[9] += c * c
+    return count

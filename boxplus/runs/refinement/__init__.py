@@ -1,0 +1,1 @@
+"""`boxplus refine`: a finished run of odometry optimised as a whole."""

@@ -1,0 +1,136 @@
+"""From a recording and what the odometry made of it to what refinement works on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.filtering.nav_state import NavState
+from boxplus.manifolds import quaternion
+from boxplus.residuals.inertial.imu_noise import ImuNoise
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
+from boxplus.systems.refinement.config import RefinementConfig
+from boxplus.systems.refinement.finished_run import FinishedRun
+from boxplus.systems.refinement.point_store import PointStore
+from boxplus.systems.refinement.slices import cut, slices_that_fit
+
+_LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryRows:
+    """What the odometry said of R scans.
+
+    Attributes:
+        time_ns: (R,) int64, ascending; states: R of them; status: (R,) text.
+    """
+
+    time_ns: NDArray[np.int64]
+    states: list[NavState]
+    status: NDArray[np.str_]
+
+
+def collect(
+    events: Iterable[Scan | ImuSamples],
+    rows: OdometryRows,
+    odometry: LioConfig,
+    config: RefinementConfig,
+    store: PointStore | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> FinishedRun:
+    """Go through a recording once more and keep what refinement needs.
+
+    Args:
+        events: of the recording.
+        rows: of the odometry over it, and its settings `odometry`.
+        store: where the points go; None for memory.
+        should_stop: asked between events; True ends the reading, and what was read so far is returned.
+
+    Raises:
+        InputError: the recording is another one than the odometry went over, or too short to refine.
+    """
+    return _Collector(rows, odometry, config, store if store is not None else PointStore()).run(events, should_stop)
+
+
+class _Collector:
+    def __init__(self, rows: OdometryRows, odometry: LioConfig, config: RefinementConfig, store: PointStore) -> None:
+        self._rows, self._config, self._store = rows, config, store
+        self._max_gap_s = odometry.max_imu_gap
+        self._number = {int(t): k for k, t in enumerate(rows.time_ns)}
+        self._noise = ObservedNoise(odometry)
+        self._densities: list[NDArray[np.float64]] = []
+        self._imu: list[ImuSamples] = []
+        self._time_ns: list[int] = []
+        self._T: list[NDArray[np.float64]] = []
+        self._state: list[NDArray[np.float64]] = []
+        self._is_end: list[bool] = []
+        self._next = 0
+
+    def run(self, events: Iterable[Scan | ImuSamples], should_stop: Callable[[], bool]) -> FinishedRun:
+        sequencer = Sequencer()
+        for event in events:
+            if should_stop():
+                break
+            if isinstance(event, Scan):
+                sequencer.add_scan(event)
+            else:
+                sequencer.add_imu(event)
+            self._take(sequencer.frames())
+        else:
+            self._take(sequencer.frames(flush=True))
+        return self._finished()
+
+    def _take(self, frames: list[Frame]) -> None:
+        for frame in frames:
+            self._imu.append(frame.imu)
+            self._densities.append(self._noise.update(frame.imu))
+            number = self._number.get(frame.scan.end_ns)
+            if number is None or number < self._next:
+                continue
+            self._next = number + 1
+            follows = number > 0 and bool(self._time_ns) and self._time_ns[-1] == frame.begin_ns == self._rows.time_ns[number - 1]
+            before = self._rows.states[number - 1] if follows else None
+            if self._time_ns and before is None:
+                raise InputError(
+                    "a run without a break", f"none of the scan before that at {frame.scan.end_ns} ns", "refine its parts"
+                )
+            after = self._rows.states[number]
+            count = slices_that_fit(frame.imu.time_ns, frame.duration_s, self._config.slices)
+            for part in cut(frame, before, after, count, self._max_gap_s, self._config.max_points):
+                self._time_ns.append(part.time_ns)
+                self._T.append(part.T_world_imu)
+                self._state.append(np.concatenate([part.v_world, after.bias_accel, after.bias_gyro]))
+                self._is_end.append(part.is_end)
+                self._store.append(part.p_lidar if self._rows.status[number] != "lost" else part.p_lidar[:0])
+
+    def _finished(self) -> FinishedRun:
+        found, asked = sum(self._is_end), len(self._rows.time_ns)
+        if found < max(_LEAST_FOUND * asked, 2):
+            raise InputError(
+                f"the recording that the odometry went over, with {asked} scans",
+                f"{found} of them",
+                "give the recording with --recording, read with the same options as for the odometry",
+            )
+        last = self._rows.states[self._next - 1]
+        imu = ImuSamples.joined(self._imu)
+        time_ns, first = np.unique(imu.time_ns, return_index=True)
+        gyro, accel, gyro_walk, accel_walk = np.sqrt(np.median(self._densities, axis=0)).tolist()
+        return FinishedRun(
+            time_ns=np.array(self._time_ns, dtype=np.int64),
+            T_world_imu=np.stack(self._T),
+            velocity_bias=np.stack(self._state),
+            gravity_world=last.gravity_world,
+            T_imu_lidar=np.concatenate([quaternion.from_matrix(last.R_imu_lidar[None])[0], last.p_imu_lidar]),
+            points=self._store.arrays(),
+            imu=ImuSamples(time_ns, imu.gyro[first], imu.accel[first]),
+            noise=ImuNoise(gyro=gyro, accel=accel, gyro_walk=gyro_walk, accel_walk=accel_walk),
+            is_end=np.array(self._is_end),
+        )

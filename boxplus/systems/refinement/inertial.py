@@ -1,0 +1,58 @@
+"""Preintegration between poses of a finished run, with gaps of the IMU for what they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from boxplus.systems.refinement.finished_run import FinishedRun
+
+Floats = NDArray[np.float64]
+
+_LONGEST_GAP_S = 0.15
+_GAP_TURN, _GAP_PUSH = 1.0, 5.0  # rad/s and m/s², that nobody has measured
+
+
+def preintegrated(run: FinishedRun, scans: NDArray[np.int64], velocity_bias: Floats) -> Preintegration:
+    """Between successive ones of `scans`, at the biases (N, 9) of the earlier one.
+
+    Over a gap of the samples the covariance is that of not knowing how the body moved.
+    """
+    begin, end = scans[:-1], scans[1:]
+    time_ns, gyro, accel = _covering(run)
+    found = Preintegration.integrate(
+        time_ns,
+        gyro,
+        accel,
+        noise=run.noise,
+        intervals_ns=np.stack([run.time_ns[begin], run.time_ns[end]], axis=1),
+        bias_accel=velocity_bias[begin, 3:6],
+        bias_gyro=velocity_bias[begin, 6:],
+    )
+    unknown = (found.longest_gap_s > _LONGEST_GAP_S) | (found.steps < 2)
+    gap = np.where(unknown, np.minimum(found.longest_gap_s, found.duration_s), 0.0)
+    if not gap.any():
+        return found
+    turn, push = _GAP_TURN * gap, _GAP_PUSH * gap
+    sigma = np.concatenate(
+        [np.repeat((push * found.duration_s)[:, None], 3, 1), np.repeat(turn[:, None], 3, 1), np.repeat(push[:, None], 3, 1)],
+        axis=1,
+    )
+    covariance = found.covariance.copy()
+    covariance[:, np.arange(9), np.arange(9)] += sigma**2
+    return replace(found, covariance=covariance, steps=np.maximum(found.steps, 2))
+
+
+def _covering(run: FinishedRun) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """The samples, the first and last one held as far as the scans reach."""
+    time_ns, gyro, accel = run.imu.time_ns, run.imu.gyro, run.imu.accel
+    if time_ns[0] > run.time_ns[0]:
+        time_ns, gyro, accel = np.insert(time_ns, 0, run.time_ns[0]), np.vstack([gyro[:1], gyro]), np.vstack([accel[:1], accel])
+    if time_ns[-1] < run.time_ns[-1]:
+        time_ns, gyro, accel = (
+            np.append(time_ns, run.time_ns[-1]), np.vstack([gyro, gyro[-1:]]), np.vstack([accel, accel[-1:]]),
+        )  # fmt: skip
+    return time_ns, gyro, accel

@@ -1,0 +1,137 @@
+"""What scans see of planes: points are gone through once for each question, and none is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import quaternion, se3
+from boxplus.maps.plane_voxels.plane_map import PlaneMap, find_planes
+from boxplus.maps.plane_voxels.thickness import Sharpness, sharpness
+from boxplus.maps.plane_voxels.voxel_sums import VoxelSums
+from boxplus.residuals.planes.pose_quadratic import add_plane_forms
+from boxplus.systems.refinement.config import RefinementConfig
+from boxplus.systems.refinement.finished_run import FinishedRun
+from boxplus.systems.refinement.keyframes import Keyframes
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_JUDGED = 5  # of so many points one takes no part and judges the result
+_LEAST_SIGMA = 0.002  # m, of a distance from a plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeClusters:
+    """M clusters of points of keyframes on planes.
+
+    Attributes:
+        keyframe, plane: (M,) whose.
+        clusters: (M, 4, 4) Σ [ℓ; 1][ℓ; 1]ᵀ in the keyframe's LiDAR frame, divided by the variance of a distance.
+    """
+
+    keyframe: Ints
+    plane: Ints
+    clusters: Floats
+
+
+def lidar_poses(T_world_imu: Floats, T_imu_lidar: Floats) -> Floats:
+    """(N, 7) T_world_lidar."""
+    return se3.compose(T_world_imu, np.broadcast_to(T_imu_lidar, T_world_imu.shape))
+
+
+def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: RefinementConfig) -> PlaneMap:
+    """The planes of the map as it is, each through all the points that lie on it."""
+    voxels = VoxelSums(config.smallest_voxel)
+    for k, R, p, points in _placed(run, T_lidar, judging=False):
+        voxels.add(points, R, p, int(keyframes.of_scan[k]))
+    planes = find_planes(voxels, config)
+    world = np.zeros((len(planes), 4, 4))
+    for _, R, p, points in _placed(run, T_lidar, judging=False):
+        found, own = planes.clusters_of(points, R, p)
+        world[found] += _moved(own, R, p - planes.centres[found])
+    return planes.refitted(world)
+
+
+def keyframe_clusters(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap) -> KeyframeClusters:
+    """What every keyframe sees with the scans around it, of the planes that two keyframes see."""
+    information = _information(planes)
+    relative = se3.compose(se3.inverse(T_lidar[keyframes.scan[keyframes.of_scan]]), T_lidar)
+    R_key, p_key = quaternion.to_matrix(relative[:, :4]), relative[:, 4:]
+    total = np.zeros((len(planes), 4, 4))
+    keyframe: list[Ints] = []
+    plane: list[Ints] = []
+    clusters: list[Floats] = []
+
+    def close(number: int) -> None:
+        seen = np.flatnonzero(total[:, 3, 3])
+        keyframe.append(np.full(len(seen), number))
+        plane.append(seen)
+        clusters.append(total[seen] * information[seen, None, None])
+        total[seen] = 0.0
+
+    current = 0
+    for k, R, p, points in _placed(run, T_lidar, judging=False):
+        if keyframes.of_scan[k] != current:
+            close(current)
+            current = int(keyframes.of_scan[k])
+        found, own = planes.clusters_of(points, R, p)
+        total[found] += _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
+    close(current)
+    all_planes = np.concatenate(plane)
+    often = np.bincount(all_planes, minlength=len(planes))[all_planes] >= 2
+    return KeyframeClusters(np.concatenate(keyframe)[often], all_planes[often], np.concatenate(clusters)[often])
+
+
+def scan_forms(
+    run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, is_held: NDArray[np.bool_]
+) -> Floats:
+    """Q (N, 13, 13) of every scan on the planes that are held (P,), for `PoseQuadratic` about the poses' positions."""
+    information = _information(planes)
+    R_L, p_L = quaternion.to_matrix(T_imu_lidar[:4]), T_imu_lidar[4:]
+    forms = np.zeros((len(run), 13, 13))
+    for k, R, p, points in _placed(run, lidar_poses(T_world_imu, T_imu_lidar), judging=False):
+        found, own = planes.clusters_of(points, R, p)
+        seen = is_held[found]
+        found = found[seen]
+        body = _moved(own[seen], R_L, np.broadcast_to(p_L, (len(found), 3))) * information[found, None, None]
+        normals = planes.planes[found, :3]
+        offsets = np.einsum("ki,ki->k", normals, T_world_imu[k, 4:] - planes.centres[found]) + planes.planes[found, 3]
+        add_plane_forms(body, normals, offsets, forms[k])
+    return forms
+
+
+def judge(run: FinishedRun, T_before: Floats, T_after: Floats, planes: PlaneMap) -> tuple[Sharpness, Sharpness]:
+    """The sharpness of the points that took no part, before and after, on planes that were found before; LiDAR poses (N, 7)."""
+    world = np.zeros((2, len(planes), 4, 4))
+    R_after, p_after = quaternion.to_matrix(T_after[:, :4]), T_after[:, 4:]
+    for k, R, p, points in _placed(run, T_before, judging=True):
+        found, own = planes.clusters_of(points, R, p)
+        for side, (turn, shift) in enumerate(((R, p), (R_after[k], p_after[k]))):
+            world[side, found] += _moved(own, turn, shift - planes.centres[found])
+    return sharpness(world[0]), sharpness(world[1])
+
+
+def _placed(run: FinishedRun, T_lidar: Floats, *, judging: bool) -> Iterator[tuple[int, Floats, Floats, NDArray[np.float32]]]:
+    """Scan by scan its number, R, p, and the points that take part, or those that judge."""
+    R = quaternion.to_matrix(T_lidar[:, :4])
+    for k, points in enumerate(run.points):
+        if len(points):
+            chosen = (np.arange(len(points)) % _JUDGED == 0) == judging
+            yield k, R[k], T_lidar[k, 4:], np.ascontiguousarray(points[chosen])
+
+
+def _information(planes: PlaneMap) -> Floats:
+    information: Floats = np.maximum(planes.thickness, _LEAST_SIGMA) ** -2.0
+    return information
+
+
+def _moved(clusters: Floats, R: Floats, p: Floats) -> Floats:
+    """Σ [x; 1][x; 1]ᵀ (k, 4, 4) of points moved to R x + p, with one p (k, 3) for each cluster."""
+    T = np.zeros((len(clusters), 4, 4))
+    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, p, 1.0
+    moved: Floats = T @ clusters @ np.swapaxes(T, 1, 2)
+    return moved

@@ -1,0 +1,126 @@
+"""`boxplus refine` from the folder of a run to its own."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from boxplus.cli import app
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import read_trajectory
+from boxplus.recordings import open_recording
+from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.refinement import refine_run
+from boxplus.runs.refinement.summary import RefineSummary
+from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation.recording_writer import write_recording
+
+LIDAR = SpinningLidar(azimuth_steps=200)
+
+
+def call(*words: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "200"})
+    return result.exit_code, re.sub(r"\s+", " ", result.stdout), re.sub(r"\s+", " ", result.stderr)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The folder of a run, and its recording with the truth beside it."""
+    base = tmp_path_factory.mktemp("refine")
+    bag = write_recording(simulate("walk", duration_s=5.0, lidar=LIDAR), base / "walk", "ros1")
+    with open_recording(bag) as recording:
+        run_odometry(recording, base / "run")
+    return base / "run", bag
+
+
+@pytest.fixture(scope="module")
+def refined(folders: tuple[Path, Path]) -> tuple[Path, str]:
+    run, bag = folders
+    code, out, err = call("refine", run, "--gt", bag.with_suffix(".gt.tum"))
+    assert code == 0, err
+    return run.with_name("run_refined"), out
+
+
+def test_folder_holds_everything(folders: tuple[Path, Path], refined: tuple[Path, str]) -> None:
+    folder, out = refined
+    summary = RefineSummary.model_validate_json((folder / "run.json").read_bytes())
+    before, after = read_trajectory(folders[0] / "trajectory.csv"), read_trajectory(folder / "trajectory.csv")
+    np.testing.assert_array_equal(after.times, before.times)
+    assert after.status == before.status and after.covariance is not None
+    assert summary.state == "finished" and summary.scans == len(after)
+    shift = np.linalg.norm(after.p - before.p, axis=1)
+    if summary.accepted:
+        assert shift.max() == pytest.approx(summary.largest_shift_m, abs=1e-6) and summary.largest_shift_m > 0.0
+        assert len(read_ply(folder / "map.ply").points) > 1000
+        assert "accepted: thickness" in out
+    else:
+        assert shift.max() < 1e-8 and not (folder / "map.ply").exists()
+        assert "NOT accepted" in out
+    assert summary.ate_before_m is not None and 0.0 < summary.ate_before_m < 0.1
+    assert "Before and after" in (folder / "report.html").read_text(encoding="utf-8")
+    assert not (folder / "points.spool").exists()
+
+
+def test_a_run_that_was_not_accepted_keeps_its_trajectory(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refine_run.Refinement, "refusal", property(lambda self: "because"))
+    code, out, err = call("refine", folders[0], "-o", tmp_path / "out", "--no-report", "--set", "refinement.rounds=1")
+    assert code == 0, err
+    assert "NOT accepted, the trajectory is that of the run: because" in out
+    summary = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert summary["accepted"] is False and summary["refusal"] == "because"
+    before, after = read_trajectory(folders[0] / "trajectory.csv"), read_trajectory(tmp_path / "out" / "trajectory.csv")
+    np.testing.assert_allclose(after.p, before.p, atol=1e-8)
+    assert before.covariance is not None and after.covariance is not None
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-6)
+    assert not (tmp_path / "out" / "map.ply").exists()
+
+
+def test_what_is_no_run_or_another_recording_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    code, _, err = call("refine", tmp_path / "nothing", "-o", tmp_path / "out")
+    assert code == 2 and "run.json" in err
+    code, _, err = call("refine", folders[0], "-o", folders[0] / "inside")
+    assert code == 2 and "another folder than that of the run" in err
+    code, _, err = call("refine", folders[0], "-o", tmp_path / "gone", "--recording", tmp_path / "gone.bag")
+    assert code in (1, 2) and "gone.bag" in err
+    other = write_recording(simulate("walk", seed=3, duration_s=2.0, lidar=LIDAR), tmp_path / "other", "ros1")
+    code, _, err = call("refine", folders[0], "-o", tmp_path / "wrong", "--recording", other)
+    assert code == 2 and "the recording that the odometry went over" in err
+    assert json.loads((tmp_path / "wrong" / "run.json").read_text())["state"] == "failed"
+
+
+def test_runs_that_cannot_be_believed_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    facts = json.loads((folders[0] / "run.json").read_text())
+    changes = {
+        "the clocks differ": {"contradiction": "the clocks differ"},
+        "come to its end": {"state": "failed"},
+        "mounting of the LiDAR is known": {"extrinsic": facts["extrinsic"] | {"source": "identity"}},
+    }
+    for words, change in changes.items():
+        copy = tmp_path / words.replace(" ", "_")
+        shutil.copytree(folders[0], copy)
+        (copy / "run.json").write_text(json.dumps(facts | change))
+        code, _, err = call("refine", copy)
+        assert code == 2 and words in err
+
+
+def test_results_are_replaced_on_demand_only(folders: tuple[Path, Path], refined: tuple[Path, str]) -> None:
+    code, _, err = call("refine", folders[0])
+    assert code == 2 and "the results of an earlier run" in err
+
+
+def test_stopping_leaves_no_half_results(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    from boxplus.runs.refinement.folder import claim_refine_folder
+
+    with claim_refine_folder(tmp_path / "out", folders[0]) as claimed:
+        run = refine_run.read_odometry_run(folders[0])
+        result = refine_run.refine_run(run, claimed, should_stop=lambda: True)
+    assert result.summary.state == "interrupted"
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.json", "config.yaml"}

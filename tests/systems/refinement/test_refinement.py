@@ -1,0 +1,150 @@
+"""Refinement of a simulated run: nearer to the truth, as sure as it says, and refused where the map does not become sharper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.evaluation.nees import nees
+from boxplus.manifolds import quaternion, se3, so3
+from boxplus.maps.plane_voxels.thickness import Sharpness
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.simulation import Simulation, SpinningLidar, make_scenario
+from boxplus.simulation.motions import manoeuvres
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.refinement.collecting import OdometryRows, collect
+from boxplus.systems.refinement.config import RefinementConfig
+from boxplus.systems.refinement.finished_run import FinishedRun
+from boxplus.systems.refinement.keyframes import choose_keyframes
+from boxplus.systems.refinement.refinement import Refinement, refine
+from tests.systems.slam.drives import ate
+
+LIDAR = SpinningLidar(channels=16, azimuth_steps=300, vertical_fov_deg=(-25.0, 25.0))
+
+
+@dataclass(frozen=True)
+class Case:
+    events: list[Scan | ImuSamples]
+    rows: OdometryRows
+    config: LioConfig
+    T_true: NDArray[np.float64]  # of the rows
+    run: FinishedRun
+    refined: Refinement
+
+    def error(self, T: NDArray[np.float64]) -> float:
+        return ate(T[self.run.is_end][:, 4:], self.T_true[:, 4:])
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scenario = make_scenario("spin", seed=4)
+    trajectory = manoeuvres.handheld(9.0, (-2.5, -1.8, 1.1), (2.5, 1.8, 2.4), 0.8, 0.8, 1.5, seed=5)
+    simulation = Simulation(replace(scenario, trajectory=trajectory, lidar=LIDAR), seed=4, duration_s=8.0)
+    config = LioConfig(T_imu_lidar=tuple(map(tuple, simulation.T_imu_lidar.tolist())))  # type: ignore[call-arg]
+    odometry = LidarInertialOdometry(config)
+    events = list(simulation)
+    estimates = [
+        e for event in events for e in (odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event))
+    ]
+    estimates += odometry.flush()
+    times = np.array([e.time_ns for e in estimates])
+    rows = OdometryRows(times, [e.state for e in estimates], np.array([e.status for e in estimates]))
+    motion = simulation.ground_truth(times)
+    T_true = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
+    refinement = RefinementConfig()  # type: ignore[call-arg]
+    run = collect(events, rows, config, refinement)
+    return Case(events, rows, config, T_true, run, refine(run, refinement))
+
+
+def test_scans_are_cut_into_slices_that_keep_every_point(case: Case) -> None:
+    run = case.run
+    assert run.is_end.sum() == len(case.rows.time_ns)
+    np.testing.assert_array_equal(run.time_ns[run.is_end], case.rows.time_ns)
+    assert 3 * len(case.rows.time_ns) < len(run) <= 4 * len(case.rows.time_ns)
+    assert (np.diff(run.time_ns) > 0).all()
+    ends = np.flatnonzero(run.is_end)
+    expected = np.stack([np.append(quaternion.from_matrix(s.R_world_imu[None])[0], s.p_world_imu) for s in case.rows.states])
+    np.testing.assert_allclose(np.abs(run.T_world_imu[ends]), np.abs(expected), atol=1e-12)
+    scans = [event for event in case.events if isinstance(event, Scan)]
+    assert sum(map(len, run.points)) == sum(len(scan) for scan in scans if scan.end_ns in set(case.rows.time_ns.tolist()))
+
+
+def test_slices_lie_on_the_way_between_the_scans(case: Case) -> None:
+    """Between two scans the IMU carries the pose: no slice jumps."""
+    run = case.run
+    step = np.linalg.norm(np.diff(run.T_world_imu[:, 4:], axis=0), axis=1) / (np.diff(run.time_ns) * 1e-9)
+    assert step.max() < 1.3 * np.linalg.norm(run.velocity_bias[:, :3], axis=1).max() + 0.1
+
+
+def test_it_comes_nearer_to_the_truth_and_says_so(case: Case) -> None:
+    refined = case.refined
+    before, after = case.error(case.run.T_world_imu), case.error(refined.after.T_world_imu)
+    assert after < before
+    assert refined.refusal is None
+    assert refined.sharpness[1].thickness < refined.sharpness[0].thickness
+    np.testing.assert_allclose(refined.after.T_world_imu[0], case.run.T_world_imu[0], atol=1e-9)
+
+
+def test_covariance_is_that_of_the_error(case: Case) -> None:
+    """Relative to the first pose. Errors of one run are one draw, so the band is wide: within four times of what was said."""
+    ends = np.flatnonzero(case.run.is_end)
+    T, covariance = case.refined.after.T_world_imu[ends], case.refined.pose_covariance[ends]
+    truth = se3.compose(np.broadcast_to(se3.compose(T[0], se3.inverse(case.T_true[0])), T.shape), case.T_true)
+    turn = so3.log(np.swapaxes(quaternion.to_matrix(truth[:, :4]), 1, 2) @ quaternion.to_matrix(T[:, :4]))
+    found = nees(np.hstack([turn, T[:, 4:] - truth[:, 4:]])[1:], covariance[1:]).mean() / 6.0
+    assert 0.05 < found < 4.0
+
+
+def test_threads_do_not_change_a_bit(case: Case) -> None:
+    settings = RefinementConfig(rounds=1, threads=2)  # type: ignore[call-arg]
+    one, two = (refine(case.run, settings.model_copy(update={"threads": n})) for n in (1, 2))
+    np.testing.assert_array_equal(one.after.T_world_imu, two.after.T_world_imu)
+
+
+def test_what_does_not_sharpen_the_map_is_refused(case: Case) -> None:
+    sharp, blurred = Sharpness(0.010, 1.0, 1000, 9), Sharpness(0.011, 1.0, 1000, 9)
+    assert replace(case.refined, sharpness=(blurred, sharp)).refusal is None
+    for pair in ((sharp, blurred), (sharp, sharp)):
+        refusal = replace(case.refined, sharpness=pair).refusal
+        assert refusal == "the points that took no part lie farther from their planes than before"
+    nothing = Sharpness(float("nan"), float("nan"), 0, 0)
+    assert "no plane" in str(replace(case.refined, sharpness=(nothing, nothing)).refusal)
+
+
+def test_a_run_at_the_truth_is_left_there(case: Case) -> None:
+    """Refining does not drift away, however often planes are found anew."""
+    ends = np.flatnonzero(case.run.is_end)
+    moved = refine(case.run, RefinementConfig(rounds=6)).after.T_world_imu[ends]  # type: ignore[call-arg]
+    assert ate(moved[:, 4:], case.refined.after.T_world_imu[ends][:, 4:]) < 0.5e-3
+
+
+def test_another_recording_is_refused(case: Case) -> None:
+    later = OdometryRows(case.rows.time_ns + 7, case.rows.states, case.rows.status)
+    with pytest.raises(InputError, match=r"expected the recording that the odometry went over, with \d+ scans – got 0 of them"):
+        collect(case.events, later, case.config, RefinementConfig())  # type: ignore[call-arg]
+
+
+def test_without_planes_nothing_is_refined(case: Case) -> None:
+    blind = replace(case.run, points=[points[:3] for points in case.run.points])
+    with pytest.raises(InputError, match=r"expected 6 planes at least that two keyframes see – got \d"):
+        refine(blind)
+
+
+def test_keyframes_begin_after_a_way_a_turn_or_a_time() -> None:
+    time_ns = np.arange(100) * 100_000_000
+    still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (100, 1))
+    config = RefinementConfig()  # type: ignore[call-arg]
+    assert len(choose_keyframes(time_ns, still, config)) == 10  # 11 scans each, the last with what is left
+    walking, turning = still.copy(), still.copy()
+    walking[:, 4] = 0.2 * np.arange(100)
+    turning[:, :4] = quaternion.from_matrix(so3.exp(np.deg2rad(6.0) * np.arange(100)[:, None] * [0.0, 0.0, 1.0]))
+    for poses, length in ((walking, 4), (turning, 2)):
+        keyframes = choose_keyframes(time_ns, poses, config)
+        assert np.bincount(keyframes.of_scan)[:-1].tolist() == [length] * (len(keyframes) - 1)
+        assert keyframes.scan[0] == 0 and (keyframes.of_scan[keyframes.scan] == np.arange(len(keyframes))).all()
