@@ -21,6 +21,7 @@ from boxplus.runs.config import MapConfig
 from boxplus.simulation import simulate, write_recording
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.slam.config import RegistrationConfig, SlamConfig
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from tests.small_problems import write_small_files
@@ -148,6 +149,7 @@ def test_every_page_is_in_the_index() -> None:
         ("slam", DescriptorConfig),
         ("slam", RegistrationConfig),
         ("gnss", GeoreferenceConfig),
+        ("localization", LocalizationConfig),
     ],
 )
 def test_configuration_page_names_every_setting_and_its_default(name_of_page: str, model: type[BaseModel]) -> None:

@@ -17,6 +17,7 @@ _COMMANDS = {
     "lio": ("boxplus.cli.lio:lio", "Turn a recording into a trajectory, a map and a report."),
     "slam": ("boxplus.cli.slam:slam", "The same with loops closed: corrected trajectory and map beside the odometry's own."),
     "refine": ("boxplus.cli.refine:refine_command", "Refine a finished run of lio: all poses, planes and IMU samples at once."),
+    "localize": ("boxplus.cli.localize:localize", "Find where a recording is in a saved map, and follow it there."),
     "vio": ("boxplus.cli.vio:vio", "Turn a recording of cameras and an IMU into a trajectory, landmarks and a report."),
     "vo": ("boxplus.cli.vo:vo", "Turn a recording of an RGB-D or a stereo camera into a trajectory and a report."),
     "ba": ("boxplus.cli.ba:ba", "Adjust cameras and points of a BAL file or a COLMAP model."),

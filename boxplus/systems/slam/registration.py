@@ -31,6 +31,7 @@ _NEIGHBOURS = 8  # a plane is fitted to
 _CHUNK = 1024
 _STAGES = ((2.0, 4, 1500), (1.2, 6, 3000), (0.8, 15, 8000))  # largest distance of a plane's points [m], steps, points
 _STEP = 2e-4  # m, at the points: shorter ones are the end
+_SHORT = 2e-3  # m, the same where a scan is followed
 _FEWEST = 60  # points on planes
 _SCALE = 1.4826  # from the median of |e| to a standard deviation
 _LEAST_SCALE = 0.01  # m, of the residuals
@@ -113,6 +114,41 @@ def register(
         _share_near(target.points, source, se3.inverse(T), config.near),
     )
     return Registration(T, covariance, information, weak, found.lever, overlap, found.scale, len(found.e))
+
+
+def refine(
+    points: NDArray[np.float32],
+    target: Surface,
+    T_start: Floats,
+    config: RegistrationConfig,
+    *,
+    distance: float,
+    steps: int,
+) -> Registration | None:
+    """Lay few points, near where they belong already, over a target; None where too few find a plane.
+
+    What `register` does in its last stage, for a scan that is followed from one to the next. Overlap is not looked at: NaN.
+
+    Args:
+        points: (N, 3) float32 of the source [m].
+        distance: of a plane's points, at most [m].
+        steps: Gauss-Newton steps.
+    """
+    T = np.array(T_start, dtype=np.float64)
+    found = None
+    for _ in range(steps):
+        found = _Matched.of(points, target, T, distance, config)
+        if found is None:
+            return None
+        step, length = found.step(config.weak_information)
+        T = se3.compose(T, se3.exp(step))
+        if length < _SHORT:
+            break
+    if found is None:
+        return None
+    covariance, information, weak = found.covariance(config, np.zeros((6, 6)))
+    unasked = float("nan")
+    return Registration(T, covariance, information, weak, found.lever, (unasked, unasked), found.scale, len(found.e))
 
 
 def surface_distance(source: Surface, target: Surface, T_target_source: Floats, config: RegistrationConfig) -> float | None:

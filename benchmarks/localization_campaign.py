@@ -1,0 +1,255 @@
+"""Localisation in a saved map over simulated days: starts found within 10 s, false starts, error in the map, kidnappings.
+
+    python benchmarks/localization_campaign.py --worlds city,forest,hall --starts 0:20:2
+    python benchmarks/localization_campaign.py --worlds corridors,car_park,storeys --starts 1:9:2
+    python benchmarks/localization_campaign.py --worlds city --wrong --starts 1:21:2
+
+A map is made on one drive. Another day a fifth of what is smaller than a house has moved, another sensor (half the rings, other
+angles and height) starts anywhere with another world of its odometry, which drifts. A start is false where any pose that is given
+out is off by more than a metre or 5°. `--wrong` looks for each start in the map of another world of the same kind. Settings were
+chosen on even starts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import se3
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.tiles.layout import split_by_tile
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+from boxplus.runs.saved_map.places import along
+from boxplus.runs.saved_map.saved_map import SavedMap
+from boxplus.runs.saved_map.tiled_points import TiledPoints
+from boxplus.simulation.drifting_drive import DriftConfig, DriftingDrive, simulate_drifting_drive
+from boxplus.simulation.worlds import raycast
+from boxplus.simulation.worlds.alike import car_park, parallel_corridors, storeys
+from boxplus.simulation.worlds.sites import forest, warehouse
+from boxplus.simulation.worlds.world import World
+from boxplus.simulation.worlds.worlds import city, hall
+from boxplus.systems.localization.localizer import Localizer, Search
+
+Floats = NDArray[np.float64]
+Route = list[list[float]]
+FALSE_M, FALSE_RAD, WITHIN_S, MOVED, HOUSE_M = 1.0, np.deg2rad(5.0), 10.0, 0.2, 4.0
+OTHER_SENSOR = {"channels": 16, "vertical_fov_deg": (-15.0, 15.0), "height": 1.3, "range_sigma": 0.03}
+INDOORS = {"speed": 1.5, "step_m": 0.3, "corner_radius": 0.8, "max_range": 40.0, "vertical_fov_deg": (-25.0, 25.0), "height": 1.6}
+OUTDOORS = {"speed": 8.0, "step_m": 1.0}
+
+
+@dataclass(frozen=True)
+class Site:
+    """A kind of world: how to build it from a seed, the drive its map is made on, a random drive of another day."""
+
+    world: Callable[[int], World]
+    route: Route
+    start: Callable[[np.random.Generator], Route]
+    sensor: dict[str, object]
+
+
+def _city_start(random: np.random.Generator) -> Route:
+    street, x, side = float(random.integers(0, 3)) * 60.0, random.uniform(8.0, 112.0), random.uniform(-1.5, 1.5)
+    ahead = x + 90.0 * (1.0 if x < 60.0 else -1.0)
+    route = [[x, street + side], [ahead, street + side]]
+    return route if random.uniform() < 0.5 else [[b, a] for a, b in route]
+
+
+def _line(low: Floats, high: Floats, length: float) -> Callable[[np.random.Generator], Route]:
+    """Straight ahead from anywhere in a rectangle, along x, towards its middle."""
+
+    def start(random: np.random.Generator) -> Route:
+        x, y = random.uniform(low, high)
+        return [[x, y], [x + length * (1.0 if x < 0.5 * (low[0] + high[0]) else -1.0), y]]
+
+    return start
+
+
+def _corridor_start(random: np.random.Generator) -> Route:
+    x, y = random.uniform(-20.0, 20.0), 12.0 * float(random.integers(0, 4))
+    return [[x, y], [x + (15.0 if random.uniform() < 0.5 else -15.0), y]]
+
+
+def _storey_start(random: np.random.Generator) -> Route:
+    x, z, side = random.uniform(-10.0, 10.0), 4.0 * float(random.integers(0, 3)), random.choice([-10.5, 10.5])
+    return [[x, side, z], [16.5 if x < 0 else -16.5, side, z]]
+
+
+def _loop(x: float, y: float, z: float = 0.0) -> Route:
+    return [[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z], [-x, -y + 2.0, z]]
+
+
+SITES = {
+    "city": Site(
+        lambda seed: city(2, 2, seed=seed),
+        [
+            [0, 0],
+            [120, 0],
+            [120, 60],
+            [0, 60],
+            [0, 120],
+            [120, 120],
+            [120, 60],
+            [60, 60],
+            [60, 120],
+            [0, 120],
+            [0, 0],
+            [60, 0],
+            [60, 60],
+        ],
+        _city_start,
+        OUTDOORS,
+    ),
+    "forest": Site(
+        lambda seed: forest(120.0, seed=seed),
+        [[-50, 0], [50, 0]],
+        _line(np.array([-45.0, -1.0]), np.array([45.0, 1.0]), 40.0),
+        {**INDOORS, "max_range": 50.0},
+    ),
+    "hall": Site(
+        lambda seed: hall(seed=seed), _loop(22.0, 7.0), _line(np.array([-20.0, -6.0]), np.array([20.0, 6.0]), 18.0), INDOORS
+    ),
+    "warehouse": Site(
+        lambda seed: warehouse(seed=seed),
+        [[-18, 0], [18, 0]],
+        _line(np.array([-16.0, -0.8]), np.array([16.0, 0.8]), 15.0),
+        INDOORS,
+    ),
+    "corridors": Site(
+        lambda seed: parallel_corridors(),
+        [[-31.5, 0], [31.5, 0], [31.5, 12], [-31.5, 12], [-31.5, 24], [31.5, 24], [31.5, 36], [-31.5, 36], [-31.5, 0]],
+        _corridor_start,
+        INDOORS,
+    ),
+    "car_park": Site(
+        lambda seed: car_park(),
+        [[x, 8.0 * j] for j in range(1, 6) for x in ((8.0, 72.0) if j % 2 else (72.0, 8.0))],
+        _line(np.array([24.0, 8.0]), np.array([56.0, 40.0]), 15.0),
+        {**INDOORS, "corner_radius": 3.0},
+    ),
+    "storeys": Site(
+        lambda seed: storeys(seed=seed), [c for k in range(3) for c in _loop(16.5, 10.5, 4.0 * k)], _storey_start, INDOORS
+    ),
+}
+
+
+def another_day(world: World, seed: int) -> World:
+    """A fifth of the solids smaller than a house, elsewhere."""
+    random = np.random.Generator(np.random.PCG64([seed, 900]))
+    solids = world.solids.copy()
+    chosen = (solids[:, raycast.ENCLOSING] < HOUSE_M) & (random.uniform(size=len(solids)) < MOVED)
+    angle, way = random.uniform(0.0, 2.0 * np.pi, chosen.sum()), random.uniform(2.0, 8.0, chosen.sum())
+    solids[chosen, raycast.CENTRE] += way * np.cos(angle)
+    solids[chosen, raycast.CENTRE + 1] += way * np.sin(angle)
+    return World(list(solids))
+
+
+def map_of(drive: DriftingDrive, config: LocalMapConfig) -> SavedMap:
+    """The map that a perfect run over a drive leaves."""
+    world = [se3.act(T, scan.astype(np.float64)) for T, scan in zip(drive.T_world_body, drive.scans, strict=True)]
+    points = np.concatenate(world).astype(np.float32)
+    tiles = dict(split_by_tile(points[first_per_voxel(points, config.voxel)], 32.0))
+    tiled = TiledPoints(tiles, 32.0, lambda index: tiles[index])
+    trajectory = Trajectory(drive.time_ns, drive.T_world_body[:, 4:], drive.T_world_body[:, :4])
+    return SavedMap(Path("simulated"), "simulated", along(trajectory, tiled.near, config), trajectory, config.voxel, [], tiled)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What came of one start: found when, worst and rms error of the poses given out, seconds of computation by kind."""
+
+    found_s: float
+    worst_m: float
+    worst_rad: float
+    rms_m: float
+    search_ms: float
+    track_ms: float
+    text: str
+
+    @property
+    def is_false(self) -> bool:
+        return self.worst_m > FALSE_M or self.worst_rad > FALSE_RAD
+
+
+def localize(saved: SavedMap, drive: DriftingDrive, seed: int) -> Start:
+    """Push a drive in a world of its own."""
+    random = np.random.Generator(np.random.PCG64([seed, 901]))
+    yaw = random.uniform(-np.pi, np.pi)
+    T_own = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), *random.uniform(-50.0, 50.0, 3)])
+    localizer, found_s, errors, took = Localizer(saved), np.nan, [], {True: [], False: []}
+    verdicts: list[str] = []
+    for time_ns, T, truth, scan in zip(drive.time_ns.tolist(), drive.T_odo_body, drive.T_world_body, drive.scans, strict=True):
+        began = time.perf_counter()
+        found = localizer.push(time_ns, se3.compose(T_own, T), scan)
+        took[found.search is not None].append(time.perf_counter() - began)
+        if found.search is not None:
+            verdicts.append(_verdict(time_ns * 1e-9, found.search))
+        if found.T_map_body is not None:
+            found_s = min(found_s, time_ns * 1e-9) if np.isfinite(found_s) else time_ns * 1e-9
+            xi = se3.log(se3.compose(se3.inverse(truth), found.T_map_body))
+            errors.append([np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])])
+    e = np.array(errors).reshape(-1, 2)
+    return Start(
+        found_s,
+        e[:, 1].max(initial=0.0),
+        e[:, 0].max(initial=0.0),
+        float(np.sqrt((e[:, 1] ** 2).mean())) if len(e) else np.nan,
+        1e3 * float(np.mean(took[True])) if took[True] else np.nan,
+        1e3 * float(np.median(took[False])) if took[False] else np.nan,
+        "; ".join([*verdicts, localizer.lost_because or ""]),
+    )
+
+
+def _verdict(seconds: float, search: Search) -> str:
+    fits = " ".join(f"{c.fit:.2f}{'' if c.refusal is None else 'x'}" for c in search.candidates[:4])
+    return f"{seconds:.1f} s: {search.verdict or 'found'} [{fits}]"
+
+
+def run(name: str, starts: range, wrong: bool, verbose: bool) -> str:
+    """All starts in one kind of world; a world has five of them."""
+    site, results, saved, built = SITES[name], [], None, -1
+    for start in starts:
+        seed = start // 5
+        if seed != built:
+            world = site.world(seed)
+            saved = map_of(
+                simulate_drifting_drive(world, site.route, DriftConfig(**site.sensor), seed), LocalMapConfig(max_range=50.0)
+            )
+            built = seed
+        random = np.random.Generator(np.random.PCG64([start, 902]))
+        there = another_day(site.world(seed + 100) if wrong else world, start)
+        drive = simulate_drifting_drive(there, site.start(random), DriftConfig(**{**site.sensor, **OTHER_SENSOR}), start)
+        result = localize(saved, drive, start)
+        results.append(result)
+        if verbose:
+            print(f"  {name} {start}: found {result.found_s:.1f} s, worst {result.worst_m:.2f} m, rms {result.rms_m:.3f} m, "
+                  f"search {result.search_ms:.0f} ms, scan {result.track_ms:.1f} ms, {result.text}", flush=True)  # fmt: skip
+    found = [r for r in results if r.found_s <= WITHIN_S]
+    right = [r.rms_m for r in found if not r.is_false]
+    return (
+        f"{name:10s} {'wrong map' if wrong else ''} {len(results)} starts, {len(found)} found within {WITHIN_S:g} s, "
+        f"{sum(r.is_false for r in results)} false, rms in the map {np.mean(right) if right else np.nan:.3f} m"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", default="city,forest,hall,warehouse,corridors,car_park,storeys", help="comma-separated")
+    parser.add_argument("--starts", default="1:21:2", help="first:last:step, the last one excluded")
+    parser.add_argument("--wrong", action="store_true", help="look in the map of another world")
+    parser.add_argument("--verbose", action="store_true", help="a line for each start")
+    options = parser.parse_args()
+    starts = range(*(int(text) for text in options.starts.split(":")))
+    for name in options.worlds.split(","):
+        print(run(name, starts, options.wrong, options.verbose), flush=True)
+
+
+if __name__ == "__main__":
+    main()

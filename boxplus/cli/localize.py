@@ -1,0 +1,108 @@
+"""`boxplus localize`: a recording and a saved map in, poses in the map out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.options import takes_recording_options
+from boxplus.recordings.options import RecordingOptions
+
+if TYPE_CHECKING:
+    from boxplus.runs.localization.localization_run import LocalizationResult
+
+
+@takes_recording_options
+def localize(
+    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    saved: Annotated[
+        Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio' or 'boxplus slam', map folder, PLY or PCD file.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_localized here.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="One setting, e.g. localization.least_fit=0.6; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    T_imu_lidar: Annotated[
+        str | None, typer.Option("--T-imu-lidar", help="Pose of the LiDAR in the IMU frame, as for 'boxplus lio'.")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+    ] = None,
+    keep_map: Annotated[bool, typer.Option("--keep-map", help="Write the odometry's own map too.")] = False,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    *,
+    options: RecordingOptions,
+) -> None:
+    """Find out where a recording was made in a map, and follow it there.
+
+    The odometry of 'boxplus lio', and beside it the search for its place in the map. Poses in the map's frame are written from
+    where it is found on, and never while it is searched for. Exit codes: as 'boxplus lio'; 3 also where no place was found.
+    """
+    from boxplus.runs.localization.config import load_localization_config
+    from boxplus.runs.transform import parse_transform
+
+    odometry: dict[str, object] = {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)}
+    if T_imu_lidar is not None:
+        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
+    overrides: dict[str, dict[str, object]] = {
+        "recording": options.model_dump(exclude_defaults=True),
+        "odometry": odometry,
+        "map": {"save": keep_map},
+    }
+    run_config = load_localization_config(config, settings or (), overrides)
+    folder = output or Path(f"{recording.resolve().stem}_localized")
+
+    from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.recordings import open_recording
+    from boxplus.runs.localization.folder import claim_localization_folder
+    from boxplus.runs.localization.localization_run import run_localization
+    from boxplus.runs.saved_map.saved_map import open_saved_map
+
+    terminal = RunTerminal()
+    with (
+        stop_on_interrupt(terminal.announce_stop) as should_stop,
+        open_recording(recording, run_config.recording) as opened,
+        claim_localization_folder(folder, overwrite=overwrite) as claimed,
+    ):
+        with terminal.status("opening the map"):
+            opened_map = open_saved_map(saved, run_config.local_maps)
+        info = opened.info
+        terminal.print_evidence(
+            info.path, f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages", info.evidence
+        )
+        with terminal.progress() as progress:
+            result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
+        if not no_report:
+            from boxplus.report.localization_page import write_localization_report
+
+            with terminal.status("drawing the report"):
+                write_localization_report(folder, result)
+    files = ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
+    terminal.print_results(result.odometry, _rows(result), folder, files)
+    if result.summary.state == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if result.summary.contradiction is not None or result.summary.found_after_s is None:
+        raise typer.Exit(EXIT_UNTRUSTED)
+
+
+def _rows(result: LocalizationResult) -> list[tuple[str, str]]:
+    """What the terminal shows of the place."""
+    summary = result.summary
+    counts = ", ".join(f"{count} {name}" for name, count in sorted(summary.status.items()))
+    found = "never found" if summary.found_after_s is None else f"found after {summary.found_after_s:.1f} s"
+    rows = [("map", f"{summary.map}, {summary.places} places"), ("in the map", f"{found}; scans: {counts}")]
+    rows += [("map", text) for text in summary.map_report]
+    rows += [("lost", text) for text in summary.losses]
+    rows += [("warning", text) for text in summary.warnings]
+    return rows + [("candidate", text) for text in summary.best_candidates]

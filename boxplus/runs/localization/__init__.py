@@ -1,0 +1,1 @@
+"""`boxplus localize`: odometry over a recording, and where it is in a saved map."""

@@ -1,0 +1,171 @@
+"""A pose at which a query may lie in the map, and everything that was asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import se3
+from boxplus.maps.local_maps.visibility import directions, nearest_ranges
+from boxplus.systems.localization.config import LocalizationConfig
+from boxplus.systems.localization.global_search import Guess, same_pose
+from boxplus.systems.localization.standing import standing
+from boxplus.systems.slam.registration import Registration, Surface, register
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+_NEAR = 0.3  # m, between a point that stands and the map's
+_ASKED = 4000  # points that stand, for the fit
+_SPLAT = 1.5  # voxels, between the points of a surface that has one a voxel
+_SEEN = 0.75  # of the range that was measured; what the map has nearer than this, and by a metre, is seen through
+_FEWEST_DIRECTIONS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A place in the map, registered.
+
+    Attributes:
+        place: number of the local map it was found over.
+        T_map_query: (7,) after registration; covariance (6, 6) on the right of it [rad, m].
+        agreement: of both from above, see `Guess`.
+        fit: share of the query's points that stand within 0.3 m of points of the map.
+        overlap: share of all points within 0.5 m.
+        rms: spread of distances to the map's planes [m].
+        measured: how many of the six directions the surfaces determine.
+        seen_through: share of directions in which the map has something nearer than what was measured.
+        refusal: why it is not believed, in a sentence; None where nothing speaks against it.
+    """
+
+    place: int
+    T_map_query: Floats
+    covariance: Floats
+    agreement: float
+    fit: float
+    overlap: float
+    rms: float
+    measured: int
+    seen_through: float
+    refusal: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Query:
+    """What is looked for: a local map, and the newest scan of it.
+
+    Attributes:
+        points: (N, 3), frame level; stands: those of them that stand.
+        scan: (M, 3) of one scan, in the frame of the query; viewpoint: (3,) where it was taken.
+    """
+
+    points: Points
+    stands: Points
+    surface: Surface
+    scan: Points
+    viewpoint: Floats
+
+    @classmethod
+    def of(cls, points: Points, scan: Points, viewpoint: Floats) -> Query:
+        stands = points[standing(points)]
+        spread = np.ascontiguousarray(stands[:: max(len(stands) // _ASKED, 1)])
+        return cls(points, spread, Surface.of(points), scan, viewpoint)
+
+
+def examine(guess: Guess, query: Query, surroundings: Surface, voxel: float, config: LocalizationConfig) -> Candidate:
+    """Register a query to the map from a guess, and ask what speaks against it.
+
+    Args:
+        surroundings: the map around the guess, map frame; voxel: one point per voxel of this edge [m].
+    """
+    found = register(query.surface, surroundings, guess.T_map_query, config.registration) if len(surroundings.points) else None
+    if found is None:
+        none = float("nan")
+        refusal = "too few points on planes of the map"
+        return Candidate(guess.place, guess.T_map_query, np.eye(6), guess.agreement, 0.0, 0.0, none, 0, none, refusal)
+    T = found.T_target_source
+    fit = _share_near(query.stands, surroundings, T)
+    through = seen_through(query, surroundings.points, T, voxel)
+    measured = 6 - len(found.weak)
+    candidate = Candidate(
+        guess.place, T, found.covariance, guess.agreement, fit, found.overlap[0], found.rms, measured, through, None
+    )
+    return replace(candidate, refusal=_refusal(candidate, found, config))
+
+
+def _refusal(candidate: Candidate, found: Registration, config: LocalizationConfig) -> str | None:
+    if candidate.measured < 6:
+        return f"the surfaces determine {candidate.measured} of 6 directions only"
+    if candidate.fit < config.least_fit:
+        return f"{100 * candidate.fit:.0f} % of what stands is in the map, {100 * config.least_fit:.0f} % asked for"
+    if candidate.overlap < config.least_overlap:
+        return f"{100 * candidate.overlap:.0f} % of the points are in the map, {100 * config.least_overlap:.0f} % asked for"
+    if candidate.seen_through > config.most_seen_through:
+        return f"in {100 * candidate.seen_through:.0f} % of directions the map has something nearer than what is seen"
+    if found.rms > config.largest_rms:
+        return f"surfaces lie {100 * found.rms:.1f} cm apart, {100 * config.largest_rms:.0f} cm at most"
+    return None
+
+
+def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Candidate | None, str, bool]:
+    """The best candidate that nothing speaks against, why it is not believed yet (empty where it is), and whether at once.
+
+    Every other pose is its rival, also one that was refused: a second place that fits nearly as well means that the map is alike
+    in two places, and a pose nearby that does that the surfaces repeat.
+    """
+    ranked = sorted(candidates, key=lambda candidate: -candidate.fit)
+    best = next((candidate for candidate in ranked if candidate.refusal is None), None)
+    if best is None:
+        return None, "no place passes every test", False
+    at_once = True
+    for other in ranked:
+        if other is best or same_pose(other.T_map_query, best.T_map_query):
+            continue
+        is_clearly_worse = 1.0 - other.fit >= config.telling_misfit * (1.0 - best.fit)
+        if best.fit - other.fit < config.telling * (0.5 if is_clearly_worse else 1.0):
+            away = float(np.linalg.norm(other.T_map_query[4:] - best.T_map_query[4:]))
+            return best, f"another pose, {away:.1f} m away, fits nearly as well: {_percent(other)} and {_percent(best)}", False
+        at_once = at_once and other.fit * config.decisive <= best.fit
+    return best, "", at_once
+
+
+def seen_through(query: Query, map_points: Points, T_map_query: Floats, voxel: float) -> float:
+    """Share of the directions of a scan in which something of the map stands nearer than what was measured; NaN for too few."""
+    viewpoint = se3.act(T_map_query, query.viewpoint[None])[0]
+    scan = se3.act(T_map_query, query.scan.astype(np.float64)).astype(np.float32)
+    stands = map_points[standing(map_points)]
+    measured = nearest_ranges(*directions(scan, viewpoint), 0.0)
+    there = nearest_ranges(*directions(stands, viewpoint), _SPLAT * voxel)
+    asked = np.isfinite(measured) & np.isfinite(there)
+    if np.count_nonzero(asked) < _FEWEST_DIRECTIONS:
+        return float("nan")
+    return float(np.mean((there < _SEEN * measured - 1.0)[asked]))
+
+
+def examine_all(
+    guesses: list[Guess], query: Query, points_near: Callable[[Floats, float], Points], voxel: float, config: LocalizationConfig
+) -> list[Candidate]:
+    """Candidates of all guesses, each registered to the map around it."""
+    reach = float(np.quantile(np.linalg.norm(query.points, axis=1), 0.98)) + 5.0
+    around: dict[tuple[int, ...], Surface] = {}
+    found: list[Candidate] = []
+    for guess in guesses:
+        key = tuple(np.round(guess.T_map_query[4:] / reach * 2.0).astype(int).tolist())
+        if key not in around:
+            around[key] = Surface.of(points_near(np.array(key) * reach / 2.0, 1.5 * reach))
+        found.append(examine(guess, query, around[key], voxel, config))
+    return found
+
+
+def _share_near(points: Points, target: Surface, T: Floats) -> float:
+    if not len(points):
+        return 0.0
+    moved = se3.act(T, points.astype(np.float64))
+    return float(np.mean(target.tree.nearest(moved, 1, max_distance=_NEAR).counts > 0))
+
+
+def _percent(candidate: Candidate) -> str:
+    return f"{100 * candidate.fit:.0f} %"

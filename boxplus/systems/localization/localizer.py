@@ -1,0 +1,242 @@
+"""Localisation in a saved map: scans of an odometry in, poses in the map out. Derivations: docs/localization.md.
+
+localizer = Localizer(open_saved_map("run1"))
+for time_ns, T_odo_body, p_body in scans:
+    found = localizer.push(time_ns, T_odo_body, p_body)
+    found.status                             # searching, localised, or odometry only
+    found.T_map_body                         # never while searching
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus._numbers import as_floats
+from boxplus.errors import InputError
+from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.se3 import SE3
+from boxplus.maps.local_maps.builder import LocalMapBuilder
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.systems.localization.candidate import Candidate, Query, examine_all, rivalry
+from boxplus.systems.localization.config import LocalizationConfig
+from boxplus.systems.localization.global_search import PlaceImages, same_pose
+from boxplus.systems.localization.place_map import PlaceMap
+from boxplus.systems.localization.tracking import Matched, Tracker
+
+Floats = NDArray[np.float64]
+Status = Literal["localised", "odometry only", "searching"]
+
+_AGREE = 1.0, np.deg2rad(5.0), 1.0  # m, rad, m: two queries that say the same, the odometry between them
+_QUERY_RANGE = 60.0  # m
+_STILL = 1.0  # s after a registration was taken that a pose is localised, where no later one failed
+_HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+_NEVER = -(2**62)
+_JUMP_S = 2.0  # between scans, after which nothing is known of the motion between
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """One query, looked for in the whole map.
+
+    Attributes:
+        time_ns: of its newest scan.
+        candidates: what was looked at, the best fit first.
+        verdict: why none is believed; empty where one is.
+    """
+
+    time_ns: int
+    candidates: tuple[Candidate, ...]
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localization:
+    """What is known of one scan.
+
+    Attributes:
+        time_ns: absolute [ns].
+        status: "localised": held by the map; "odometry only": followed by the odometry from where the map held it last;
+            "searching": not known, then `T_map_body` is None.
+        T_map_body: (7,) [qw, qx, qy, qz, x, y, z]; covariance: (6, 6) of [w, v] on the right of it [rad, m].
+        matched: this scan against the map; None where it was not compared.
+        search: the query that this scan completed; None for most.
+    """
+
+    time_ns: int
+    status: Status
+    T_map_body: Floats | None
+    covariance: Floats | None
+    matched: Matched | None
+    search: Search | None
+
+
+class Localizer:
+    """Finds where an odometry is in a map, follows it there, and finds it again where it is lost.
+
+    Args:
+        place_map: the map, from `open_saved_map`.
+        config: settings; each has a default.
+
+    Attributes:
+        last_search: the newest query.
+        losses: how often the place was lost; lost_because: why last, None before it was.
+
+    Example: docs/localization.md.
+    """
+
+    def __init__(self, place_map: PlaceMap, config: LocalizationConfig | None = None) -> None:
+        self.config = config if config is not None else LocalizationConfig()
+        self.last_search: Search | None = None
+        self.lost_because: str | None = None
+        self.losses = 0
+        self._map = place_map
+        self._images = PlaceImages(place_map.local_maps)
+        self._tracker: Tracker | None = None
+        self._before: tuple[int, Floats] | None = None
+        self._promising: Floats | None = None  # T_map_odo of the query before, where it was nearly believed
+        self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
+        self._begin_search()
+
+    def push(
+        self, time_ns: int, T_odo_body: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike = (0.0, 0.0, 1.0), *, lost: bool = False
+    ) -> Localization:
+        """Take a scan.
+
+        Args:
+            time_ns: absolute [ns], later than the one before.
+            T_odo_body: (7,) pose of the body in the odometry's world.
+            p_body: (N, 3) its points in the body's frame [m].
+            up_odo: (3,) against gravity, in the odometry's world.
+            lost: the odometry does not know where this scan belongs.
+
+        Raises:
+            InputError: a time that is not later, arrays of another shape, not finite.
+        """
+        T_odo = SE3.check("T_odo_body", np.atleast_2d(as_floats(T_odo_body, "T_odo_body")))[0]
+        points = np.asarray(p_body, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError("p_body of shape (N, 3)", f"shape {points.shape}", "give points in the body's frame [m]")
+        if self._before is not None and time_ns <= self._before[0]:
+            raise InputError("scans in order of time", f"{time_ns} ns after {self._before[0]} ns", "push each scan once")
+        points = points[np.isfinite(points).all(axis=1)]
+        seconds = 0.0 if self._before is None else (time_ns - self._before[0]) * 1e-9
+        step = _HERE if self._before is None else se3.compose(se3.inverse(self._before[1]), T_odo)
+        self._before = int(time_ns), T_odo
+        if seconds > _JUMP_S:
+            self._lose(f"no scan for {seconds:.1f} s")
+        up = as_floats(up_odo, "up_odo")
+        if self._tracker is None:
+            return self._search(int(time_ns), T_odo, points[:0] if lost else points, up)
+        self._tracker.predict(step, seconds)
+        return self._follow(self._tracker, int(time_ns), T_odo, points, up, lost)
+
+    def _search(self, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats) -> Localization:
+        """Collect scans; look for what has been collected."""
+        search = None
+        for query in self._builder.push(time_ns, T_odo, np.zeros((6, 6)), points, up):
+            search = self._look(query, time_ns, T_odo, points)
+        if self._tracker is None:
+            return Localization(time_ns, "searching", None, None, None, search)
+        return Localization(time_ns, "localised", self._tracker.T_map_body, self._tracker.covariance, None, search)
+
+    def _look(self, local_map: LocalMap, time_ns: int, T_odo: Floats, scan: NDArray[np.float32]) -> Search:
+        config = self.config
+        T_query_body = se3.compose(se3.inverse(local_map.T_odo_map), T_odo)
+        seen = se3.act(T_query_body, scan.astype(np.float64)).astype(np.float32)
+        candidates: list[Candidate] = []
+        verdict = "the scans have no points"
+        if len(local_map.points):
+            query = Query.of(local_map.points, seen, T_query_body[4:])
+            guesses = self._images.guesses(local_map.points, config.candidates)
+            candidates = examine_all(guesses, query, self._map.points_near, self._map.voxel, config)
+            candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
+            verdict = self._judge(candidates, local_map, T_query_body)
+        self.last_search = Search(time_ns, tuple(candidates), verdict)
+        return self.last_search
+
+    def _judge(self, candidates: list[Candidate], local_map: LocalMap, T_query_body: Floats) -> str:
+        """Begin to follow the best candidate where it is believed; returns why not."""
+        if not candidates:
+            return "nothing that was seen stands, or none of it agrees with the map"
+        best, verdict, at_once = rivalry(candidates, self.config)
+        if best is None or verdict:
+            self._promising = None
+            return verdict
+        T_map_odo = se3.compose(best.T_map_query, se3.inverse(local_map.T_odo_map))
+        if not at_once:
+            before, self._promising = self._promising, T_map_odo
+            if before is None or not self._agree(before, T_map_odo, local_map.T_odo_map):
+                return f"not {self.config.decisive:g} times as good as the next place: a second query has to agree"
+        T_map_body = se3.compose(best.T_map_query, T_query_body)
+        Ad = se3.adjoint(se3.inverse(T_query_body))
+        self._tracker = Tracker(self._map, T_map_body, Ad @ best.covariance @ Ad.T, self.config)
+        self._held_ns = self._fitting_ns = local_map.end_ns
+        self._failures = 0
+        return ""
+
+    @staticmethod
+    def _agree(first: Floats, second: Floats, T_odo: Floats) -> bool:
+        """Whether two T_map_odo put the odometry's pose at the same place."""
+        return same_pose(se3.compose(first, T_odo), se3.compose(second, T_odo), *_AGREE)
+
+    def _follow(
+        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats, lost: bool
+    ) -> Localization:
+        config = self.config
+        matched = None
+        if not lost and len(points) and (time_ns - self._tried_ns) * 1e-9 >= config.track_interval:
+            self._tried_ns = time_ns
+            matched = tracker.correct(points, _level(T_odo, up))
+            self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
+            # One that fails ends it at once: a sensor that was carried away is not where the odometry has it.
+            self._held_ns = time_ns if matched.measured else _NEVER
+            if matched.share >= config.least_share or not matched.is_mapped:
+                self._fitting_ns = time_ns
+        reason = self._why_lost(time_ns, tracker)
+        if reason:
+            self._lose(reason)
+            return Localization(time_ns, "searching", None, None, matched, None)
+        status: Status = "localised" if (time_ns - self._held_ns) * 1e-9 <= _STILL else "odometry only"
+        return Localization(time_ns, status, tracker.T_map_body, tracker.covariance, matched, None)
+
+    def _why_lost(self, time_ns: int, tracker: Tracker) -> str | None:
+        config = self.config
+        if self._failures >= config.failures:
+            return f"{self._failures} registrations in a row contradict the odometry"
+        if (time_ns - self._fitting_ns) * 1e-9 >= config.lost_after:
+            return f"less than {100 * config.least_share:.0f} % of what stands has been in the map for {config.lost_after:g} s"
+        if tracker.sigma > config.largest_sigma:
+            return f"followed by the odometry alone until the position was known to {tracker.sigma:.1f} m only"
+        return None
+
+    def _lose(self, reason: str) -> None:
+        if self._tracker is not None:
+            self.lost_because = reason
+            self.losses += 1
+        self._begin_search()
+
+    def _begin_search(self) -> None:
+        config = self.config
+        self._tracker = None
+        self._promising = None
+        self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
+        voxel = self._map.voxel
+        self._builder = LocalMapBuilder(
+            LocalMapConfig(
+                length=config.query_length, duration=config.query_duration, least_length=0.0, voxel=voxel, max_range=_QUERY_RANGE
+            )  # type: ignore[call-arg]
+        )
+
+
+def _level(T_odo_body: Floats, up_odo: Floats) -> Floats:
+    """(3, 3) to a frame whose z is up, whatever its x."""
+    z = quaternion.to_matrix(T_odo_body[:4]).T @ (up_odo / np.linalg.norm(up_odo))
+    x = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = x - z * (z @ x)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])

@@ -1,0 +1,32 @@
+"""What stands: points on vertical runs. Ground, floors and ceilings fit everywhere and tell no place from another."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_COLUMN, _LEVEL = 1.0, 0.5  # m, sides of the cells of the ground, and of height
+_GAP, _LEAST = 2, 2  # levels that a run may leap, and that it has to reach over
+
+
+def standing(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(N,) mask of points (N, 3), z up, in a column of ground whose points reach over 1 m of height without a gap of 1 m.
+
+    Example:
+        >>> import numpy as np
+        >>> wall = np.column_stack([np.full(10, 0.5), np.full(10, 0.5), np.linspace(0.1, 3.0, 10)])
+        >>> floor = np.column_stack([np.linspace(5.1, 9.9, 10), np.full(10, 0.5), np.zeros(10)])
+        >>> standing(np.concatenate([wall, floor]).astype(np.float32)).sum()
+        np.int64(10)
+    """
+    if not len(points):
+        return np.zeros(0, dtype=np.bool_)
+    cell = np.floor(points.astype(np.float64) / (_COLUMN, _COLUMN, _LEVEL)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    # Heights lie in the low bits, so that the sorted keys run up column after column.
+    keys, of = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_inverse=True)
+    begins = np.r_[True, np.diff(keys) > _GAP]
+    run = np.cumsum(begins) - 1
+    first = keys[begins]
+    last = keys[np.r_[np.flatnonzero(begins)[1:] - 1, len(keys) - 1]]
+    return np.asarray((last - first >= _LEAST)[run[of.ravel()]])

@@ -1,0 +1,125 @@
+"""`boxplus localize` in the map of a simulated run: another way through it, a map of another place, files and facts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from boxplus.errors import InputError
+from boxplus.formats.ply import read_ply, write_ply
+from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.manifolds import quaternion, se3
+from boxplus.recordings.recording import Recording
+from boxplus.report.localization_page import write_localization_report
+from boxplus.runs.config import load_run_config
+from boxplus.runs.localization.config import LocalizationRunConfig, load_localization_config
+from boxplus.runs.localization.folder import LocalizationFolder, claim_localization_folder
+from boxplus.runs.localization.localization_run import LocalizationResult, run_localization
+from boxplus.runs.localization.logs import LOG_COLUMNS, SEARCH_COLUMNS
+from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.row_log import read_row_log
+from boxplus.runs.saved_map.saved_map import open_saved_map
+from boxplus.simulation import SpinningLidar
+from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.motions import trajectories
+from boxplus.simulation.scenarios import make_scenario
+from boxplus.simulation.simulation import Simulation
+from boxplus.simulation.worlds.worlds import yard
+
+ODOMETRY = ("odometry.scan_voxel=0.5", "odometry.map_cell=0.5")
+SETTINGS = [*ODOMETRY, "map.save=false", "localization.candidates=4", "local_maps.max_range=40"]
+
+
+def drive(route: tuple[tuple[float, float], ...], seed: int) -> Simulation:
+    lidar = SpinningLidar(channels=16, azimuth_steps=250, vertical_fov_deg=(-25.0, 15.0), rate_hz=5.0)
+    way = trajectories.drive(route, speed=5.0, standstill_s=1.0, seed=seed)
+    scenario = replace(make_scenario("drive"), name="yard", world=yard(60.0, seed=8), trajectory=way, lidar=lidar)
+    return Simulation(scenario, seed=seed)
+
+
+def run(recording: Recording, folder: Path, saved: Path) -> LocalizationResult:
+    config = load_localization_config(settings=SETTINGS)
+    return run_localization(recording, folder, open_saved_map(saved, config.local_maps), config)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("map") / "run"
+    config = load_run_config(settings=[*ODOMETRY, "map.ply=true", "map.pcd=false"])
+    run_odometry(as_recording(drive(((-20.0, 0.0), (20.0, 0.0)), seed=1)), folder, config)
+    return folder
+
+
+def true_in_map(simulation: Simulation, mapped: Path, trajectory: Trajectory) -> np.ndarray:
+    """(n, 7) the true poses in the frame of the map, by where the run that made it was in the middle of its way."""
+    made = read_trajectory(mapped / "trajectory.csv")
+    k = len(made) // 2
+    T_map = np.concatenate([made.q_wxyz[k], made.p[k]])
+    T_map_world = se3.compose(
+        T_map, se3.inverse(true_poses(drive(((-20.0, 0.0), (20.0, 0.0)), seed=1), made.times[k : k + 1])[0])
+    )
+    return se3.compose(T_map_world, true_poses(simulation, trajectory.times))
+
+
+def true_poses(simulation: Simulation, time_ns: np.ndarray) -> np.ndarray:
+    """(n, 7) in the simulated world."""
+    truth = simulation.ground_truth(time_ns)
+    return np.hstack([quaternion.from_matrix(truth.R_world_imu), truth.p_world_imu])
+
+
+def draw(folder: Path, result: LocalizationResult) -> str:
+    """The page of the run, without that of its odometry."""
+    without = replace(result, odometry=result.odometry.model_copy(update={"scans": 0}))
+    return write_localization_report(folder, without).read_text(encoding="utf-8")
+
+
+def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_path: Path) -> None:
+    simulation = drive(((15.0, 2.0), (-14.0, 2.0)), seed=2)
+    result = run(as_recording(simulation), tmp_path / "out", mapped)
+    own, summary = LocalizationFolder(tmp_path / "out"), result.summary
+    assert json.loads(own.summary.read_text())["program"] == "boxplus localize" and summary.map_kind == "boxplus lio"
+    assert summary.found_after_s is not None and summary.found_after_s <= 7.0 and not summary.losses
+    trajectory, log = read_trajectory(own.trajectory), read_row_log(own.log, LOG_COLUMNS)
+    assert len(log) == summary.scans == sum(summary.status.values())
+    assert set(trajectory.status or ()) == {"localised"}
+    # A pose is written for exactly the scans that are not searching.
+    np.testing.assert_array_equal(trajectory.times, log.time_ns[log.status != "searching"])
+    xi = se3.log(
+        se3.compose(se3.inverse(true_in_map(simulation, mapped, trajectory)), np.hstack([trajectory.q_wxyz, trajectory.p]))
+    )
+    assert np.linalg.norm(xi[:, 3:], axis=1).max() < 0.15 and np.linalg.norm(xi[:, :3], axis=1).max() < np.deg2rad(1.0)
+    odometry = read_trajectory(own.odometry.trajectory)
+    assert summary.T_map_world is not None
+    T_last = np.concatenate([odometry.q_wxyz[-1], odometry.p[-1]])
+    np.testing.assert_allclose(se3.compose(np.array(summary.T_map_world), T_last)[4:], trajectory.p[-1], atol=1e-6)
+    searches = read_row_log(own.searches, SEARCH_COLUMNS)
+    assert "" in searches.texts["verdict"] and "passes" in searches.status
+    page = draw(own.path, result)
+    assert "until the place was found" in page and "local maps were computed" in page
+    with pytest.raises(InputError, match="earlier run"), claim_localization_folder(own.path):
+        pass
+
+
+def test_in_the_map_of_another_place_there_is_no_pose(mapped: Path, tmp_path: Path) -> None:
+    cloud = read_ply(mapped / "map.ply").points
+    cloud = cloud[np.abs(cloud).max(axis=1) < 20.0]
+    mirrored = cloud * np.array([1.0, -1.0, 1.0], np.float32)  # as much to see, and nowhere the same
+    write_ply(tmp_path / "mirrored.ply", mirrored)
+    result = run(as_recording(drive(((-12.0, 0.0), (8.0, 0.0)), seed=4)), tmp_path / "out", tmp_path / "mirrored.ply")
+    summary = result.summary
+    assert set(summary.status) == {"searching"} and summary.found_after_s is None and summary.T_map_world is None
+    assert summary.searches >= 1 and any(text.startswith("not found") for text in summary.warnings)
+    assert summary.best_candidates and all("% of what stands fits" in text for text in summary.best_candidates)
+    assert not LocalizationFolder(tmp_path / "out").trajectory.read_text().splitlines()[1:]
+    assert "The best candidates, and why not" in draw(tmp_path / "out", result)
+
+
+def test_settings() -> None:
+    assert load_localization_config(settings=["localization.least_fit=0.7"]).localization.least_fit == 0.7
+    assert LocalizationRunConfig().local_maps.max_range == 50.0
+    with pytest.raises(InputError, match="nonsense"):
+        load_localization_config(settings=["localization.nonsense=1"])

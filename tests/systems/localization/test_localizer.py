@@ -1,0 +1,103 @@
+"""Starts in a known map that are found and followed, places that are lost and found again, and starts that must not be found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from boxplus.errors import InputError
+from boxplus.manifolds import se3
+from boxplus.simulation.worlds.alike import parallel_corridors
+from boxplus.simulation.worlds.world import World
+from boxplus.simulation.worlds.worlds import yard
+from boxplus.systems.localization.config import LocalizationConfig
+from boxplus.systems.localization.localizer import Localizer
+from tests.systems.localization.days import INDOORS, KnownMap, drive_of, errors, known_map, own_world, push_all
+
+FEW = LocalizationConfig(candidates=5)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return yard(60.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def place_map(world: World) -> KnownMap:
+    return known_map(world, [[-18, 0], [18, 0], [18, 12]], INDOORS, seed=3)
+
+
+def test_a_start_elsewhere_is_found_and_followed(world: World, place_map: KnownMap) -> None:
+    drive = drive_of(world, [[14, 1.5], [0, 1.5]], seed=5)
+    localizer = Localizer(place_map, FEW)
+    found = push_all(localizer, drive, own_world(drive))
+    assert found[0].status == "searching" and found[-1].status == "localised"
+    for one in found:
+        assert (one.T_map_body is None) == (one.covariance is None) == (one.status == "searching")
+    xi = errors(found, drive)
+    assert 5 < len(xi) < len(found)
+    assert np.linalg.norm(xi[:, 3:], axis=1).max() < 0.1 and np.linalg.norm(xi[:, :3], axis=1).max() < np.deg2rad(1.0)
+    covariance = found[-1].covariance
+    assert covariance is not None
+    assert xi[-1] @ np.linalg.solve(covariance, xi[-1]) < 40.0  # of 6, beyond the 0.999999 quantile
+    assert np.sqrt(covariance.diagonal()[3:]).max() < 0.1
+    search = localizer.last_search
+    assert search is not None and search.verdict == "" and search.candidates[0].refusal is None
+    # Scans that the odometry has lost are not looked at, and after two seconds of them nothing is known.
+    T, end = own_world(drive)[-1], int(drive.time_ns[-1])
+    lost = [localizer.push(end + k * 400_000_000, T, drive.scans[-1], lost=True) for k in range(1, 8)]
+    assert all(one.matched is None for one in lost)
+    assert lost[-1].status == "searching" and lost[-1].T_map_body is None
+
+
+def test_a_sensor_that_is_carried_away_is_noticed_and_found_again(world: World, place_map: KnownMap) -> None:
+    first, second = drive_of(world, [[10, 0], [-1, 0]], seed=6), drive_of(world, [[-16, 0], [-3, 0]], seed=7)
+    localizer = Localizer(place_map, FEW)
+    before = push_all(localizer, first, own_world(first))
+    assert before[-1].status == "localised"
+    # The odometry noticed nothing: its poses go on as if the sensor had stayed.
+    T_odo = se3.compose(own_world(first)[-1], se3.compose(se3.inverse(second.T_odo_body[0]), second.T_odo_body))
+    after = push_all(localizer, second, T_odo, int(first.time_ns[-1]) + 300_000_000)
+    statuses = [one.status for one in after]
+    assert "searching" in statuses and statuses[-1] == "localised"
+    assert "localised" not in statuses[: statuses.index("searching")]
+    assert localizer.losses == 1 and localizer.lost_because is not None and "of what stands" in localizer.lost_because
+    begin = statuses.index("searching")
+    again = errors(after[begin:], replace(second, T_world_body=second.T_world_body[begin:]))
+    assert len(again) and np.linalg.norm(again[:, 3:], axis=1).max() < 0.1
+    end = after[-1].time_ns + 3_000_000_000
+    assert localizer.push(end, T_odo[-1], second.scans[-1]).status == "searching"
+    assert localizer.lost_because == "no scan for 3.0 s"
+
+
+def test_another_place_is_not_found_and_it_is_said_why(place_map: KnownMap) -> None:
+    drive = drive_of(yard(60.0, seed=4), [[14, 1.5], [0, 1.5]], seed=5)
+    localizer = Localizer(place_map, FEW)
+    assert {one.status for one in push_all(localizer, drive, own_world(drive))} == {"searching"}
+    search = localizer.last_search
+    assert search is not None and search.verdict
+    assert all(candidate.refusal for candidate in search.candidates)
+
+
+def test_corridors_that_are_alike_are_not_told_apart() -> None:
+    world = parallel_corridors(count=2, length=36.0)
+    route = [[-19.5, 0], [19.5, 0], [19.5, 12], [-19.5, 12], [-19.5, 2]]
+    place_map = known_map(world, route, INDOORS, seed=1)
+    drive = drive_of(world, [[-6, 12], [6, 12]], seed=2)
+    found = push_all(Localizer(place_map, FEW), drive, own_world(drive))
+    xi = errors(found, drive)
+    assert not len(xi) or np.linalg.norm(xi[:, 3:], axis=1).max() < 0.5
+
+
+def test_input_is_checked(place_map: KnownMap) -> None:
+    localizer = Localizer(place_map, FEW)
+    here = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    localizer.push(10, here, np.zeros((0, 3)))
+    with pytest.raises(InputError, match="in order of time"):
+        localizer.push(10, here, np.zeros((0, 3)))
+    with pytest.raises(InputError, match="shape"):
+        localizer.push(20, here, np.zeros((4, 2)))
+    with pytest.raises(InputError, match="T_odo_body"):
+        localizer.push(20, [2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], np.zeros((0, 3)))
