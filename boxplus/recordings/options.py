@@ -127,6 +127,17 @@ class RecordingOptions(BaseModel):
             raise InputError("every LiDAR once", f"{self.lidar_topic}, {', '.join(topics)}", "leave the repeated ones out")
         return self
 
+    @model_validator(mode="after")
+    def _some_range_is_left(self) -> RecordingOptions:
+        for name, one in [("", self), *((f" of {other.topic}", self.alone(other)) for other in self.other_lidars or ())]:
+            if one.min_range >= one.max_range:
+                raise InputError(
+                    f"min_range (--min-range) below max_range (--max-range){name}",
+                    f"{one.min_range:g} and {one.max_range:g} m, between which no point lies",
+                    "lower the first or raise the second",
+                )
+        return self
+
     def alone(self, other: OtherLidar) -> RecordingOptions:
         """How one of the other LiDARs would be read as the only one, by its own clock."""
         own = other.model_dump(include={"point_time_field", "point_time_unit", "point_time_reference"})

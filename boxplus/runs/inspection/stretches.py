@@ -61,5 +61,6 @@ def gather_scans(recording: Recording, stretches: Sequence[Stretch], report: Cal
             return
         for stretch in stretches:
             if event.start_ns >= stretch.begin_ns and event.end_ns <= stretch.end_ns:
-                stretch.scans.append(thinned(event, _MOST_POINTS))
+                # Of several LiDARs the first alone: what is wrong with another one must not be blamed on its mounting.
+                stretch.scans.append(thinned(event if event.lidar is None else event.of_lidar(0), _MOST_POINTS))
         report(recording.progress)

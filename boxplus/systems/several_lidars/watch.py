@@ -160,5 +160,8 @@ class LidarWatch:
 
     def _contradict(self, other: _Other) -> list[str]:
         text = other.verified.text if other.verified is not None else ""
-        self.contradiction = f"LiDAR {other.name} contradicts the first one: {text}"
+        self.contradiction = (
+            f"LiDAR {other.name} contradicts the first one: {text}; 'boxplus inspect' measures it by the path of the first "
+            "alone, which the error has not bent"
+        )
         return [self.contradiction]
