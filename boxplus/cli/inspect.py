@@ -39,13 +39,19 @@ def inspect(
     *,
     options: RecordingOptions,
 ) -> None:
-    """Examine a recording: topics, rates, gaps, times, units, noise, extrinsic, points. Exit code 1 when there are errors."""
+    """Examine a recording: topics, rates, gaps, times, units, noise, extrinsic, points. Exit code 1 when there are errors.
+
+    Where there is nothing to examine, no such file or folder, it is 2, as with every command.
+    """
     from rich.console import Console
     from rich.progress import Progress
 
+    from boxplus.errors import RecordingError
     from boxplus.runs.inspection.diagnosis import diagnose
     from boxplus.runs.transform import parse_transform
 
+    if not recording.exists():
+        raise RecordingError("a recording", f"no file or folder {recording}", "check the path")
     T_given = None if T_imu_lidar is None else parse_transform(T_imu_lidar)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)

@@ -60,6 +60,14 @@ def test_a_value_out_of_range_names_its_option() -> None:
     assert "Invalid value for --start: Input should be greater than or equal to 0 (got -1.0)" in result.stderr
 
 
+def test_a_recording_that_does_not_exist_is_bad_input() -> None:
+    result = CliRunner().invoke(app, ["inspect", "nowhere.bag"])
+    assert (result.exit_code, result.stderr.strip()) == (
+        2,
+        "error: expected a recording – got no file or folder nowhere.bag – check the path",
+    )
+
+
 def test_exit_codes_of_paths_that_cannot_be_written(tmp_path: Path) -> None:
     recording = write_recording(simulate("walk", duration_s=1.0, lidar=SpinningLidar(azimuth_steps=100)), tmp_path / "walk")
     (tmp_path / "file").write_text("mine")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,10 +16,10 @@ from boxplus.systems.several_lidars.surfaces import Surfaces
 Verdict = Literal["agree", "contradicted", "unverified"]
 Cause = Literal["", "pose", "inverted", "clock", "pose or clock", "pose and clock"]
 
-_FLOOR = np.array([np.radians(0.2)] * 3 + [0.03] * 3 + [0.003])
+_FLOOR = np.array([np.radians(0.2)] * 3 + [0.02] * 3 + [0.003])
 """Beside the covariance of a fit: what the surfaces and the first LiDAR's own path leave in error (rad, m, s)."""
 _CONTRADICTED = 5.0  # standard deviations, floor included
-_SHOWN = np.array([np.radians(2.0)] * 3 + [0.3] * 3 + [0.03])
+_SHOWN = np.array([np.radians(2.0)] * 3 + [0.3] * 3 + [0.008])
 """A standard deviation below which a component counts as checked (rad, m, s)."""
 _LEAST_NEAR, _LEAST_FITTING, _GOOD_FITTING = 0.1, 0.6, 0.85
 _OFFSETS_S = (0.25, -0.25, 0.5, -0.5)
@@ -36,6 +36,7 @@ class PairJudgement:
         rotation_deg, translation_m, time_offset_s: found, from what is declared; None where nothing could be fitted.
         sigma_deg, sigma_m, sigma_s: their standard deviations, of the worst axis.
         T_first_other: (4, 4) as found.
+        unshown: of an agreement, what motion and scene do not show: "position", "clock".
     """
 
     verdict: Verdict
@@ -48,6 +49,7 @@ class PairJudgement:
     sigma_m: float | None = None
     sigma_s: float | None = None
     T_first_other: NDArray[np.float64] | None = None
+    unshown: tuple[str, ...] = ()
 
 
 def judge_pair(
@@ -114,11 +116,10 @@ def _judged(fit: PairFit, *, inverted: bool) -> PairJudgement:
     shown = np.sqrt(np.diag(C)) < _SHOWN
     if not shown[:3].all():
         return judgement("unverified", "", f"the surfaces both saw do not show how it lies: they fit {numbers}")
-    open_parts = [name for name, part in (("position", shown[3:6]), ("clock", shown[6:])) if not part.all()]
-    doubt = (
-        f"; its {' and '.join(open_parts)} could not be checked: the motion or the scene does not show it" if open_parts else ""
-    )
-    return judgement("agree", "", f"its points fit what the first LiDAR saw where declared ({numbers}){doubt}")
+    unshown = tuple(name for name, part in (("position", shown[3:6]), ("clock", shown[6:])) if not part.all())
+    doubt = f"; its {' and '.join(unshown)} could not be checked: the motion or the scene does not show it" if unshown else ""
+    agreed = judgement("agree", "", f"its points fit what the first LiDAR saw where declared ({numbers}){doubt}")
+    return replace(agreed, unshown=unshown)
 
 
 def _named(d: NDArray[np.float64], C: NDArray[np.float64], numbers: str, *, inverted: bool) -> tuple[Cause, str]:

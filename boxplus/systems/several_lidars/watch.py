@@ -23,6 +23,7 @@ _EVERY_S = 30.0
 _LONGEST_GAP_S = 0.5
 _SURFACE_POINTS, _OTHER_POINTS = 1500, 80  # of a scan that are kept
 _MOST_PENDING = 100
+_MOST_TRIES = 12  # windows in a row, to check a LiDAR for the first time
 
 
 @dataclass(slots=True)
@@ -38,7 +39,13 @@ class _Other:
     contradicted: int = 0
     streak: int = 0  # of windows in a row that contradict
     last: PairJudgement | None = None
-    verified: PairJudgement | None = None
+    agreed: PairJudgement | None = None  # of the windows that agree, that which shows most, the last of these
+    contradicting: PairJudgement | None = None
+
+    @property
+    def judgement(self) -> PairJudgement | None:
+        """What contradicts, where the last window that shows anything does; else what agrees; else why nothing is known."""
+        return (self.contradicting if self.streak else None) or self.agreed or self.last
 
 
 class LidarWatch:
@@ -62,10 +69,11 @@ class LidarWatch:
         self._p: list[NDArray[np.float64]] = []
         self._surface: list[NDArray[np.float64]] = []
         self._resume_ns: int | None = None
+        self._tries = 0
 
     def judgements(self) -> dict[str, tuple[PairJudgement | None, int, int]]:
-        """Of each other LiDAR: what its last window that showed anything said, windows judged, windows that contradict."""
-        return {other.name: (other.verified or other.last, other.windows, other.contradicted) for other in self._others}
+        """Of each other LiDAR: what is known of it, windows judged, windows that contradict."""
+        return {other.name: (other.judgement, other.windows, other.contradicted) for other in self._others}
 
     def add_scan(self, scan: Scan) -> None:
         """Take a merged scan in, before its estimate comes."""
@@ -108,11 +116,17 @@ class LidarWatch:
         for other in self._others:
             if other.streak and self.contradiction is None and 2 * other.contradicted >= other.windows:
                 told += self._contradict(other)
-            if other.verified is None:
+            if other.windows == 0:
                 why = "the recording is too short" if other.last is None else other.last.text
                 told.append(
                     f"LiDAR {other.name} could not be checked against the first one, and was merged as declared: {why}; see "
                     "'boxplus inspect'"
+                )
+            elif other.agreed is not None and other.agreed.unshown and not other.streak:
+                what = " and ".join(other.agreed.unshown)
+                told.append(
+                    f"the {what} of LiDAR {other.name} could not be checked against the first one, and was taken as declared: "
+                    f"{other.agreed.text}"
                 )
         return told
 
@@ -128,7 +142,7 @@ class LidarWatch:
     def _judge(self) -> list[str]:
         """Each other LiDAR against what the first one has seen in this window."""
         told: list[str] = []
-        doubted = False
+        doubted, unverified = False, False
         end_ns = self._time_ns[-1]
         if len(self._time_ns) >= FEWEST_POSES and self._surface:
             motion = LidarMotion(np.array(self._time_ns), np.array(self._R), np.array(self._p))
@@ -136,9 +150,11 @@ class LidarWatch:
             for other in self._others:
                 told += self._judge_one(other, motion, surfaces)
                 doubted |= other.last is not None and other.last.verdict == "contradicted"
+                unverified |= other.windows == 0
         self._forget(end_ns)
-        # A doubt is followed up at once; what is known for sure is not looked at all the time.
-        again = doubted and self.contradiction is None
+        # A doubt is followed up at once, as is a LiDAR not checked yet; what is known for sure is not looked at all the time.
+        self._tries += unverified
+        again = (doubted or (unverified and self._tries <= _MOST_TRIES)) and self.contradiction is None
         self._resume_ns = None if again else end_ns + round(self.every_s * 1e9)
         return told
 
@@ -151,15 +167,17 @@ class LidarWatch:
         other.last = found
         if found.verdict == "unverified":
             return []
-        other.windows, other.verified = other.windows + 1, found
+        other.windows += 1
         if found.verdict == "agree":
             other.streak = 0
+            if other.agreed is None or len(found.unshown) <= len(other.agreed.unshown):
+                other.agreed = found
             return []
-        other.contradicted, other.streak = other.contradicted + 1, other.streak + 1
+        other.contradicted, other.streak, other.contradicting = other.contradicted + 1, other.streak + 1, found
         return self._contradict(other) if other.streak > 1 and self.contradiction is None else []
 
     def _contradict(self, other: _Other) -> list[str]:
-        text = other.verified.text if other.verified is not None else ""
+        text = other.contradicting.text if other.contradicting is not None else ""
         self.contradiction = (
             f"LiDAR {other.name} contradicts the first one: {text}; 'boxplus inspect' measures it by the path of the first "
             "alone, which the error has not bent"

@@ -134,3 +134,4 @@ def test_at_rest_the_clock_is_not_called_checked() -> None:
     time_ns = START_NS + (random.uniform(0.1, SECONDS - 0.1, len(p_other)) * 1e9).astype(np.int64)
     judgement = judge_pair(rest, surfaces, p_other, time_ns + 200_000_000, T_TRUE)
     assert judgement.verdict == "agree" and "its clock could not be checked" in judgement.text
+    assert judgement.unshown == ("clock",)
