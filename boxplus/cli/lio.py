@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options
+from boxplus.cli.options import takes_recording_options, with_default_threads
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -67,10 +66,7 @@ def lio(
         "odometry": odometry,
         "map": {"save": False} if no_map else {},
     }
-    run_config = load_run_config(config, settings or (), overrides)
-    if "threads" not in run_config.odometry.model_fields_set:
-        both = {"threads": min(2, os.cpu_count() or 1)}
-        run_config = run_config.model_copy(update={"odometry": run_config.odometry.model_copy(update=both)})
+    run_config = with_default_threads(load_run_config(config, settings or (), overrides))
     folder = output or Path(f"{recording.resolve().stem}_boxplus")
     summary = run(recording, folder, run_config, overwrite=overwrite, resume=resume, view=view, report=not no_report)
     if summary.state == "interrupted":

@@ -1,17 +1,23 @@
-"""Options that several commands share: how a recording is read."""
+"""Options that several commands share: how a recording is read, and on how many threads."""
 
 from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from pydantic import BaseModel, ValidationError
 
 from boxplus.errors import BoxplusError
 from boxplus.recordings.options import OtherLidar, RecordingOptions
+
+if TYPE_CHECKING:
+    from boxplus.runs.config import RunConfig
+
+ConfigT = TypeVar("ConfigT", bound="RunConfig")
 
 _TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None, tuple[OtherLidar, ...] | None: list[str] | None}
 """What a command line can take, for what it cannot."""
@@ -70,6 +76,14 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
         return with_options
 
     return decorate
+
+
+def with_default_threads(config: ConfigT) -> ConfigT:
+    """Two threads for the odometry, where the machine has them and neither an option nor a file says how many."""
+    if "threads" in config.odometry.model_fields_set:
+        return config
+    both = {"threads": min(2, os.cpu_count() or 1)}
+    return config.model_copy(update={"odometry": config.odometry.model_copy(update=both)})
 
 
 def _flag(name: str) -> str:

@@ -11,9 +11,7 @@ import typer
 def report(
     folder: Annotated[
         Path,
-        typer.Argument(
-            help="The output folder of 'boxplus lio', 'vio' or 'vo'; of 'slam', the folder odometry in it.", metavar="FOLDER"
-        ),
+        typer.Argument(help="The output folder of 'boxplus lio', 'slam', 'vio' or 'vo'.", metavar="FOLDER"),
     ],
 ) -> None:
     """Draw the report of a run again, also of an interrupted one, and say how far the run came."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options
+from boxplus.cli.options import takes_recording_options, with_default_threads
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.runs.slam.slam_run import SlamResult
+    from boxplus.report.live_view import LiveView
+    from boxplus.runs.slam.result import SlamResult
     from boxplus.runs.slam.summary import GnssFacts
 
 
@@ -45,21 +45,24 @@ def slam(
     utm: Annotated[bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).")] = False,
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
     *,
     options: RecordingOptions,
 ) -> None:
     """Turn a recording into a trajectory and a map, with loops closed.
 
     The odometry of 'boxplus lio', with its results in the folder odometry/, and beside it the places that were seen again:
-    corrected trajectory and map, and every loop that was looked at in loops.csv and in the report. Exit codes: as 'boxplus lio'.
+    corrected trajectory and map, and every loop that was looked at in loops.csv and in the report. Exit codes: as 'boxplus lio',
+    and 3 also where loops that fit contradict the odometry.
     """
     from boxplus.runs.slam.config import load_slam_config
     from boxplus.runs.slam.loop_file import read_loop_decisions
     from boxplus.runs.transform import parse_transform
     from boxplus.sensors.gnss import antenna_offset
 
-    odometry: dict[str, object] = {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)}
+    odometry: dict[str, object] = {} if threads is None else {"threads": threads}
     if T_imu_lidar is not None:
         odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
     gnss: dict[str, object] = {"utm": True} if utm else {}
@@ -71,7 +74,7 @@ def slam(
         "gnss": gnss,
         "map": {"save": False} if no_map else {},
     }
-    run_config = load_slam_config(config, settings or (), overrides)
+    run_config = with_default_threads(load_slam_config(config, settings or (), overrides))
     forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
     folder = output or Path(f"{recording.resolve().stem}_slam")
 
@@ -80,11 +83,16 @@ def slam(
     from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
 
+    shown: LiveView | None = None
+    if view:
+        from boxplus.report.live_view import LiveView
+
+        shown = LiveView(recording.name)
     terminal = RunTerminal()
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_recording(recording, run_config.recording) as opened,
-        claim_slam_folder(folder, overwrite=overwrite) as claimed,
+        claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
     ):
         info = opened.info
         terminal.print_evidence(
@@ -92,13 +100,22 @@ def slam(
         )
         with terminal.progress() as progress:
             result = run_slam(
-                opened, claimed, run_config, forbidden=forbidden, forced=forced, progress=progress, should_stop=should_stop
+                opened,
+                claimed,
+                run_config,
+                forbidden=forbidden,
+                forced=forced,
+                resume=resume,
+                progress=progress,
+                view=shown,
+                loop_view=shown,
+                should_stop=should_stop,
             )
         if not no_report:
-            from boxplus.report.slam_page import write_slam_report
+            from boxplus.report import write_report
 
             with terminal.status("drawing the report"):
-                write_slam_report(folder, result)
+                write_report(result)
     terminal.print_results(result.odometry, _rows(result), folder, ("report.html", "trajectory.tum", "loops.csv", "map.ply"))
     if result.summary.state == "interrupted":
         raise typer.Exit(130)
@@ -120,6 +137,8 @@ def _rows(result: SlamResult) -> list[tuple[str, str]]:
     ]
     if summary.gnss is not None:
         rows.insert(2, ("on the Earth", _earth(summary.gnss)))
+    if summary.contradiction is not None:
+        rows.append(("not to be trusted", summary.contradiction))
     return rows + [("warning", text) for text in summary.warnings]
 
 

@@ -1,9 +1,10 @@
-"""Writing files so that they are either whole or not there, and saying in a sentence why a write failed."""
+"""Writing files and folders so that they are either whole or not there, and saying in a sentence why a write failed."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import BinaryIO
 from boxplus.errors import OutputError
 
 TEMPORARY_SUFFIX = ".boxplus-tmp"
-"""Ending of files that are being written; such a file is never complete."""
+"""Ending of files and folders that are being written; such a one is never complete."""
+EARLIER_SUFFIX = ".boxplus-earlier"
+"""Ending of a folder that another one is about to replace; it is whole."""
 
 
 def output_error(path: str | Path, error: OSError) -> OutputError:
@@ -65,3 +68,37 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and not isinstance(error, OutputError):
             raise output_error(target, error) from error
         raise
+
+
+@contextmanager
+def replaced_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a folder beside `path` to write into; when the block ends well, it takes the place of the folder at `path`.
+
+    When the block raises, what was at `path` before stays as it was. A process that is killed leaves the one or the other whole:
+    between two renames the folder may be missing, and the next call puts the earlier one back first.
+
+    Raises:
+        OutputError: a folder cannot be created, removed or renamed.
+    """
+    target = Path(path)
+    made, earlier = (target.with_name(target.name + ending) for ending in (TEMPORARY_SUFFIX, EARLIER_SUFFIX))
+    try:
+        if earlier.exists() and not target.exists():
+            os.rename(earlier, target)
+        for leftover in (made, earlier):
+            if leftover.exists():
+                shutil.rmtree(leftover)
+        try:
+            yield make_folder(made)
+        except BaseException:
+            shutil.rmtree(made, ignore_errors=True)
+            raise
+        if target.exists():
+            os.rename(target, earlier)
+        os.rename(made, target)
+        if earlier.exists():
+            shutil.rmtree(earlier)
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise output_error(target, error) from error

@@ -10,9 +10,10 @@ if TYPE_CHECKING:
     from boxplus.report.run_data import RunData
     from boxplus.report.visual_data import VisualData
     from boxplus.runs.direct.summary import DirectSummary
+    from boxplus.runs.slam.result import SlamResult
     from boxplus.runs.visual_inertial.summary import VioSummary
 
-    AnyRun = RunData | VisualData[VioSummary] | VisualData[DirectSummary]
+    AnyRun = RunData | VisualData[VioSummary] | VisualData[DirectSummary] | SlamResult
 
 
 def write_report(run: str | Path | AnyRun) -> Path:
@@ -32,26 +33,32 @@ def write_report(run: str | Path | AnyRun) -> Path:
     from boxplus.report.page import write_page
     from boxplus.report.plots import write_plots
     from boxplus.report.run_data import RunData
+    from boxplus.report.slam_page import write_slam_report
     from boxplus.report.visual_page import write_visual_report
+    from boxplus.runs.slam.result import SlamResult
 
     data = load_report(run) if isinstance(run, (str, Path)) else run
     if isinstance(data, RunData):
         write_plots(data)
         return write_page(data)
+    if isinstance(data, SlamResult):
+        write_report(data.folder.odometry.path)
+        return write_slam_report(data)
     if data.summary.program == "boxplus vo":
         return write_direct_report(data)
     return write_visual_report(data)
 
 
 def load_report(folder: str | Path) -> AnyRun:
-    """What the report of a run shows, of any kind of odometry.
+    """What the report of a run shows, of any kind of odometry, and of one with loop closure.
 
     Raises:
-        InputError: no run's folder, or a run without a single estimate.
+        InputError: no run's folder, a run without a single estimate, or one whose loops are not closed yet.
     """
     from boxplus.report.run_data import load_run
     from boxplus.report.visual_data import load_direct_run, load_visual_run
     from boxplus.runs.output_folder import SUMMARY, program_of
+    from boxplus.runs.slam.result import load_slam_result
 
     with suppress(OSError):
         program = program_of(Path(folder) / SUMMARY)
@@ -59,4 +66,6 @@ def load_report(folder: str | Path) -> AnyRun:
             return load_visual_run(folder)
         if program == "boxplus vo":
             return load_direct_run(folder)
+        if program == "boxplus slam":
+            return load_slam_result(folder)
     return load_run(folder)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
+from boxplus.runs.slam.loop_search import Closure
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES, Estimate
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 
@@ -26,6 +27,7 @@ _MAP_SCANS = 600
 _SMALLEST_STEP_M = 0.02
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark is not kept
 _SEEN_RGB = (53, 104, 168)
+_LOOP_RGB = (209, 73, 91)
 _LOOPBACK = "127.0.0.1"
 _LONGEST_WAIT_S = 20.0
 
@@ -91,6 +93,12 @@ class LiveView(_Viewer):
             rerun.log(f"lidar_share/{axis.replace(' ', '_')}", rerun.Scalars(float(share)))
         rerun.log("points_used", rerun.Scalars(float(estimate.points_used)))
         self._count += 1
+
+    def show_loops(self, closure: Closure) -> None:
+        """Show the path with loops closed, beside that of the odometry, and every loop that is believed now."""
+        rerun, p_map = self._rerun, np.array(closure.p_map)
+        rerun.log("world/corrected", rerun.LineStrips3D([p_map], colors=[_SEEN_RGB]))
+        rerun.log("world/loops", rerun.LineStrips3D(p_map[np.array(closure.loops)], radii=0.05, colors=[_LOOP_RGB]))
 
 
 class LiveCameraView(_Viewer):

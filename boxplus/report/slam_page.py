@@ -16,9 +16,8 @@ from boxplus.manifolds import se3
 from boxplus.report.palette import INK
 from boxplus.report.plots import plain
 from boxplus.report.skeleton import html_table, tiles, warnings_section, write_html
-from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.loop_file import why_refused
-from boxplus.runs.slam.slam_run import SlamResult
+from boxplus.runs.slam.result import SlamResult
 from boxplus.systems.slam.loop import Loop
 
 _PLACE, _QUERY = "#8a8f98", "#d1495b"
@@ -27,18 +26,14 @@ _POINTS = 8000  # of a local map in a picture
 _DPI = 80
 
 
-def write_slam_report(folder: str | Path, result: SlamResult) -> Path:
-    """Draw `report.html` of a run with loop closure; that of the odometry too, in its own folder. Returns the path.
+def write_slam_report(result: SlamResult) -> Path:
+    """Draw `report.html` of a run with loop closure, without that of its odometry. Returns the path.
 
     Raises:
+        InputError: a local map is missing or damaged.
         OutputError: the files cannot be written.
     """
-    from boxplus.report import write_report
-
-    own = SlamFolder(Path(folder))
-    if result.odometry.scans:
-        write_report(own.odometry.path)
-    return write_html(own.report, Path(result.summary.recording).name, _body(result))
+    return write_html(result.folder.report, Path(result.summary.recording).name, _body(result))
 
 
 def _body(result: SlamResult) -> str:
@@ -64,13 +59,13 @@ def _body(result: SlamResult) -> str:
 
 
 def _overview(result: SlamResult) -> str:
-    correction = result.slam.correction()
+    correction = result.outcome.correction
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.subplots()
     before, after = correction.T_odo[:, 4:6], correction.T_map[:, 4:6]
     axes.plot(*before.T, color=_PLACE, linewidth=1.2, label="odometry")
     axes.plot(*after.T, color=INK, linewidth=1.4, marker=".", label="corrected")
-    for loop in result.slam.loops:
+    for loop in result.outcome.loops:
         if loop.is_accepted:
             ends = after[[loop.place, loop.query]]
             axes.plot(*ends.T, color=_QUERY, linewidth=1.6)
@@ -84,7 +79,7 @@ def _overview(result: SlamResult) -> str:
 
 def _table(result: SlamResult) -> str:
     heading = ("loop", "at", "verdict", "found by", "overlap", "surfaces apart", "innovation", "measured", "weight", "why not")
-    rows = [_row(loop, result.map_time_s) for loop in _ordered(result.slam.loops)]
+    rows = [_row(loop, result.map_time_s) for loop in _ordered(result.outcome.loops)]
     how = (
         "To remove a loop or to force one, write its pair into a file and run again with --loops: "
         "<code>forbid: [[query, place]]</code>, <code>force: [[query, place]]</code>."
@@ -114,7 +109,7 @@ def _ordered(loops: Sequence[Loop]) -> list[Loop]:
 
 
 def _pictures(result: SlamResult) -> list[str]:
-    drawn = [loop for loop in _ordered(result.slam.loops) if loop.measured > 0]
+    drawn = [loop for loop in _ordered(result.outcome.loops) if loop.measured > 0]
     sections = []
     for loop in drawn[:_PICTURES]:
         verdict = "closed" if loop.is_accepted else f"refused: {why_refused(loop)}"

@@ -40,6 +40,19 @@ class View(Protocol):
         """Show one scan."""
 
 
+class Companion(View, Protocol):
+    """Something that sees every estimate, and goes on from a checkpoint together with the run."""
+
+    def snapshot(self) -> dict[str, object]:
+        """What it holds after the estimates so far, as `write_state` takes it; only to be written at once."""
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `snapshot`; estimates after it are shown again."""
+
+    def finish(self) -> None:
+        """The last estimate was shown. What is still held back goes to disk before `run.json` says that the run is finished."""
+
+
 def run_odometry(
     recording: Recording,
     folder: str | Path | RunFolder,
@@ -50,6 +63,7 @@ def run_odometry(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     view: View | None = None,
+    companion: Companion | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> RunSummary:
     """Run odometry over a recording and write trajectory, map and facts to a folder.
@@ -69,6 +83,7 @@ def run_odometry(
         resume: go on with a run that was killed or interrupted, from its last checkpoint.
         progress: called after every event that was read.
         view: shown every estimate.
+        companion: the same, and goes on with the run where it is resumed.
         should_stop: asked between events; True ends the run in good order, with the state "interrupted".
 
     Returns:
@@ -87,7 +102,7 @@ def run_odometry(
     with claimed as run_folder:
         extrinsic = extrinsic or choose_extrinsic(recording, config.odometry)
         config = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
-        run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view)
+        run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view, companion)
         if resume:
             run.resume()
         return run.execute(should_stop or (lambda: False))
@@ -104,6 +119,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         extrinsic: Extrinsic,
         progress: Callable[[Progress], None],
         view: View | None,
+        companion: Companion | None,
     ) -> None:
         info = recording.info
         identity = run_identity(info, dump_run_config(config, info), f"{info.lidar_topic} and {info.imu_topic}")
@@ -113,7 +129,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         self._folder = folder
         self._config = config
         self._extrinsic = extrinsic
-        self._view = view
+        self._view, self._companion = view, companion
         alone = not recording.info.imu_topic
         self._odometry = LidarOdometry(config.odometry) if alone else LidarInertialOdometry(config.odometry)
         self._watch = watch_of(recording)
@@ -126,13 +142,20 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
 
     def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
         """See `ResumableRun.snapshot`."""
-        return self._odometry.snapshot(), {"registered": self._registered, "watch": self._watch}
+        companion = None if self._companion is None else self._companion.snapshot()
+        return self._odometry.snapshot(), {"registered": self._registered, "watch": self._watch, "companion": companion}
 
     def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
         """See `ResumableRun.restore`."""
         self._odometry.restore(odometry)
         self._statistics = cast(RunStatistics, self.counts)
         self._registered, self._watch = run["registered"], run["watch"]
+        began_alone, goes_on_alone = run.get("companion") is None, self._companion is None
+        if began_alone != goes_on_alone:
+            began, now = ("'boxplus lio'" if alone else "'boxplus slam'" for alone in (began_alone, goes_on_alone))
+            raise InputError(f"the command that the run began with, {began}", now, f"go on with {began}")
+        if self._companion is not None:
+            self._companion.restore(run["companion"])
 
     def open(self, stack: ExitStack) -> None:
         """See `RunLoop.open`."""
@@ -175,8 +198,9 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 self._statistics.warnings.add(text, estimate.time_ns)
         self.status = estimate.status
         self.seconds["writing"] += time.perf_counter() - began
-        if self._view is not None:
-            self._view.show(estimate)
+        for viewer in (self._companion, self._view):
+            if viewer is not None:
+                viewer.show(estimate)
 
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
@@ -184,6 +208,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             for text in self._watch.finish():
                 self._statistics.warnings.add(text)
         super().at_end(state)
+        if self._companion is not None:
+            self._companion.finish()
 
     def finish(self) -> None:
         """Merge the map."""

@@ -81,10 +81,13 @@ class ResumableRun(RunLoop[EventT, EstimateT, FactsT]):
 
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
+        if state != "finished":
+            self._checkpoints.write(self._checkpoint())
+
+    def done(self, state: State) -> None:
+        """See `RunLoop.done`: until then a killed run goes on from its checkpoint, were it only to merge its map again."""
         if state == "finished":
             self._results.checkpoint.unlink(missing_ok=True)
-        else:
-            self._checkpoints.write(self._checkpoint())
 
     def _checkpoint(self) -> Checkpoint:
         odometry, run = self.snapshot()

@@ -17,6 +17,11 @@ PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
 
 
+def is_map_file(inside: Path) -> bool:
+    """Whether a file, by its path inside a map folder, is one of the map, a half-written one too."""
+    return _MAP_FILE.fullmatch(inside.as_posix().removesuffix(TEMPORARY_SUFFIX)) is not None
+
+
 @dataclass(frozen=True, slots=True)
 class OdometryFolder:
     """The paths of the results that every odometry run has.
@@ -118,10 +123,7 @@ class RunFolder(OdometryFolder):
     def own_files(self) -> Iterator[Path]:
         """The files in the folder that a run writes."""
         yield from self.existing([self.scans, self.map_ply, self.map_pcd], PLOTS)
-        for path in self.tiles.rglob("*"):
-            inside = path.relative_to(self.tiles).as_posix().removesuffix(TEMPORARY_SUFFIX)
-            if path.is_file() and _MAP_FILE.fullmatch(inside):
-                yield path
+        yield from (path for path in self.tiles.rglob("*") if path.is_file() and is_map_file(path.relative_to(self.tiles)))
 
     def own_folders(self) -> Iterator[Path]:
         """The folders in it that a run creates, inner ones first."""

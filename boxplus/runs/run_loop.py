@@ -117,6 +117,9 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
     def finish(self) -> None:
         """All files are closed; what remains to be made of them."""
 
+    def done(self, state: State) -> None:
+        """Everything is written, and `run.json` says so."""
+
     def execute(self, should_stop: Callable[[], bool]) -> FactsT:
         """Everything, and the facts of it."""
         with atomic_file(self.config_path) as file:
@@ -136,7 +139,9 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
                 else:
                     self.write_summary("failed", named)
             raise
-        return self.write_summary(state)
+        summary = self.write_summary(state)
+        self.done(state)
+        return summary
 
     def _process(self, should_stop: Callable[[], bool]) -> State:
         """Every event through the odometry, every estimate to disk."""

@@ -13,6 +13,7 @@ import pytest
 
 from boxplus import InputError, VioConfig
 from boxplus.report.live_view import LiveCameraView, LiveView
+from boxplus.runs.slam.loop_search import Closure
 from tests.systems.visual_inertial_odometry.simulated_rays import PIXEL_SIGMA, Flight, rig, run
 
 _VIEWER = """
@@ -89,3 +90,13 @@ def test_frames_of_cameras_are_shown_with_pose_path_and_landmarks(rerun: MagicMo
     paths = [call.args[0] for call in rerun.LineStrips3D.call_args_list if isinstance(call.args[0], list)]
     assert np.array_equal(paths[-1][0][-1], view._path[-1])
     assert np.linalg.norm(view._path[-1] - last.T_world_imu[:3, 3]) <= 0.02
+
+
+def test_loops_are_shown_when_they_close(rerun: MagicMock) -> None:
+    view = LiveView("city", spawn=False)
+    rerun.log.reset_mock()
+    view.show_loops(Closure([[2, 0], [3, 1]], [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.5, 0.0, 0.0], [5.0, 1.0, 0.0]]))
+    assert [call.args[0] for call in rerun.log.call_args_list] == ["world/corrected", "world/loops"]
+    path, loops = (call.args[0] for call in rerun.LineStrips3D.call_args_list)
+    assert np.shape(path) == (1, 4, 3)
+    np.testing.assert_array_equal(loops, [[[0.5, 0, 0], [0, 0, 0]], [[5, 1, 0], [5, 0, 0]]])

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from boxplus.errors import InputError
+from boxplus.formats.output import EARLIER_SUFFIX, TEMPORARY_SUFFIX
+from boxplus.runs.folder_lock import locked_folder
 from boxplus.runs.output_folder import output_folder
-from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.run_folder import RunFolder, is_map_file
+from boxplus.runs.run_summary import read_summary
+from boxplus.runs.slam.summary import read_slam_summary
 
 PROGRAM = "boxplus slam"
+_LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,33 +50,85 @@ class SlamFolder(RunFolder):
         return self.path / "scans.spool"
 
     @property
+    def local_maps(self) -> Path:
+        """Folder of the local maps, one file each, and of the graph."""
+        return self.path / "local_maps"
+
+    @property
+    def graph(self) -> Path:
+        """Where closed loops put the local maps, and every loop, for programs."""
+        return self.local_maps / "graph.npz"
+
+    @property
     def odometry(self) -> RunFolder:
         """The run of the odometry, as `boxplus lio` leaves it."""
         return RunFolder(self.path / "odometry")
+
+    @contextmanager
+    def locked_to_resume(self, program: str) -> Iterator[None]:
+        """See `OdometryFolder.locked_to_resume`; there is something to do where the odometry is finished, but not the run."""
+        is_left = self.odometry_is_finished() and (
+            not self.summary.is_file() or read_slam_summary(self.summary).state != "finished"
+        )
+        if not (is_left or self.odometry.checkpoint.is_file()):
+            raise InputError(
+                "the folder of a run of 'boxplus slam' that did not come to its end, with a checkpoint in odometry/",
+                f"none in {self.path}",
+                "start the run without --resume; a checkpoint is written every few seconds",
+            )
+        with locked_folder(self.path, program) as lock:
+            lock.keep_file = False
+            yield
+
+    def odometry_is_finished(self) -> bool:
+        """Whether the odometry came to its end, and left everything that the rest needs."""
+        try:
+            return read_summary(self.odometry.summary).state == "finished"
+        except InputError:
+            return False
 
     def own_files(self) -> Iterator[Path]:
         """See `RunFolder.own_files`."""
         yield from RunFolder.own_files(self)
         yield from self.existing([self.loops, self.georeference, self.gnss, self.trajectory_utm, self.spool], ())
+        for tiles in self._half_replaced():
+            yield from (path for path in tiles.rglob("*") if path.is_file() and is_map_file(path.relative_to(tiles)))
+        yield from (path for path in self.local_maps.glob("*.npz*") if is_local_map_file(path))
         yield from self.odometry.own_files()
 
     def own_folders(self) -> Iterator[Path]:
         """See `RunFolder.own_folders`."""
         yield from self.odometry.own_folders()
-        yield self.odometry.path
+        yield from (self.odometry.path, self.local_maps)
+        for tiles in self._half_replaced():
+            yield from (*tiles.glob("tiles/*"), tiles / "tiles", tiles)
         yield from RunFolder.own_folders(self)
+
+    def _half_replaced(self) -> tuple[Path, Path]:
+        """Where a killed run may have left the corrected map that it was writing, or the one before."""
+        tiles = self.tiles
+        return tiles.with_name(tiles.name + TEMPORARY_SUFFIX), tiles.with_name(tiles.name + EARLIER_SUFFIX)
+
+
+def is_local_map_file(path: Path) -> bool:
+    """Whether a file in the folder of local maps is one that a run writes, a half-written one too."""
+    return _LOCAL_MAP_FILE.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)) is not None
 
 
 @contextmanager
-def claim_slam_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[SlamFolder]:
+def claim_slam_folder(folder: str | Path, *, overwrite: bool = False, resume: bool = False) -> Iterator[SlamFolder]:
     """A folder to write a run into, locked while the block runs; see `claim_run_folder`.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
-            set.
+            set; no run to resume.
         OutputError: it cannot be created or cleared.
     """
     slam = SlamFolder(Path(folder))
+    if resume:
+        with slam.locked_to_resume(PROGRAM):
+            yield slam
+        return
     with output_folder(
         slam.path, PROGRAM, slam.own_files, slam.own_folders, overwrite=overwrite, holds_results=slam.odometry.holds_estimates
     ):

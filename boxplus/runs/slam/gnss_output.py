@@ -15,13 +15,14 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.recording import Recording
+from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.summary import GnssFacts
 from boxplus.sensors.geodesy import EnuFrame, to_utm, utm_epsg
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.georeference import Georeference, georeference
 from boxplus.systems.slam.correction import Correction
-from boxplus.systems.slam.slam import Slam
+from boxplus.systems.slam.outcome import SlamOutcome
 
 _ABOUT = (
     "# Trajectory and map of this run are east, north and up [m] of this origin. T_enu_map [qw, qx, qy, qz, x, y, z] is where\n"
@@ -29,25 +30,26 @@ _ABOUT = (
 )
 
 
-def lay_onto_earth(recording: Recording, folder: SlamFolder, slam: Slam, config: GeoreferenceConfig) -> Georeference | None:
+def lay_onto_earth(
+    recording: Recording, folder: SlamFolder, outcome: SlamOutcome, config: SlamRunConfig
+) -> tuple[SlamOutcome, Georeference | None]:
     """Compare the fixes of a recording with a finished odometry and move the local maps where both put them together.
 
     Returns:
-        None where the recording has none, or they were left out. A refusal leaves the local maps where they are.
+        The outcome as it was, and None, where the recording has no fixes or they were left out. A refusal leaves the local maps
+        where they are.
     """
     if not recording.info.gnss_topic:
-        return None
+        return outcome, None
     odometry = read_trajectory(folder.odometry.trajectory)
     known = np.ones(len(odometry), dtype=np.bool_)
     if odometry.status is not None:
         known = np.array([status != "lost" for status in odometry.status], dtype=np.bool_)
     T_odo_imu = np.hstack([odometry.q_wxyz, odometry.p])
-    found = georeference(
-        slam.graph(), recording.fixes(), odometry.times[known], T_odo_imu[known], config, recording.info.p_imu_antenna
-    )
-    if found.fit is not None:
-        slam.T_map = list(found.fit.T_map)
-    return found
+    graph = outcome.graph(config.slam.gravity_sigma)
+    times, antenna = odometry.times[known], recording.info.p_imu_antenna
+    found = georeference(graph, recording.fixes(), times, T_odo_imu[known], config.gnss, antenna)
+    return (outcome if found.fit is None else outcome.laid(found.fit.T_map, found.fit.T_enu_map)), found
 
 
 def write_georeference(folder: SlamFolder, found: Georeference, config: GeoreferenceConfig) -> None:

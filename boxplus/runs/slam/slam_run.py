@@ -4,38 +4,35 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import closing, nullcontext, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from boxplus.errors import InputError, printable
-from boxplus.formats.output import atomic_file
-from boxplus.formats.trajectory import read_trajectory
-from boxplus.formats.trajectory_writer import TrajectoryWriter
-from boxplus.manifolds import quaternion, se3
-from boxplus.maps.local_maps.builder import LocalMapBuilder
-from boxplus.maps.local_maps.local_map import LocalMap
-from boxplus.maps.tiles.store import merge
-from boxplus.maps.tiles.writer import TileWriter
+from boxplus.errors import BoxplusError, InputError, OutputError, printable
+from boxplus.formats.output import atomic_file, make_folder
+from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings.recording import Recording
 from boxplus.runs.extrinsic import Extrinsic
 from boxplus.runs.odometry_run import View, run_odometry
+from boxplus.runs.run_facts import State
 from boxplus.runs.run_loop import Progress, versions
-from boxplus.runs.run_summary import RunSummary
+from boxplus.runs.run_summary import RunSummary, read_summary
+from boxplus.runs.slam.beside import Beside, LoopView
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
+from boxplus.runs.slam.corrected import write_corrected_map, write_corrected_trajectory
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.gnss_output import gnss_facts, gnss_warnings, lay_onto_earth, write_georeference
+from boxplus.runs.slam.graph_file import write_graph
 from boxplus.runs.slam.loop_file import Pairs, write_loops
-from boxplus.runs.slam.spool import ScanSpool, SpooledScan
-from boxplus.runs.slam.summary import SlamSummary
+from boxplus.runs.slam.loop_search import LoopSearch
+from boxplus.runs.slam.result import SlamResult
+from boxplus.runs.slam.spool import ScanSpool
+from boxplus.runs.slam.summary import LEFT_IN_PLACE, SlamSummary, read_slam_summary
 from boxplus.sensors.geodesy import require_utm
-from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
-from boxplus.systems.slam.correction import Correction
+from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.slam import Slam
 
 _KINDS = {  # beginnings of the sentences that refuse a loop
@@ -49,22 +46,6 @@ _KINDS = {  # beginnings of the sentences that refuse a loop
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SlamResult:
-    """What a run with loop closure leaves in memory.
-
-    Attributes:
-        summary: as in `run.json`; odometry: that of the odometry.
-        slam: with all loops; maps: the local maps, `map_time_s` (n,) when they were since the first scan.
-    """
-
-    summary: SlamSummary
-    odometry: RunSummary
-    slam: Slam
-    maps: list[LocalMap]
-    map_time_s: NDArray[np.float64]
-
-
 def run_slam(
     recording: Recording,
     folder: str | Path | SlamFolder,
@@ -74,24 +55,32 @@ def run_slam(
     forced: Pairs | None = None,
     extrinsic: Extrinsic | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     view: View | None = None,
+    loop_view: LoopView | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> SlamResult:
     """Run the odometry and close loops while it runs; write the corrected trajectory and map beside its own.
+
+    Loops are looked for by a process of its own, whose result depends on the local maps alone. A run that was killed or
+    interrupted goes on from the odometry's checkpoint, or, where that is finished, from what it left; the loops are looked for
+    again among the local maps on disk. Its results are those of a run without an interruption, to the bit.
 
     Args:
         recording: opened.
         folder: created; see docs/output_folder.md for what it holds. Or what `claim_slam_folder` yields.
         config: settings; each has a default.
         forbidden, forced: pairs (query, place) of local maps, see `read_loop_decisions`.
-        extrinsic, overwrite, progress, view, should_stop: as for `run_odometry`.
+        loop_view: shown loops when they are closed.
+        extrinsic, overwrite, resume, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
         InputError: the recording has no IMU; OpenCV, the extra `vision`, is not installed and density images are wanted; what
-            `run_odometry` and `Slam` refuse.
+            `run_odometry` and `Slam` refuse; nothing to resume.
         OutputError: the folder cannot be written or the disk is full.
         RecordingError: nothing could be read.
+        BoxplusError: the process that looks for loops came to an end.
     """
     if not recording.info.imu_topic:
         raise InputError(
@@ -101,146 +90,147 @@ def run_slam(
     config = config or SlamRunConfig()
     if config.gnss.utm:
         require_utm()
-    slam = Slam(config.slam, forbidden=forbidden or (), forced=forced or ())
-    claimed = nullcontext(folder) if isinstance(folder, SlamFolder) else claim_slam_folder(folder, overwrite=overwrite)
-    started = datetime.now(UTC)
-    with claimed as own, ScanSpool(own.spool, config.map.voxel) as spool:
-        beside = _Beside(LocalMapBuilder(config.local_maps), slam, spool if config.map.save else None, view)
-        odometry = run_odometry(
-            recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, overwrite=overwrite, progress=progress,
-            view=beside, should_stop=should_stop,
-        )  # fmt: skip
-        beside.finish()
+    Slam(config.slam, forbidden=forbidden or (), forced=forced or ())  # refuses what it refuses before the odometry has run
+    if isinstance(folder, SlamFolder):
+        claimed = nullcontext(folder)
+    else:
+        claimed = claim_slam_folder(folder, overwrite=overwrite, resume=resume)  # type: ignore[assignment]
+    with claimed as own:
+        run = _Run(recording, own, config, resume)
+        search = LoopSearch(config.slam, forbidden or [], forced or [], make_folder(own.local_maps), own.graph)
+        return run.execute(search, extrinsic, progress or (lambda _: None), view, loop_view, should_stop or (lambda: False))
+
+
+class _Run:
+    """One run: the odometry, then what closing the loops makes of its results."""
+
+    def __init__(self, recording: Recording, folder: SlamFolder, config: SlamRunConfig, resume: bool) -> None:
+        self._recording, self._folder, self._config, self._resume = recording, folder, config, resume
+        self._started, self._resumed = datetime.now(UTC), 0
+        text = dump_slam_config(config)
+        if resume:
+            self._resumed = _checked_to_go_on(folder, text)
+        with atomic_file(folder.config) as file:
+            file.write(text.encode())
+
+    def execute(
+        self,
+        search: LoopSearch,
+        extrinsic: Extrinsic | None,
+        progress: Callable[[Progress], None],
+        view: View | None,
+        loop_view: LoopView | None,
+        should_stop: Callable[[], bool],
+    ) -> SlamResult:
+        """Everything; `run.json` says how it ended."""
+        own, config = self._folder, self._config
+        own.graph.unlink(missing_ok=True)  # of a run that was interrupted: what is there belongs together, or is not there
+        self._facts("running").write(own.summary)
+        spool = ScanSpool(own.spool, config.map.voxel, go_on=self._resume) if config.map.save else None
+        is_over = False
+        try:
+            with (
+                search,
+                closing(Beside(config.local_maps, LocalMapFolder(own.local_maps), spool, search, loop_view)) as beside,
+            ):
+                if self._resume and own.odometry_is_finished():
+                    odometry = self._finished_odometry(beside)
+                else:
+                    odometry = run_odometry(
+                        self._recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, resume=self._resume,
+                        progress=progress, view=view, companion=beside, should_stop=should_stop,
+                    )  # fmt: skip
+                outcome = search.finish(lambda: progress(_waiting(search)))
+            result = self._write(odometry, outcome, spool, search.seconds)
+            is_over = result.summary.state == "finished"
+            return result
+        except BaseException as problem:
+            named = str(problem) if isinstance(problem, BoxplusError) else f"{type(problem).__name__}: {problem}"
+            stopped = isinstance(problem, KeyboardInterrupt)
+            with suppress(OutputError):  # the disk may be full
+                self._facts("running" if stopped else "failed", None if stopped else named).write(own.summary)
+            raise
+        finally:
+            if spool is not None:
+                spool.close(remove=is_over)
+
+    def _finished_odometry(self, beside: Beside) -> RunSummary:
+        """The odometry had come to its end; its local maps reach up to there."""
+        odometry, maps = read_summary(self._folder.odometry.summary), LocalMapFolder(self._folder.local_maps)
+        count = len(maps)
+        if not count or maps[count - 1].end_ns != odometry.last_time_ns:
+            raise InputError(
+                "local maps up to the end of the odometry", f"{count} in {maps.path}, the last of them older",
+                "start the run anew",
+            )  # fmt: skip
+        beside.give_again(count)
+        return odometry
+
+    def _write(self, odometry: RunSummary, outcome: SlamOutcome, spool: ScanSpool | None, slam_s: float) -> SlamResult:
+        own, config = self._folder, self._config
         began = time.perf_counter()
-        earth = lay_onto_earth(recording, own, slam, config.gnss)
-        correction = slam.correction()
-        placed = correction if earth is None or earth.fit is None else correction.placed(earth.fit.T_enu_map)
-        _write_trajectory(own, placed)
+        outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
+        correction, gnss, told = outcome.correction, None, [] if outcome.accepted else [LEFT_IN_PLACE]
+        write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:
+            write_graph(own.graph, outcome)
             write_georeference(own, earth, config.gnss)
-        stored = _write_map(own, config, spool, placed) if config.map.save else 0
-        first_ns = odometry.first_time_ns or 0
-        seconds = np.array([(m.time_ns - first_ns) * 1e-9 for m in beside.maps])
-        write_loops(own.loops, slam.loops, seconds)
-        with atomic_file(own.config) as file:
-            file.write(dump_slam_config(config).encode())
-        summary = _summary(started, recording, odometry, slam, correction, stored, beside.seconds, time.perf_counter() - began)
-        if earth is not None:
-            facts = gnss_facts(recording.info.gnss_topic, earth, correction)
-            summary = summary.model_copy(update={"gnss": facts, "warnings": summary.warnings + gnss_warnings(earth)})
-        summary.write(own.summary)
-    return SlamResult(summary, odometry, slam, beside.maps, seconds)
-
-
-class _Beside:
-    """Sees every estimate of the odometry: local maps, loops, and the scans to be placed anew."""
-
-    def __init__(self, builder: LocalMapBuilder, slam: Slam, spool: ScanSpool | None, view: View | None) -> None:
-        self._builder, self._slam, self._spool, self._view = builder, slam, spool, view
-        self.maps: list[LocalMap] = []
-        self.seconds = 0.0
-
-    def show(self, estimate: Estimate) -> None:
-        """See `View`."""
-        began = time.perf_counter()
-        state = estimate.state
-        T_odo_imu = np.concatenate([quaternion.from_matrix(state.R_world_imu), state.p_world_imu])
-        # The odometry's error of the position is along the world's axes; that of SE(3) is along the body's.
-        turn = np.eye(6)
-        turn[3:, 3:] = state.R_world_imu.T
-        p_imu = (estimate.p_lidar @ state.R_imu_lidar.T.astype(np.float32) + state.p_imu_lidar.astype(np.float32)).astype(
-            np.float32
+            gnss = gnss_facts(self._recording.info.gnss_topic, earth, correction)
+            told += gnss_warnings(earth)
+        stored = write_corrected_map(own, config.map, spool, outcome.placed) if spool is not None else 0
+        write_loops(own.loops, outcome.loops, np.asarray((correction.time_ns - (odometry.first_time_ns or 0)) * 1e-9))
+        shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)
+        refused = Counter(_kind(loop.refusal) for loop in outcome.loops if not loop.is_accepted)
+        summary = self._facts(odometry.state).model_copy(
+            update={
+                "contradiction": odometry.contradiction or outcome.doubt,
+                "scans": odometry.scans,
+                "path_length_m": odometry.path_length_m,
+                "local_maps": len(correction.time_ns),
+                "loops_looked_at": len(outcome.loops),
+                "loops_accepted": len(outcome.accepted),
+                "loops_forced": sum(loop.source == "forced" for loop in outcome.accepted),
+                "loops_refused": dict(refused),
+                "largest_shift_m": float(shift.max()),
+                "last_shift_m": float(shift[-1]),
+                "map_points": stored,
+                "slam_s": slam_s,
+                "writing_s": time.perf_counter() - began,
+                "gnss": gnss,
+                "warnings": told,
+            }
         )
-        if estimate.status == "lost":  # nobody knows where its points belong
-            p_imu = p_imu[:0]
-        covariance = turn @ estimate.pose_covariance @ turn.T
-        made = self._builder.push(estimate.time_ns, T_odo_imu, 0.5 * (covariance + covariance.T), p_imu, -state.gravity_world)
-        if self._spool is not None and len(p_imu):
-            self._spool.append(SpooledScan(estimate.time_ns, T_odo_imu, p_imu, estimate.intensity), estimate.points_world())
-        self._take(made)
-        self.seconds += time.perf_counter() - began
-        if self._view is not None:
-            self._view.show(estimate)
+        summary.write(own.summary)
+        return SlamResult(own, summary, odometry, outcome, LocalMapFolder(own.local_maps))
 
-    def finish(self) -> None:
-        """The last local map."""
-        began = time.perf_counter()
-        self._take(self._builder.flush())
-        self.seconds += time.perf_counter() - began
-
-    def _take(self, made: Iterable[LocalMap]) -> None:
-        for local_map in made:
-            self.maps.append(local_map)
-            self._slam.add(local_map)
-            if self._spool is not None:
-                self._spool.forget()
+    def _facts(self, state: State, error: str | None = None) -> SlamSummary:
+        return SlamSummary(
+            versions=versions("rosbags", "opencv-python-headless"),
+            state=state,
+            error=error,
+            resumed=self._resumed,
+            started=self._started,
+            updated=datetime.now(UTC),
+            recording=printable(str(self._recording.info.path.resolve())),
+        )
 
 
-def _write_trajectory(folder: SlamFolder, correction: Correction) -> None:
-    """The odometry's poses, corrected; covariance (which closing loops can only make smaller) and status are the odometry's."""
-    odometry = read_trajectory(folder.odometry.trajectory)
-    poses = correction.apply(odometry.times, np.hstack([odometry.q_wxyz, odometry.p]))
-    # Errors of positions are along the world's axes, and the world has turned.
-    turns = np.tile(np.eye(6), (len(poses), 1, 1))
-    turns[:, 3:, 3:] = quaternion.to_matrix(poses[:, :4]) @ quaternion.to_matrix(odometry.q_wxyz).transpose(0, 2, 1)
-    none = np.zeros((6, 6))
-    with TrajectoryWriter(folder.path) as writer:
-        for k, (time_ns, T) in enumerate(zip(odometry.times.tolist(), poses, strict=True)):
-            covariance = none if odometry.covariance is None else turns[k] @ odometry.covariance[k] @ turns[k].T
-            status = "ok" if odometry.status is None else odometry.status[k]
-            writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance, status)
+def _checked_to_go_on(folder: SlamFolder, config: str) -> int:
+    """How often the run will have been resumed; settings are those that it began with."""
+    before = folder.config.read_text(encoding="utf-8") if folder.config.is_file() else ""
+    if before != config:
+        pairs = zip(before.splitlines(), config.splitlines(), strict=False)
+        began, now = next(((a, b) for a, b in pairs if a != b), ("more settings", "fewer"))
+        raise InputError(
+            f"the settings that the run began with ({began.strip()})", now.strip(),
+            f"give --config {folder.config}, or start a new run in another folder",
+        )  # fmt: skip
+    return 1 + (read_slam_summary(folder.summary).resumed if folder.summary.is_file() else 0)
 
 
-def _write_map(folder: SlamFolder, config: SlamRunConfig, spool: ScanSpool, correction: Correction) -> int:
-    """Tiles and merged files of the scans where closed loops put them; the odometry's own map stays as it is."""
-    settings = config.map
-    with TileWriter(folder.tiles, tile_size=settings.tile_size, voxel=settings.voxel) as tiles:
-        for scan in spool.scans():
-            T = correction.apply([scan.time_ns], scan.T_odo_body[None])[0]
-            tiles.append(se3.act(T, scan.p_body.astype(np.float64)), scan.intensity)
-        stored = tiles.stored
-    if settings.ply or settings.pcd:
-        merge(folder.tiles, folder.map_ply if settings.ply else None, folder.map_pcd if settings.pcd else None)
-    return stored
-
-
-def _summary(
-    started: datetime,
-    recording: Recording,
-    odometry: RunSummary,
-    slam: Slam,
-    correction: Correction,
-    stored: int,
-    slam_s: float,
-    writing_s: float,
-) -> SlamSummary:
-    accepted = [loop for loop in slam.loops if loop.is_accepted]
-    shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)
-    refused = Counter(_kind(loop.refusal) for loop in slam.loops if not loop.is_accepted)
-    warnings = [] if accepted else ["no loop was closed: trajectory and map are those of the odometry"]
-    if slam.doubt is not None:
-        warnings.append(slam.doubt)
-    return SlamSummary(
-        versions=versions("rosbags", "opencv-python-headless"),
-        state=odometry.state,
-        started=started,
-        updated=datetime.now(UTC),
-        recording=printable(str(recording.info.path.resolve())),
-        contradiction=odometry.contradiction,
-        scans=odometry.scans,
-        path_length_m=odometry.path_length_m,
-        local_maps=len(correction.time_ns),
-        loops_looked_at=len(slam.loops),
-        loops_accepted=len(accepted),
-        loops_forced=sum(loop.source == "forced" for loop in accepted),
-        loops_refused=dict(refused),
-        largest_shift_m=float(shift.max()),
-        last_shift_m=float(shift[-1]),
-        map_points=stored,
-        slam_s=slam_s,
-        writing_s=writing_s,
-        warnings=warnings,
-    )
+def _waiting(search: LoopSearch) -> Progress:
+    """The odometry is at its end; the loop search comes after it."""
+    return Progress(search.done / max(search.given, 1), search.done, "local maps", "ok", stage="closing loops")
 
 
 def _kind(refusal: str | None) -> str:

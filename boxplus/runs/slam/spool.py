@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.errors import OutputError
+from boxplus.errors import InputError
 from boxplus.formats.output import output_error
+from boxplus.manifolds import quaternion
 from boxplus.maps.tiles.voxel_thinning import RecentVoxels
 
 _HEAD = struct.Struct("<qqB7d")  # time, points, whether with intensity, pose
@@ -27,30 +28,41 @@ class SpooledScan(NamedTuple):
     intensity: NDArray[np.float32] | None
 
 
+class SpoolMark(NamedTuple):
+    """A place in a spool: its bytes so far, and those before its last stretch began."""
+
+    size: int
+    stretch: int
+
+
 class ScanSpool:
     """Appends scans to a file, without the points whose voxel another point near in time has taken.
 
     Args:
         path: created anew.
         voxel: edge of the voxels, in the odometry's world [m]; None keeps every point.
+        go_on: keep what an earlier spool wrote there.
 
     Raises:
         OutputError: it cannot be written.
     """
 
-    def __init__(self, path: Path, voxel: float | None) -> None:
+    def __init__(self, path: Path, voxel: float | None, *, go_on: bool = False) -> None:
         self.path, self._voxel = path, voxel
         self._recent = None if voxel is None else RecentVoxels(voxel)
+        self._stretch = 0
         try:
-            self._file: BinaryIO = path.open("wb")
+            self._file: BinaryIO = path.open("r+b" if go_on else "w+b")
+            self._file.seek(0, os.SEEK_END)
         except OSError as error:
             raise output_error(path, error) from error
 
-    def append(self, scan: SpooledScan, p_odo: NDArray[np.float64]) -> None:
-        """Add a scan whose points are at `p_odo` (N, 3) in the odometry's world."""
+    def append(self, scan: SpooledScan) -> None:
+        """Add a scan; points that are not finite are left out."""
+        p_odo = _in_odometry(scan)
         keep = np.flatnonzero(np.isfinite(p_odo).all(axis=1))
         if self._recent is not None:
-            keep = keep[self._recent.new(np.ascontiguousarray(p_odo[keep], dtype=np.float32))]
+            keep = keep[self._recent.new(p_odo[keep])]
         points = np.ascontiguousarray(scan.p_body[keep], dtype=np.float32)
         try:
             self._file.write(_HEAD.pack(scan.time_ns, len(points), scan.intensity is not None, *scan.T_odo_body.tolist()))
@@ -62,27 +74,83 @@ class ScanSpool:
 
     def forget(self) -> None:
         """Begin a new stretch: voxels seen before count as new, as loops may part what the odometry laid together."""
+        self._stretch = self._file.tell()
         if self._voxel is not None:
             self._recent = RecentVoxels(self._voxel)
 
+    def mark(self) -> SpoolMark:
+        """How far it is, all of it handed to the operating system; `cut` goes back to there.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise output_error(self.path, error) from error
+        return SpoolMark(self._file.tell(), self._stretch)
+
+    def cut(self, mark: SpoolMark) -> None:
+        """Take away what was appended after a mark.
+
+        Raises:
+            InputError: there is less than that.
+        """
+        if (size := self._file.seek(0, os.SEEK_END)) < mark.size:
+            raise InputError(f"the {mark.size} bytes of the checkpoint in {self.path}", f"{size}", "start the run anew")
+        self._file.truncate(mark.size)
+        self._file.seek(mark.stretch)
+        self.forget()
+        while (scan := _next_scan(self._file)) is not None:
+            if self._recent is not None:
+                self._recent.new(_in_odometry(scan))
+
     def scans(self) -> Iterator[SpooledScan]:
         """All scans so far, in order."""
-        self._file.flush()
+        self.mark()
+        with self.path.open("rb") as file:
+            while (scan := _next_scan(file)) is not None:
+                yield scan
+
+    def poses(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Times (n,) and poses (n, 7) along the odometry of all scans so far, without their points."""
+        self.mark()
+        times, poses = [], []
         with self.path.open("rb") as file:
             while head := file.read(_HEAD.size):
                 time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
-                points = np.frombuffer(file.read(12 * count), dtype=np.float32).reshape(-1, 3)
-                intensity = np.frombuffer(file.read(4 * count), dtype=np.float32) if has_intensity else None
-                yield SpooledScan(time_ns, np.array(pose), points, intensity)
+                times.append(time_ns)
+                poses.append(pose)
+                file.seek(count * (16 if has_intensity else 12), os.SEEK_CUR)
+        return np.array(times, dtype=np.int64), np.array(poses).reshape(-1, 7)
 
-    def __enter__(self) -> ScanSpool:
-        return self
+    def close(self, *, remove: bool = False) -> None:
+        """Close the file; safe to call twice.
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        """Close and remove the file."""
+        Raises:
+            OutputError: it cannot be removed.
+        """
+        self._file.close()
         try:
-            self._file.close()
-            self.path.unlink(missing_ok=True)
-        except OSError as failure:
-            if error is None:
-                raise OutputError(f"cannot remove {self.path}: {failure}") from failure
+            if remove:
+                self.path.unlink(missing_ok=True)
+        except OSError as error:
+            raise output_error(self.path, error) from error
+
+
+def _next_scan(file: BinaryIO) -> SpooledScan | None:
+    """The scan at the position of a file, which moves on; None at its end."""
+    if not (head := file.read(_HEAD.size)):
+        return None
+    time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
+    points = np.frombuffer(file.read(12 * count), dtype=np.float32).reshape(-1, 3)
+    intensity = np.frombuffer(file.read(4 * count), dtype=np.float32) if has_intensity else None
+    return SpooledScan(time_ns, np.array(pose), points, intensity)
+
+
+def _in_odometry(scan: SpooledScan) -> NDArray[np.float32]:
+    """(N, 3) points in the odometry's world, point by point with the same rounding whatever others come with it."""
+    R, t = quaternion.to_matrix(scan.T_odo_body[:4]), scan.T_odo_body[4:]
+    x, y, z = np.ascontiguousarray(scan.p_body.T, dtype=np.float64)
+    rows = [R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + t[k] for k in range(3)]
+    return np.ascontiguousarray(np.stack(rows, axis=1), dtype=np.float32)

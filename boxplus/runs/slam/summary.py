@@ -6,10 +6,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
+from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 from boxplus.runs.run_facts import Part, State
+
+LEFT_IN_PLACE = "no loop was closed: trajectory and map are those of the odometry"
 
 
 class GnssFacts(Part):
@@ -43,10 +46,14 @@ class SlamSummary(Part):
     program: Literal["boxplus slam"] = "boxplus slam"
     versions: dict[str, str]
     state: State
+    error: str | None = None
+    resumed: int = Field(0, description="how often the run went on after it had been killed or interrupted")
     started: datetime
     updated: datetime
     recording: str = Field(description="path of the recording")
-    contradiction: str | None = Field(None, description="why the odometry is not to be trusted; see odometry/run.json")
+    contradiction: str | None = Field(
+        None, description="why the result is not to be trusted: how sensors contradict each other, or loops the odometry"
+    )
     scans: int = 0
     path_length_m: float = Field(0.0, description="along the odometry [m]")
     local_maps: int = 0
@@ -62,6 +69,15 @@ class SlamSummary(Part):
     writing_s: float = Field(0.0, description="and on writing the corrected trajectory and map")
     warnings: list[str] = Field(default=[])
 
+    def describe_state(self) -> str:
+        """One sentence on how far the run came, and whether its result is to be trusted."""
+        doubt = "" if self.contradiction is None else f"; not to be trusted: {self.contradiction}"
+        if self.state in ("finished", "interrupted"):
+            closed = f"{self.loops_accepted} loops closed, of {self.loops_looked_at} looked at"
+            return f"{self.state}: {self.scans} scans, {self.local_maps} local maps, {closed}{doubt}"
+        how = f"stopped by an error: {self.error}" if self.state == "failed" else "still running, or ended without a word"
+        return f"{how}; see the folder odometry for how far it came, and go on with --resume"
+
     def write(self, path: Path) -> None:
         """Replace the file in one step.
 
@@ -70,3 +86,17 @@ class SlamSummary(Part):
         """
         with atomic_file(path) as file:
             file.write(self.model_dump_json(indent=2).encode())
+
+
+def read_slam_summary(path: Path) -> SlamSummary:
+    """Read `run.json` of 'boxplus slam'.
+
+    Raises:
+        InputError: missing, cut, not of this version, or of another kind of run.
+    """
+    try:
+        return SlamSummary.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise InputError(
+            "run.json as this version of 'boxplus slam' writes it", f"{path}: {error}", "give its output folder, or run it again"
+        ) from error

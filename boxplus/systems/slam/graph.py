@@ -36,12 +36,20 @@ class ClosedGraph:
         is_kept: (loops,) which loops the result rests on.
         errors: (loops,) what each of them is off by at the result, in standard deviations.
         solution: with history and covariance of the block `poses`.
+        poses: that block.
     """
 
     T_map: Floats
     is_kept: NDArray[np.bool_]
     errors: Floats
     solution: Solution
+    poses: Variables
+
+    def covariances(self) -> tuple[Floats, Floats]:
+        """Of each pose, against the first one, (n, 6, 6) on its right; and of each with the one after it, (n − 1, 6, 6)."""
+        x, n = self.poses, len(self.T_map)
+        steps = np.arange(n - 1)
+        return self.solution.covariance(x), self.solution.covariance(x[steps], x[steps + 1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +149,7 @@ def close_graph(
     errors = np.zeros(len(loops))
     for name, group in groups.items():
         errors[rows[name]] = np.sqrt(group.squares(solution.values))
-    return ClosedGraph(solution[x], is_kept, errors, solution)
+    return ClosedGraph(solution[x], is_kept, errors, solution, x)
 
 
 def _threshold(dof: int) -> float:

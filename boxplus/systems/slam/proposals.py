@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from boxplus.systems.slam.odometry_chain import OdometryChain
 from boxplus.systems.slam.rivals import best_shift
 
 Floats = NDArray[np.float64]
+Maps = Callable[[int], LocalMap]
 
 _CONTEXTS = 3  # places looked at that have a similar scan context
 _CONTEXT_REACH = 8.0  # m, from which a place still has a similar one
@@ -49,24 +50,23 @@ class Proposer:
         if config.appearance == "density":
             opencv("which describes density images")  # now, not after the first local map
 
-    def propose(self, maps: Sequence[LocalMap], before: int, odometry: OdometryChain, T_map: Sequence[Floats]) -> list[Proposal]:
-        """Places before number `before` for the newest of the maps, which is remembered for later ones.
+    def propose(self, query: int, maps: Maps, before: int, odometry: OdometryChain, T_map: Sequence[Floats]) -> list[Proposal]:
+        """Places before number `before` for the newest map, number `query`, which is remembered for later ones.
 
         Args:
-            maps: all so far; T_map: (7,) of each, as estimated now.
+            maps: gives a map by its number; T_map: (7,) of each, as estimated now.
         """
-        query = len(maps) - 1
         found: list[Proposal] = []
         if self._config.appearance == "density":
-            features = described(maps[query], self._config)
+            features = described(maps(query), self._config)
             found = [seen(candidate) for candidate in self._densities.candidates(features, before=before, seed=query)]
             self._densities.add(features)
         if self._config.appearance != "none":
-            context = scan_context(maps[query].points, self._config.context_range)
+            context = scan_context(maps(query).points, self._config.context_range)
             if not found:
                 alike = self._contexts.candidates(context, before=before, count=_CONTEXTS)
                 found = [
-                    turned(maps[query], maps[place], place, yaw, self._config)
+                    turned(maps(query), maps(place), place, yaw, self._config)
                     for place, far, yaw in alike
                     if far <= self._config.context_distance
                 ]

@@ -9,7 +9,7 @@ corrected = slam.correction().apply(time_ns, T_odo_body)
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -21,9 +21,10 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.correction import Correction
-from boxplus.systems.slam.graph import MapGraph, close_graph
+from boxplus.systems.slam.graph import ClosedGraph, close_graph
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
+from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.proposals import Proposal, Proposer
 from boxplus.systems.slam.registration import Surface, surface_distance
 from boxplus.systems.slam.verification import verify
@@ -42,6 +43,8 @@ class Slam:
         config: settings; each has a default.
         forbidden: pairs of local maps that are no loop, whatever they look like.
         forced: pairs that are one: no test refuses it, and it is registered from where the odometry has it.
+        stored: where a local map that was added can be read again by its number, such as a `LocalMapFolder`'s; then none of their
+            points stay in memory. None keeps them.
 
     Attributes:
         loops: every loop that was looked at, the latest state of each.
@@ -53,14 +56,25 @@ class Slam:
     Example: docs/slam.md.
     """
 
-    def __init__(self, config: SlamConfig | None = None, *, forbidden: Iterable[Pair] = (), forced: Iterable[Pair] = ()) -> None:
+    def __init__(
+        self,
+        config: SlamConfig | None = None,
+        *,
+        forbidden: Iterable[Pair] = (),
+        forced: Iterable[Pair] = (),
+        stored: Callable[[int], LocalMap] | None = None,
+    ) -> None:
         self.config = config if config is not None else SlamConfig()
         self._forbidden, self._forced = _checked_pairs(forbidden, forced)
+        self._stored = stored
         self._maps: list[LocalMap] = []
         self._odometry = OdometryChain()
         self._proposer = Proposer(self.config)
         self._surfaces: dict[int, Surface] = {}
         self._rms: list[float] = []
+        self._newest: LocalMap | None = None
+        self._graph: ClosedGraph | None = None
+        self._scale = 1.0  # of the odometry's covariances, see `_drift_scale`
         self.loops: list[Loop] = []
         self.T_map: list[Floats] = []
 
@@ -73,7 +87,8 @@ class Slam:
         query = len(self._maps)
         if local_map.number != query:
             raise InputError(f"local map {query}", f"number {local_map.number}", "add the maps of one builder in their order")
-        self._maps.append(local_map)
+        self._maps.append(local_map if self._stored is None else replace(local_map, points=local_map.points[:0]))
+        self._newest = local_map
         self._odometry.add(local_map)
         self.T_map.append(self._predicted(query))
         self._rms.append(self._rms_of_odometry(query))
@@ -113,21 +128,35 @@ class Slam:
         """
         if not self._maps:
             raise InputError("a local map at least", "none", "add one first")
+        steps = self._scale * np.stack([m.covariance for m in self._maps])
         return Correction(
-            np.array([m.time_ns for m in self._maps], dtype=np.int64), np.stack(self._odometry.poses), np.stack(self.T_map)
+            np.array([m.time_ns for m in self._maps], dtype=np.int64),
+            np.stack(self._odometry.poses),
+            np.stack(self.T_map),
+            *self._covariances(steps),
+            steps,
         )
 
-    def graph(self) -> MapGraph:
-        """Local maps, odometry and the loops believed now: what positions by satellite are added to.
+    def _covariances(self, steps: Floats) -> tuple[Floats, Floats]:
+        """Of the local maps against the first, and of each with the one before: from the graph, then along the odometry."""
+        covariance, cross = np.zeros((2, *steps.shape))
+        known = 1
+        if self._graph is not None:
+            known = len(self._graph.T_map)
+            covariance[:known], cross[1:known] = self._graph.covariances()
+        for k in range(known, len(steps)):
+            Ad = se3.adjoint(se3.compose(se3.inverse(self.T_map[k]), self.T_map[k - 1]))
+            cross[k] = covariance[k - 1] @ Ad.T
+            covariance[k] = Ad @ cross[k] + steps[k]
+        return covariance, cross
+
+    def outcome(self) -> SlamOutcome:
+        """All that is known now, without the points of local maps.
 
         Raises:
             InputError: no local map yet.
         """
-        correction = self.correction()
-        loops = [loop for loop in self.loops if loop.is_accepted]
-        scale = self._drift_scale(loops)
-        covariances = np.stack([scale * m.covariance for m in self._maps])
-        return MapGraph(correction.time_ns, correction.T_odo, correction.T_map, covariances, loops, self.config.gravity_sigma)
+        return SlamOutcome(self.correction(), list(self.loops), self.doubt)
 
     def _close(self) -> None:
         """Believe the largest set of loops that agree with each other and with the odometry, and move the maps."""
@@ -136,15 +165,15 @@ class Slam:
         free = [k for k in standing if self.loops[k].source != "forced"]
         agree = free if len(free) < 2 else [free[k] for k in largest_clique(self._consistent(free))]
         chosen = sorted(forced + agree)
-        scale = self._drift_scale([self.loops[k] for k in chosen])
+        self._scale = self._drift_scale([self.loops[k] for k in chosen])
         graph = close_graph(
             self._odometry.poses,
-            [scale * m.covariance for m in self._maps],
+            [self._scale * m.covariance for m in self._maps],
             [self.loops[k] for k in chosen],
             self.config.gravity_sigma,
             [k in forced for k in chosen],
         )
-        self.T_map = list(graph.T_map)
+        self._graph, self.T_map = graph, list(graph.T_map)
         kept = {k for k, is_kept in zip(chosen, graph.is_kept, strict=True) if is_kept}
         for k in standing:
             self.loops[k] = replace(self.loops[k], weight=float(k in kept))
@@ -173,7 +202,7 @@ class Slam:
     def _proposals(self, query: int) -> list[Proposal]:
         way = self._maps[query].path_m - np.array([m.path_m for m in self._maps])
         before = int(np.count_nonzero(way >= self.config.least_way))
-        found = self._proposer.propose(self._maps, before, self._odometry, self.T_map)
+        found = self._proposer.propose(query, self._map, before, self._odometry, self.T_map)
         free = [p for p in found if (query, p.place) not in self._forbidden and (query, p.place) not in self._forced]
         wanted = sorted(place for q, place in self._forced if q == query)
         T = self.T_map
@@ -198,8 +227,13 @@ class Slam:
         if number not in self._surfaces:
             if len(self._surfaces) >= _KEPT_SURFACES:
                 del self._surfaces[next(iter(self._surfaces))]
-            self._surfaces[number] = Surface.of(self._maps[number].points)
+            self._surfaces[number] = Surface.of(self._map(number).points)
         return self._surfaces[number]
+
+    def _map(self, number: int) -> LocalMap:
+        if self._newest is not None and self._newest.number == number:
+            return self._newest
+        return self._maps[number] if self._stored is None else self._stored(number)
 
 
 def _checked_pairs(forbidden: Iterable[Pair], forced: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]:

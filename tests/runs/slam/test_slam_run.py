@@ -15,12 +15,13 @@ from boxplus.errors import InputError
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings.recording import Recording
-from boxplus.report.slam_page import write_slam_report
+from boxplus.report import load_report, write_report
 from boxplus.runs.run_summary import read_summary
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import read_loop_decisions
-from boxplus.runs.slam.slam_run import SlamResult, run_slam
+from boxplus.runs.slam.result import SlamResult, load_slam_result
+from boxplus.runs.slam.slam_run import run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan
 from boxplus.sensors.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
@@ -30,6 +31,7 @@ from boxplus.simulation.motions import trajectories
 from boxplus.simulation.scenarios import make_scenario
 from boxplus.simulation.simulation import Simulation
 from boxplus.simulation.worlds.worlds import city
+from boxplus.systems.slam.slam import Slam
 from tests.systems.slam.drives import ate
 
 SETTINGS = [
@@ -68,7 +70,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     folder = SlamFolder(tmp_path_factory.mktemp("slam") / "out")
     config = load_slam_config(settings=[*SETTINGS, "gnss.utm=true"])
     result = run_slam(block(), folder.path, config)
-    write_slam_report(folder.path, result)
+    write_report(result)
     return Finished(folder, result, round_a_block())
 
 
@@ -93,7 +95,7 @@ def test_the_loop_is_closed_and_nothing_gets_worse(finished: Finished) -> None:
 
 
 def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> None:
-    loops = finished.result.slam.loops
+    loops = finished.result.outcome.loops
     with finished.folder.loops.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [(int(row["query"]), int(row["place"]), row["accepted"] == "1") for row in rows] == [
@@ -128,6 +130,32 @@ def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
     assert np.linalg.norm((points - expected)[:2]) < 15.0
 
 
+def test_the_folder_says_all_that_the_run_did(finished: Finished) -> None:
+    """The report is drawn again from the folder alone, and programs find poses and loops there."""
+    again = load_slam_result(finished.folder.path)
+    assert again.summary == finished.result.summary and again.odometry == finished.result.odometry
+    for one, other in zip(again.outcome.loops, finished.result.outcome.loops, strict=True):
+        assert (one.query, one.place, one.refusal, one.weight) == (other.query, other.place, other.refusal, other.weight)
+        np.testing.assert_array_equal(one.information, other.information)
+    page = finished.folder.report.read_bytes()
+    finished.folder.report.unlink()
+    assert isinstance(load_report(finished.folder.path), SlamResult)
+    write_report(finished.folder.path)
+    assert len(finished.folder.report.read_bytes()) == pytest.approx(len(page), rel=0.01)
+
+
+def test_the_loop_search_beside_finds_what_the_same_local_maps_give(finished: Finished) -> None:
+    slam, maps = Slam(load_slam_config(settings=SETTINGS).slam), finished.result.maps
+    for number in range(len(maps)):
+        slam.add(maps[number])
+    expected, found = slam.outcome(), finished.result.outcome
+    for one, other in zip(found.loops, expected.loops, strict=True):  # positions by satellite have moved the maps since
+        np.testing.assert_allclose(one.T_place_query, other.T_place_query, atol=1e-9)
+    assert [(loop.query, loop.place, loop.refusal is None) for loop in found.loops] == [
+        (loop.query, loop.place, loop.refusal is None) for loop in expected.loops
+    ]
+
+
 def test_a_folder_with_results_is_replaced_only_when_asked(finished: Finished) -> None:
     with pytest.raises(InputError, match="--overwrite"), claim_slam_folder(finished.folder.path):
         pass
@@ -154,23 +182,53 @@ def test_decisions_of_a_user(tmp_path: Path) -> None:
 def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     pose = np.array([1.0, 0, 0, 0, 5.0, 0, 0])
-    with ScanSpool(tmp_path / "spool", 0.1) as spool:
-        scans = []
-        for k in range(3):
-            points = random.uniform(-5.0, 5.0, (40, 3)).astype(np.float32)
-            scans.append(SpooledScan(k, pose, points, np.arange(40, dtype=np.float32) if k else None))
-            spool.append(scans[-1], points + pose[4:])
-        spool.append(scans[0], scans[0].p_body + pose[4:])  # nothing of it is new
-        spool.forget()
-        spool.append(scans[0], scans[0].p_body + pose[4:])  # all of it is, for another local map
-        back = list(spool.scans())
-    assert [scan.time_ns for scan in back] == [0, 1, 2, 0, 0]
+    spool = ScanSpool(tmp_path / "spool", 0.1)
+    scans = []
+    for k in range(3):
+        points = random.uniform(-5.0, 5.0, (40, 3)).astype(np.float32)
+        scans.append(SpooledScan(k, pose, points, np.arange(40, dtype=np.float32) if k else None))
+        spool.append(scans[-1])
+    spool.append(scans[0])  # nothing of it is new
+    spool.forget()
+    spool.append(scans[0])  # all of it is, for another local map
+    back = list(spool.scans())
+    assert [scan.time_ns for scan in back] == spool.poses()[0].tolist() == [0, 1, 2, 0, 0]
     assert [len(scan.p_body) for scan in back][3:] == [0, len(back[0].p_body)]
-    for put, got in zip(scans, back, strict=False):
+    for put, got, T in zip(scans, back, spool.poses()[1], strict=False):
         np.testing.assert_array_equal(got.T_odo_body, put.T_odo_body)
+        np.testing.assert_array_equal(got.T_odo_body, T)
         assert set(map(tuple, got.p_body.tolist())) <= set(map(tuple, put.p_body.tolist()))
         assert (got.intensity is None) == (put.intensity is None)
+    spool.close(remove=True)
     assert not (tmp_path / "spool").exists()
+
+
+def test_a_spool_goes_on_from_a_mark_with_the_same_bytes(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    pose = np.array([np.cos(0.4), 0, 0, np.sin(0.4), 5.0, -3.0, 0.3])
+    scans = [SpooledScan(k, pose, random.uniform(-2.0, 2.0, (300, 3)).astype(np.float32), None) for k in range(8)]
+    straight = ScanSpool(tmp_path / "straight", 0.3)
+    for k, scan in enumerate(scans):
+        straight.append(scan)
+        if k == 3:
+            straight.forget()
+    broken = ScanSpool(tmp_path / "broken", 0.3)
+    for k, scan in enumerate(scans[:7]):
+        broken.append(scan)
+        if k == 3:
+            broken.forget()
+        if k == 5:
+            mark = broken.mark()
+    broken.close()
+    again = ScanSpool(tmp_path / "broken", 0.3, go_on=True)
+    again.cut(mark)
+    for scan in scans[6:]:
+        again.append(scan)
+    straight.close()
+    again.close()
+    assert (tmp_path / "broken").read_bytes() == (tmp_path / "straight").read_bytes()
+    with pytest.raises(InputError, match="bytes of the checkpoint"):
+        ScanSpool(tmp_path / "new", 0.3).cut(mark)
 
 
 def test_a_lidar_alone_is_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2, kstest
 
+from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.consistency import cycle_error, largest_clique
@@ -155,6 +156,8 @@ def test_corrections_hold_at_maps_and_never_jump(seed: int) -> None:
     T_map = se3.compose(T_odo, se3.exp(random.normal(0.0, 0.05, (6, 6))))
     time_ns = np.arange(6) * 10**9
     correction = Correction(time_ns, T_odo, T_map)
+    with pytest.raises(InputError, match="a correction with covariances"):
+        correction.covariances(time_ns, T_map)
     np.testing.assert_allclose(np.abs((correction.apply(time_ns, T_odo) * T_map)[:, :4].sum(axis=1)), 1.0, atol=1e-9)
     np.testing.assert_allclose(correction.apply(time_ns, T_odo)[:, 4:], T_map[:, 4:], atol=1e-9)
     np.testing.assert_allclose(se3.compose(correction.T_map_odo, T_odo[-1])[4:], T_map[-1, 4:], atol=1e-9)
@@ -165,3 +168,32 @@ def test_corrections_hold_at_maps_and_never_jump(seed: int) -> None:
     assert steps.max() < 0.1 * whole + 1e-9
     unmoved = Correction(time_ns, T_odo, T_odo)
     np.testing.assert_allclose(unmoved.apply(fine, body)[:, 4:], body[:, 4:], atol=1e-9)
+
+
+def test_covariances_of_corrected_poses_are_those_of_their_errors() -> None:
+    """NEES of poses at maps, between and beyond them, over simulated odometries whose loops are closed."""
+    fine, maps, runs = circle(81), np.arange(0, 80, 4), 50
+    truth, sigma = fine[maps], SIGMA / 2.0  # of a fine step: four of them make SIGMA
+    steps = [np.zeros((6, 6))]
+    for a, b in itertools.pairwise(maps.tolist()):
+        Ads = [se3.adjoint(se3.compose(se3.inverse(fine[b]), fine[k])) for k in range(a + 1, b + 1)]
+        steps.append(sum(Ad @ np.diag(sigma**2) @ Ad.T for Ad in Ads))
+    asked = np.array([8, 30, 44, 66, 80])
+    random, squares = np.random.default_rng(5), np.zeros((runs, len(asked)))
+    for run in range(runs):
+        odometry = [fine[0]]
+        for step in se3.compose(se3.inverse(fine[:-1]), fine[1:]):
+            odometry.append(se3.compose(se3.compose(odometry[-1], step), se3.exp(random.normal(0.0, sigma))))
+        T_odo = np.stack(odometry)
+        loops = [loop_between(truth, q, q - 10, random.normal(0.0, Z_SIGMA)) for q in (11, 15, 17)]
+        graph = close_graph(list(T_odo[maps]), steps, loops, 10.0, [True] * 3)
+        covariance, cross = graph.covariances()
+        cross = np.concatenate([np.zeros((1, 6, 6)), cross])
+        correction = Correction(maps * 10, T_odo[maps], graph.T_map, covariance, cross, np.stack(steps))
+        poses = correction.apply(asked * 10, T_odo[asked])
+        errors = se3.log(se3.compose(se3.inverse(fine[asked]), poses))
+        squares[run] = np.einsum(
+            "ni,ni->n", errors, np.linalg.solve(correction.covariances(asked * 10, poses), errors[..., None])[..., 0]
+        )
+    low, high = chi2(6 * runs).ppf([0.001, 0.999]) / runs
+    assert ((low < squares.mean(axis=0)) & (squares.mean(axis=0) < high)).all(), squares.mean(axis=0)

@@ -1,0 +1,61 @@
+"""A folder is replaced as a whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from boxplus.errors import OutputError
+from boxplus.formats.output import replaced_folder
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    with replaced_folder(tmp_path / "map") as made:
+        (made / "tiles").mkdir()
+        (made / "tiles" / "one").write_text("old")
+    return tmp_path / "map"
+
+
+def test_the_new_folder_takes_the_place_of_the_old_one(folder: Path) -> None:
+    with replaced_folder(folder) as made:
+        (made / "two").write_text("new")
+        assert content(folder) == {"tiles/one": "old"}
+    assert content(folder) == {"two": "new"} and os.listdir(folder.parent) == ["map"]
+
+
+def test_the_old_folder_stays_whole_where_the_disk_is_full(folder: Path) -> None:
+    with pytest.raises(OutputError, match="got a full disk"), replaced_folder(folder) as made:
+        (made / "two").write_text("ne")
+        raise OSError(28, "No space left on device")
+    assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("renames", [0, 1])
+def test_killed_between_the_renames_one_of_both_is_whole(folder: Path, renames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rename, left = os.rename, iter(range(renames))
+
+    def dies(source: Path, target: Path) -> None:
+        if next(left, None) is None:
+            raise Killed
+        rename(source, target)
+
+    with monkeypatch.context() as patched, pytest.raises(Killed), replaced_folder(folder) as made:
+        (made / "two").write_text("new")
+        patched.setattr(os, "rename", dies)
+    whole = [content(path) for path in folder.parent.iterdir()]
+    assert {"tiles/one": "old"} in whole
+    with pytest.raises(ValueError, match="again"), replaced_folder(folder):
+        assert content(folder) == {"tiles/one": "old"}
+        raise ValueError("again")
+    assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]
