@@ -20,7 +20,6 @@ Points = NDArray[np.float32]
 
 _NEAR = 0.3  # m, between a point that stands and the map's
 _ASKED = 4000  # points that stand, for the fit
-_SPLAT = 1.5  # voxels, between the points of a surface that has one a voxel
 _SEEN = 0.75  # of the range that was measured; what the map has nearer than this, and by a metre, is seen through
 _FEWEST_DIRECTIONS = 30
 
@@ -75,11 +74,11 @@ class Query:
         return cls(points, spread, Surface.of(points), scan, viewpoint)
 
 
-def examine(guess: Guess, query: Query, surroundings: Surface, voxel: float, config: LocalizationConfig) -> Candidate:
+def examine(guess: Guess, query: Query, surroundings: Surface, config: LocalizationConfig) -> Candidate:
     """Register a query to the map from a guess, and ask what speaks against it.
 
     Args:
-        surroundings: the map around the guess, map frame; voxel: one point per voxel of this edge [m].
+        surroundings: the map around the guess, map frame.
     """
     found = register(query.surface, surroundings, guess.T_map_query, config.registration) if len(surroundings.points) else None
     if found is None:
@@ -88,7 +87,7 @@ def examine(guess: Guess, query: Query, surroundings: Surface, voxel: float, con
         return Candidate(guess.place, guess.T_map_query, np.eye(6), guess.agreement, 0.0, 0.0, none, 0, none, refusal)
     T = found.T_target_source
     fit = _share_near(query.stands, surroundings, T)
-    through = seen_through(query, surroundings.points, T, voxel)
+    through = seen_through(query, surroundings.points, T)
     measured = 6 - len(found.weak)
     candidate = Candidate(
         guess.place, T, found.covariance, guess.agreement, fit, found.overlap[0], found.rms, measured, through, None
@@ -132,21 +131,27 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
     return best, "", at_once
 
 
-def seen_through(query: Query, map_points: Points, T_map_query: Floats, voxel: float) -> float:
-    """Share of the directions of a scan in which something of the map stands nearer than what was measured; NaN for too few."""
+def seen_through(query: Query, map_points: Points, T_map_query: Floats) -> float:
+    """Share of the directions of a scan in which something of the map stands nearer than what was measured; NaN for too few.
+
+    Nearer than the nearest of the direction and those beside it: at the edge of a thing some rays pass and some do not.
+    """
+    from scipy.ndimage import minimum_filter
+
     viewpoint = se3.act(T_map_query, query.viewpoint[None])[0]
     scan = se3.act(T_map_query, query.scan.astype(np.float64)).astype(np.float32)
     stands = map_points[standing(map_points)]
     measured = nearest_ranges(*directions(scan, viewpoint), 0.0)
-    there = nearest_ranges(*directions(stands, viewpoint), _SPLAT * voxel)
+    there = nearest_ranges(*directions(stands, viewpoint), 0.0)
     asked = np.isfinite(measured) & np.isfinite(there)
     if np.count_nonzero(asked) < _FEWEST_DIRECTIONS:
         return float("nan")
-    return float(np.mean((there < _SEEN * measured - 1.0)[asked]))
+    beside = minimum_filter(measured, size=3, mode=("nearest", "wrap"))
+    return float(np.mean((there < _SEEN * beside - 1.0)[asked]))
 
 
 def examine_all(
-    guesses: list[Guess], query: Query, points_near: Callable[[Floats, float], Points], voxel: float, config: LocalizationConfig
+    guesses: list[Guess], query: Query, points_near: Callable[[Floats, float], Points], config: LocalizationConfig
 ) -> list[Candidate]:
     """Candidates of all guesses, each registered to the map around it."""
     reach = float(np.quantile(np.linalg.norm(query.points, axis=1), 0.98)) + 5.0
@@ -156,7 +161,7 @@ def examine_all(
         key = tuple(np.round(guess.T_map_query[4:] / reach * 2.0).astype(int).tolist())
         if key not in around:
             around[key] = Surface.of(points_near(np.array(key) * reach / 2.0, 1.5 * reach))
-        found.append(examine(guess, query, around[key], voxel, config))
+        found.append(examine(guess, query, around[key], config))
     return found
 
 

@@ -153,7 +153,7 @@ class Localizer:
         if len(local_map.points):
             query = Query.of(local_map.points, seen, T_query_body[4:])
             guesses = self._images.guesses(local_map.points, config.candidates)
-            candidates = examine_all(guesses, query, self._map.points_near, self._map.voxel, config)
+            candidates = examine_all(guesses, query, self._map.points_near, config)
             candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
             verdict = self._judge(candidates, local_map, T_query_body)
         self.last_search = Search(time_ns, tuple(candidates), verdict)

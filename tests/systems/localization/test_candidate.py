@@ -1,0 +1,79 @@
+"""What is asked of a place before it is believed, one question at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from boxplus.manifolds import se3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.simulation.worlds.worlds import yard
+from boxplus.systems.localization.candidate import Candidate, Query, rivalry, seen_through
+from boxplus.systems.localization.config import LocalizationConfig
+from boxplus.systems.localization.global_search import PlaceImages, same_pose
+from boxplus.systems.localization.standing import standing
+from boxplus.systems.slam.registration import Surface
+from tests.systems.localization.days import INDOORS, drive_of, known_map
+
+HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def candidate(fit: float, x: float = 0.0, refusal: str | None = None) -> Candidate:
+    T = HERE + np.array([0.0, 0.0, 0.0, 0.0, x, 0.0, 0.0])
+    return Candidate(0, T, np.eye(6), 0.5, fit, 1.0, 0.02, 6, 0.0, refusal)
+
+
+def judged(*candidates: Candidate) -> tuple[bool, bool]:
+    """Whether the best is believed as far as rivals go, and whether at once."""
+    best, why, at_once = rivalry(list(candidates), LocalizationConfig())
+    assert (best is None) <= bool(why)
+    return why == "", at_once
+
+
+def test_a_rival_that_fits_nearly_as_well_forbids_to_believe() -> None:
+    assert judged(candidate(0.9)) == (True, True)
+    assert judged(candidate(0.9), candidate(0.4, 30.0)) == (True, True)
+    assert judged(candidate(0.9), candidate(0.6, 30.0)) == (True, False)  # a second query has to agree
+    assert judged(candidate(0.9), candidate(0.82, 30.0))[0] is False
+    assert judged(candidate(0.9), candidate(0.82, 4.0))[0] is False  # a column farther
+    assert judged(candidate(0.9), candidate(0.89, 0.5)) == (True, True)  # the same pose
+    # Nearly nothing does not fit here, and three times as much there.
+    assert judged(candidate(0.99), candidate(0.93, 30.0)) == (True, False)
+    assert judged(candidate(0.99), candidate(0.96, 30.0))[0] is False
+    # A rival that is refused is a rival all the same.
+    assert judged(candidate(0.9), candidate(0.88, 30.0, "surfaces lie apart"))[0] is False
+    assert judged(candidate(0.9, 0.0, "seen through"), candidate(0.4, 30.0, "too little")) == (False, False)
+
+
+def test_a_wall_of_the_map_that_a_scan_sees_past_speaks_against_it() -> None:
+    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-8.0, 8.0, 0.1), np.arange(-1.0, 3.0, 0.1)))
+    wall = np.column_stack([np.full_like(y, 10.0), y, z]).astype(np.float32)
+    query = Query(wall, wall, Surface(wall, IkdTree(wall)), wall, np.zeros(3))
+    nearer = wall * np.array([0.5, 1.0, 1.0], np.float32)
+    assert seen_through(query, wall, HERE) == 0.0
+    assert seen_through(query, nearer, HERE) > 0.8
+    farther = wall * np.array([2.0, 1.0, 1.0], np.float32)
+    assert seen_through(query, farther, HERE) == 0.0  # something was put in front of it: no contradiction
+    assert np.isnan(seen_through(query, wall[:0], HERE))
+
+
+def test_only_what_stands_counts() -> None:
+    random = np.random.default_rng(1)
+    floor = np.column_stack([random.uniform(0, 20, (2000, 2)), random.normal(0.0, 0.02, 2000)])
+    ceiling = floor + np.array([0.0, 0.0, 2.6])
+    wall = np.column_stack([random.uniform(0, 20, 2000), np.full(2000, 30.2), random.uniform(0.0, 2.6, 2000)])
+    mask = standing(np.concatenate([floor, ceiling, wall]).astype(np.float32))
+    assert not mask[:4000].any() and mask[4000:].mean() > 0.95
+    assert standing(np.zeros((0, 3), np.float32)).shape == (0,)
+
+
+def test_every_turn_and_shift_of_a_place_is_found_from_above() -> None:
+    place_map = known_map(yard(60.0, seed=3), [[-12, 0], [12, 0]], INDOORS, seed=3)
+    images = PlaceImages(place_map.local_maps)
+    drive = drive_of(yard(60.0, seed=3), [[3, 2], [-6, 2]], seed=9)
+    for yaw in (0.3, 2.9):
+        T = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), 0.0, 0.0, 0.0])
+        query = se3.act(T, drive.scans[4].astype(np.float64)).astype(np.float32)
+        best = images.guesses(query, 5)[0]
+        truth = se3.compose(drive.T_world_body[4], se3.inverse(T))
+        assert same_pose(best.T_map_query, truth, 1.0, np.deg2rad(6.0), 0.5)
+    assert images.guesses(query[:0], 5) == []
