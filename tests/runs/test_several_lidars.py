@@ -68,7 +68,8 @@ def test_facts_and_faults_of_each_lidar_and_the_same_bits_when_resumed(tmp_path:
 
 
 def test_comparing_a_sound_pair_finds_it_sound() -> None:
-    (finding,) = compare_lidars(as_recording(simulation(), others=rear()), lambda _: None)
+    finding, *merging = compare_lidars(as_recording(simulation(), others=rear()), lambda _: None)
+    assert [(entry.key, entry.verdict) for entry in merging] == [(f"merging of {name}", "ok") for name in ("/lidar/points", REAR)]
     assert (finding.key, finding.value, finding.verdict) == (f"agreement of {REAR}", "agree", "ok")
 
 

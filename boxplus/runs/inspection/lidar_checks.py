@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
 from boxplus.runs.lidar_facts import watch_of
 from boxplus.sensors.scan import Scan
+from boxplus.sensors.scan_merger import LidarShare
 from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 from boxplus.systems.several_lidars.judgement import PairJudgement
@@ -23,6 +24,7 @@ from boxplus.systems.several_lidars.judgement import PairJudgement
 _LONGEST_S = 120.0
 """Of a recording, to look for stretches in which the LiDARs can be compared."""
 _WINDOWS = 3
+_MANY_LEFT_OUT = 0.01
 _VERDICTS: dict[str, Verdict] = {"agree": "ok", "contradicted": "error", "unverified": "warning"}
 
 
@@ -78,9 +80,17 @@ def compare_lidars(recording: Recording, report: Callable[[float], None]) -> lis
             break
     watch.finish()
     found = [_finding(name, *judgement) for name, judgement in watch.judgements().items()]
-    lost = {reason: count for reason, count in recording.rejected.items() if reason.startswith(("points of ", "scans of "))}
-    found += [Evidence("merging", f"{count} left out", "warning", reason) for reason, count in lost.items()]
-    return found
+    return found + [_left_out(share, recording.rejected) for share in recording.lidars]
+
+
+def _left_out(share: LidarShare, rejected: Mapping[str, int]) -> Evidence:
+    """What of a LiDAR could not be merged."""
+    own = {reason: count for reason, count in rejected.items() if f" of {share.name}: " in reason}
+    lost = sum(count for reason, count in own.items() if reason.startswith("points of "))
+    many = lost > _MANY_LEFT_OUT * share.points or any(reason.startswith("scans of ") for reason in own)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in own.items()) or "none left out"
+    text = f"{share.merged} of {share.points} points were merged; {reasons}"
+    return Evidence(f"merging of {share.name}", f"{lost} left out", "warning" if many else "ok", text)
 
 
 def _finding(name: str, judgement: PairJudgement | None, windows: int, contradicted: int) -> Evidence:
@@ -92,7 +102,7 @@ def _finding(name: str, judgement: PairJudgement | None, windows: int, contradic
     if verdict == "agree" and contradicted:
         text = f"in {contradicted} of {windows} stretches it contradicts the first one; in the last {judgement.text}"
         return Evidence(key, "contradicted at times", "error", text)
-    text = judgement.text if verdict == "unverified" else f"{judgement.text}; over {windows} stretches of some seconds"
+    text = judgement.text if verdict == "unverified" else f"{judgement.text}; stretches of some seconds: {windows}"
     if verdict == "contradicted" and judgement.T_first_other is not None:
         T = judgement.T_first_other
         arm = ", ".join(f"{value:.3f}" for value in T[:3, 3])

@@ -113,7 +113,9 @@ def test_rates_of_the_opposite_sign_about_two_axes_look_like_half_a_turn_of_the_
     planar = Turns(turns.begin_ns, turns.end_ns, [np.array([r[0], r[1], 0.01 * r[2]]) for r in turns.rotation])
     opposite = ImuSamples(imu.time_ns, -imu.gyro * [1.0, 1.0, 0.01], imu.accel)
     (_, found) = check_rotation(stream(np.eye(3)), align(planar, opposite))
-    assert found.verdict == "error" and "does not fit this recording, or the gyroscope's rates have the opposite sign" in found.text
+    assert (
+        found.verdict == "error" and "does not fit this recording, or the gyroscope's rates have the opposite sign" in found.text
+    )
 
 
 def test_what_the_motion_does_not_show_is_not_judged() -> None:
