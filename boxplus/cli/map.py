@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from boxplus.cli.map_grid import grid, height
 from boxplus.errors import InputError
 
 map_app = typer.Typer(
@@ -65,3 +66,7 @@ def export_command(
             raise InputError("a new file", f"{path}, which exists", "give another path, or --overwrite")
     count = merge(tiles, ply, pcd, voxel)
     typer.echo(f"{count:,} points → {' and '.join(str(path) for path in (ply, pcd) if path is not None)}")
+
+
+map_app.command("grid")(grid)
+map_app.command("height")(height)

@@ -23,6 +23,7 @@ from boxplus.systems.slam.loop import Loop
 _PLACE, _QUERY = "#8a8f98", "#d1495b"
 _PICTURES = 60  # loops drawn: all accepted ones first
 _POINTS = 8000  # of a local map in a picture
+_MAP_POINTS = 200_000  # of all local maps in the overview
 _DPI = 80
 
 
@@ -59,22 +60,53 @@ def _body(result: SlamResult) -> str:
 
 
 def _overview(result: SlamResult) -> str:
-    correction = result.outcome.correction
-    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
-    axes = figure.subplots()
-    before, after = correction.T_odo[:, 4:6], correction.T_map[:, 4:6]
-    axes.plot(*before.T, color=_PLACE, linewidth=1.2, label="odometry")
-    axes.plot(*after.T, color=INK, linewidth=1.4, marker=".", label="corrected")
-    for loop in result.outcome.loops:
-        if loop.is_accepted:
-            ends = after[[loop.place, loop.query]]
-            axes.plot(*ends.T, color=_QUERY, linewidth=1.6)
-    axes.plot([], [], color=_QUERY, linewidth=1.6, label="loop")
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.legend(framealpha=0.9, fontsize=9)
+    """The map before and after from above, one over the other; a slider moves the border between them."""
+    own = result.outcome.correction
+    share = max(_MAP_POINTS // len(own.time_ns), 1)
+    points = [result.maps[k].points for k in range(len(own.time_ns))]
+    points = [cloud[:: max(len(cloud) // share, 1)] for cloud in points]
+    clouds = [_placed(points, T) for T in (own.T_odo, own.T_map)]
+    both = np.concatenate(clouds)
+    corners = np.quantile(both, [0.002, 0.998], axis=0) + np.array([[-2.0], [2.0]])
+    loops = [(loop.place, loop.query) for loop in result.outcome.accepted]
+    before, after = (
+        _from_above(cloud, T[:, 4:6], corners, loops, name)
+        for cloud, T, name in zip(clouds, (own.T_odo, own.T_map), ("before", "after"), strict=True)
+    )
+    text = (
+        "The map from above: left of the border as the odometry has it, right of it with loops closed. Red: loops, each between "
+        "two local maps; the correction is spread over the way between."
+    )
+    below, above = _embedded(after, "map after closing loops"), _embedded(before, "map before closing loops")
+    half = '<div style="position:absolute;inset:0;clip-path:inset(0 50% 0 0)">'
+    slider = (
+        f'<div style="position:relative">{below}{half}{above}</div></div>'
+        '<input type="range" min="0" max="100" value="50" style="width:100%" aria-label="border between before and after" '
+        "oninput=\"this.previousElementSibling.lastElementChild.style.clipPath='inset(0 '+(100-this.value)+'% 0 0)'\">"
+    )
+    return f"<section><h2>Before and after</h2><p>{text}</p>{slider}</section>"
+
+
+def _placed(points: Sequence[NDArray[np.float32]], T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) of local maps at poses (n, 7), from above."""
+    return np.concatenate([se3.act(pose, cloud.astype(np.float64))[:, :2] for pose, cloud in zip(T, points, strict=True)])
+
+
+def _from_above(
+    cloud: NDArray[np.float64], path: NDArray[np.float64], corners: NDArray[np.float64], loops: list[tuple[int, int]], name: str
+) -> Figure:
+    """Points, path and loops within corners (2, 2); pictures of the same corners lie on each other."""
+    width, height = corners[1] - corners[0]
+    figure = Figure(figsize=(11.0, float(np.clip(11.0 * height / width, 3.0, 14.0))))
+    axes = figure.add_axes((0.06, 0.05, 0.93, 0.9))
+    axes.scatter(cloud[:, 0], cloud[:, 1], s=0.3, linewidths=0, color=_PLACE, rasterized=True)
+    axes.plot(*path.T, color=INK, linewidth=1.2, marker=".", markersize=3)
+    for ends in loops:
+        axes.plot(*path[list(ends)].T, color=_QUERY, linewidth=1.4)
+    axes.set(xlim=corners[:, 0], ylim=corners[:, 1], aspect="equal")
+    axes.set_title(f"{name} [m]", loc="left" if name == "before" else "right", fontsize=10)
     plain(axes)
-    text = "Local maps from above. A loop joins two of them; the correction is spread over the way between."
-    return f"<section><h2>Loops</h2><p>{text}</p>{_embedded(figure, 'trajectory from above')}</section>"
+    return figure
 
 
 def _table(result: SlamResult) -> str:

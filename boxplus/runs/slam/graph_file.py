@@ -38,7 +38,7 @@ def write_graph(path: Path, outcome: SlamOutcome) -> None:
     content["loop_overlap"] = np.array([loop.overlap for loop in loops], dtype=np.float64).reshape(n, 2)
     content["loop_source"] = np.array([loop.source for loop in loops], dtype=np.str_)
     content["loop_refusal"] = np.array([loop.refusal or "" for loop in loops], dtype=np.str_)
-    content["T_world_map"] = outcome.T_world_map
+    content["drift_scale"], content["T_world_map"] = np.array(outcome.drift_scale), outcome.T_world_map
     content["doubt"] = np.array(outcome.doubt or "")
     with atomic_file(path) as file:
         np.savez(file, format=np.array(_FORMAT), version=np.array(_VERSION), **content)
@@ -63,7 +63,7 @@ def read_graph(path: Path) -> SlamOutcome:
             f"{path}: {error or type(error).__name__}",
             "go on with the run (--resume), or run 'boxplus slam' again",
         ) from error
-    return SlamOutcome(correction, loops, str(content["doubt"]) or None, content["T_world_map"])
+    return SlamOutcome(correction, loops, str(content["doubt"]) or None, float(content["drift_scale"]), content["T_world_map"])
 
 
 def _loop(content: dict[str, Any], k: int) -> Loop:

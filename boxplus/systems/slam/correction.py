@@ -32,7 +32,7 @@ class Correction:
         T_odo: (n, 7) along the odometry; T_map: (n, 7) after closing loops.
         covariance: (n, 6, 6) of each T_map against the first, on its right [w, v] [rad, m].
         cross_covariance: (n, 6, 6) of each with the one before it: rows belong to that one. Zero for the first.
-        step_covariance: (n, 6, 6) of the odometry from the one before, as it was weighed. Zero for the first.
+        step_covariance: (n, 6, 6) of the odometry from the one before, at least what was assumed. Zero for the first.
             All three are empty where nobody knows.
     """
 

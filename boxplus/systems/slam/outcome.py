@@ -20,6 +20,7 @@ class SlamOutcome:
         correction: poses of the local maps before and after.
         loops: every loop that was looked at, with what spoke for and against it.
         doubt: a sentence where loops contradict the odometry, see `Slam.doubt`.
+        drift_scale: factor of the odometry's covariances in the graph.
         T_world_map: (7,) the frame of `correction.T_map` in that of trajectory and map: another one where the map was laid onto
             the Earth.
     """
@@ -27,6 +28,7 @@ class SlamOutcome:
     correction: Correction
     loops: list[Loop]
     doubt: str | None
+    drift_scale: float = 1.0
     T_world_map: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
     @property
@@ -49,5 +51,5 @@ class SlamOutcome:
         Args:
             gravity_sigma: as in `SlamConfig`.
         """
-        own = self.correction
-        return MapGraph(own.time_ns, own.T_odo, own.T_map, own.step_covariance, self.accepted, gravity_sigma)
+        own, weighed = self.correction, min(self.drift_scale, 1.0)
+        return MapGraph(own.time_ns, own.T_odo, own.T_map, weighed * own.step_covariance, self.accepted, gravity_sigma)

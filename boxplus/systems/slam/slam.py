@@ -21,7 +21,7 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.correction import Correction
-from boxplus.systems.slam.graph import ClosedGraph, close_graph
+from boxplus.systems.slam.graph import close_graph
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
 from boxplus.systems.slam.outcome import SlamOutcome
@@ -73,7 +73,8 @@ class Slam:
         self._surfaces: dict[int, Surface] = {}
         self._rms: list[float] = []
         self._newest: LocalMap | None = None
-        self._graph: ClosedGraph | None = None
+        self._agreements: dict[Pair, bool] = {}  # of loops that stand, which do not change any more
+        self._closed = 0  # maps that the last closing saw
         self._scale = 1.0  # of the odometry's covariances, see `_drift_scale`
         self.loops: list[Loop] = []
         self.T_map: list[Floats] = []
@@ -128,7 +129,7 @@ class Slam:
         """
         if not self._maps:
             raise InputError("a local map at least", "none", "add one first")
-        steps = self._scale * np.stack([m.covariance for m in self._maps])
+        steps = max(self._scale, 1.0) * np.stack([m.covariance for m in self._maps])
         return Correction(
             np.array([m.time_ns for m in self._maps], dtype=np.int64),
             np.stack(self._odometry.poses),
@@ -138,12 +139,18 @@ class Slam:
         )
 
     def _covariances(self, steps: Floats) -> tuple[Floats, Floats]:
-        """Of the local maps against the first, and of each with the one before: from the graph, then along the odometry."""
+        """Of the local maps against the first, and of each with the one before: from the graph, then along the odometry.
+
+        Where the loops say that the odometry drifts less than assumed, its poses are weighed by that, but not believed: drift
+        that is small in tilt must not pass for a small one in yaw.
+        """
         covariance, cross = np.zeros((2, *steps.shape))
-        known = 1
-        if self._graph is not None:
-            known = len(self._graph.T_map)
-            covariance[:known], cross[1:known] = self._graph.covariances()
+        known, kept = 1, [loop for loop in self.loops if loop.is_accepted]
+        if kept:
+            known = self._closed
+            forced = [True] * len(kept)
+            graph = close_graph(self._odometry.poses[:known], list(steps[:known]), kept, self.config.gravity_sigma, forced)
+            covariance[:known], cross[1:known] = graph.covariances()
         for k in range(known, len(steps)):
             Ad = se3.adjoint(se3.compose(se3.inverse(self.T_map[k]), self.T_map[k - 1]))
             cross[k] = covariance[k - 1] @ Ad.T
@@ -156,7 +163,7 @@ class Slam:
         Raises:
             InputError: no local map yet.
         """
-        return SlamOutcome(self.correction(), list(self.loops), self.doubt)
+        return SlamOutcome(self.correction(), list(self.loops), self.doubt, self._scale)
 
     def _close(self) -> None:
         """Believe the largest set of loops that agree with each other and with the odometry, and move the maps."""
@@ -173,7 +180,7 @@ class Slam:
             self.config.gravity_sigma,
             [k in forced for k in chosen],
         )
-        self._graph, self.T_map = graph, list(graph.T_map)
+        self._closed, self.T_map = len(graph.T_map), list(graph.T_map)
         kept = {k for k, is_kept in zip(chosen, graph.is_kept, strict=True) if is_kept}
         for k in standing:
             self.loops[k] = replace(self.loops[k], weight=float(k in kept))
@@ -191,7 +198,10 @@ class Slam:
         adjacent = np.eye(len(numbers), dtype=np.bool_)
         for a, first in enumerate(numbers):
             for b in range(a):
-                adjacent[a, b] = adjacent[b, a] = agree(self.loops[first], self.loops[numbers[b]], self._odometry, self.config)
+                pair = first, numbers[b]
+                if pair not in self._agreements:
+                    self._agreements[pair] = agree(self.loops[pair[0]], self.loops[pair[1]], self._odometry, self.config)
+                adjacent[a, b] = adjacent[b, a] = self._agreements[pair]
         return adjacent
 
     def _predicted(self, query: int) -> Floats:

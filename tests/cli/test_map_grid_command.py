@@ -1,0 +1,65 @@
+"""`boxplus map grid` and `boxplus map height` over the folder of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from boxplus.cli import app
+from boxplus.formats.trajectory_writer import TrajectoryWriter
+from boxplus.maps.tiles.writer import TileWriter
+
+
+def run_folder(folder: Path, z_of_second_lap: float = 0.0) -> Path:
+    """A path along a street of 20 m between two walls."""
+    random = np.random.default_rng(0)
+    floor = np.column_stack([random.uniform([0.0, -3.0], [20.0, 3.0], (60_000, 2)), np.full(60_000, 0.3)])
+    walls = np.column_stack([random.uniform(0.0, 20.0, 20_000), np.repeat([-3.0, 3.0], 10_000), random.uniform(0.3, 4.0, 20_000)])
+    with TileWriter(folder / "map", voxel=0.1) as tiles:
+        tiles.append(np.concatenate([floor, walls]))
+    with TrajectoryWriter(folder) as writer:
+        for k in range(60):
+            z = 1.8 if k < 30 else 1.8 + z_of_second_lap
+            writer.append(10**9 + k * 10**8, np.eye(3), [1.0 + 0.6 * (k % 30), 0.0, z], np.zeros((6, 6)), "ok")
+    return folder
+
+
+def call(*words: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    return result.exit_code, result.output
+
+
+def test_floor_plan_and_heights_of_a_run(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run")
+    code, out = call("map", "grid", folder)
+    assert code == 0 and "m² free" in out, out
+    pixels = np.asarray(Image.open(folder / "grid.pgm"))
+    assert pixels.shape[0] in (60, 61) and pixels.shape[1] == 200
+    assert (pixels[5:-5, 2:-2] == 254).mean() > 0.98 and (pixels[[0, -1], 2:-2] == 0).mean() > 0.95
+    code, out = call("map", "grid", folder)
+    assert code == 2 and "--overwrite" in out
+    code, out = call("map", "height", folder)
+    assert code == 0 and "0.30 to 0." in out, out
+    # Cells that hold the wall alone have the ground beside them, and what a slope of 0.3 would rise to there.
+    assert np.nanmax(np.asarray(Image.open(folder / "height.tif"))) <= 0.3 + 0.3 * 0.5 + 1e-4
+    assert call("map", "height", folder, "--surface", "--overwrite")[0] == 0
+    assert np.nanmax(np.asarray(Image.open(folder / "height.tif"))) > 3.5
+    code, out = call("map", "grid", folder, "-o", tmp_path / "fine", "--resolution", "0.05")
+    assert code == 0 and "smaller than the map's voxels" in out
+
+
+def test_storeys_over_each_other_are_not_mixed(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run", z_of_second_lap=4.0)
+    code, out = call("map", "grid", folder)
+    assert code == 2 and "a path that is on one storey" in out and "--z LOW HIGH" in out
+    assert call("map", "grid", folder, "--z", "1", "3")[0] == 0
+
+
+@pytest.mark.parametrize("words", [["map", "grid"], ["map", "height"]])
+def test_a_folder_without_a_map_is_refused(tmp_path: Path, words: list[str]) -> None:
+    code, out = call(*words, tmp_path)
+    assert code == 2 and "expected" in out and "Traceback" not in out
