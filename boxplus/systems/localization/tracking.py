@@ -27,6 +27,7 @@ Points = NDArray[np.float32]
 _MOVED = 0.3  # of the reach of the map in memory, after which it is fetched again
 _DISTANCE, _STEPS = 0.6, 2  # m of a plane's points, and Gauss-Newton steps
 _FEWEST_STANDING = 40
+_LOOKED_AT = 8  # points of a scan for each one that is registered
 _MAPPED, _ON_MAP = 2.0, 0.3  # m, to the nearest point of the map: it has something there; the point lies on it
 
 
@@ -85,7 +86,8 @@ class Tracker:
             R_level_body: (3, 3) to a frame whose z is up, in which what stands is told.
         """
         config = self._config
-        points = p_body[first_per_voxel(p_body, config.track_voxel)]
+        points = np.ascontiguousarray(p_body[:: max(len(p_body) // (_LOOKED_AT * config.track_points), 1)])
+        points = points[first_per_voxel(points, config.track_voxel)]
         points = np.ascontiguousarray(points[:: max(math.ceil(len(points) / config.track_points), 1)])
         stands = points[standing((points @ R_level_body.T).astype(np.float32))]
         around = self._surroundings()

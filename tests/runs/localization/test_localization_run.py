@@ -26,19 +26,19 @@ from boxplus.runs.saved_map.saved_map import open_saved_map
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import trajectories
-from boxplus.simulation.scenarios import make_scenario
+from boxplus.simulation.scenarios import Scenario
 from boxplus.simulation.simulation import Simulation
 from boxplus.simulation.worlds.worlds import yard
 
-ODOMETRY = ("odometry.scan_voxel=0.5", "odometry.map_cell=0.5")
+MOUNTING = "odometry.T_imu_lidar=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+ODOMETRY = ("odometry.scan_voxel=0.5", "odometry.map_cell=0.5", MOUNTING)
 SETTINGS = [*ODOMETRY, "map.save=false", "localization.candidates=4", "local_maps.max_range=40"]
 
 
 def drive(route: tuple[tuple[float, float], ...], seed: int) -> Simulation:
     lidar = SpinningLidar(channels=16, azimuth_steps=250, vertical_fov_deg=(-25.0, 15.0), rate_hz=5.0)
     way = trajectories.drive(route, speed=5.0, standstill_s=1.0, seed=seed)
-    scenario = replace(make_scenario("drive"), name="yard", world=yard(60.0, seed=8), trajectory=way, lidar=lidar)
-    return Simulation(scenario, seed=seed)
+    return Simulation(Scenario("yard", yard(60.0, seed=8), way, lidar, T_imu_lidar=np.eye(4)), seed=seed)
 
 
 def run(recording: Recording, folder: Path, saved: Path) -> LocalizationResult:
