@@ -1,0 +1,85 @@
+"""Where tasks run: in this process, or on the workers of a Ray cluster. A task is a function of arguments that can be pickled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol
+
+from boxplus._ray import ray
+from boxplus.errors import InputError
+
+_RETRIES = 3  # of a task whose worker or machine was lost
+
+
+@dataclass(frozen=True, slots=True)
+class TaskEnd:
+    """How a task ended: its number, its value, or the sentence of what went wrong."""
+
+    number: int
+    value: Any = None
+    error: str | None = None
+
+
+class Executor(Protocol):
+    """Runs tasks that do not depend on each other."""
+
+    def run(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[TaskEnd]:
+        """Call the function with each of the arguments; ends come as they come, in any order."""
+
+
+class InProcess:
+    """One task after the other, here."""
+
+    def run(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[TaskEnd]:
+        """See `Executor`."""
+        for number, given in enumerate(arguments):
+            try:
+                yield TaskEnd(number, function(*given))
+            except Exception as error:  # noqa: BLE001 - what a task raises ends that task alone, here as on a cluster
+                yield TaskEnd(number, error=f"{type(error).__name__}: {error}")
+
+
+class RayExecutor:
+    """Tasks on a Ray cluster; one whose worker or machine is lost is run again, three times at most.
+
+    Args:
+        address: of a cluster that runs already; None starts one on this machine, for as long as the block lasts.
+        workers: tasks at a time on this machine, where one is started; None: as many as it has cores.
+
+    Raises:
+        InputError: Ray, the extra `fleet`, is not installed; no cluster at the address.
+    """
+
+    def __init__(self, address: str | None = None, workers: int | None = None) -> None:
+        self._ray = ray("which runs tasks on many machines")
+        self._address, self._workers = address, workers
+
+    def __enter__(self) -> RayExecutor:
+        try:
+            if self._address is None:
+                self._ray.init(num_cpus=self._workers, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+            else:
+                self._ray.init(address=self._address, log_to_driver=False, ignore_reinit_error=True)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError("a Ray cluster", f"none at {self._address}: {error}", "start it, or leave --address out") from error
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._ray.shutdown()
+
+    def run(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[TaskEnd]:
+        """See `Executor`."""
+        remote = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(function)
+        numbers = {remote.remote(*given): number for number, given in enumerate(arguments)}
+        waiting = list(numbers)
+        while waiting:
+            (done,), waiting = self._ray.wait(waiting, num_returns=1)
+            try:
+                yield TaskEnd(numbers[done], self._ray.get(done))
+            except self._ray.exceptions.RayTaskError as error:
+                yield TaskEnd(numbers[done], error=f"{type(error.cause).__name__}: {error.cause}")
+            except self._ray.exceptions.RayError as error:
+                lost = str(error).splitlines()[0] if str(error) else type(error).__name__
+                yield TaskEnd(numbers[done], error=f"lost {_RETRIES + 1} times: {lost}")
