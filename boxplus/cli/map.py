@@ -1,18 +1,21 @@
-"""`boxplus map`: look into a map folder, and write its tiles as one file."""
+"""`boxplus map`: join runs into one map, look into a map folder, and write its tiles as one file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from boxplus.cli.map_grid import grid, height
 from boxplus.errors import InputError
 
+if TYPE_CHECKING:
+    from boxplus.runs.sessions.summary import MergeSummary
+
 map_app = typer.Typer(
     name="map",
-    help="Look into a map folder, or write its tiles as one file.",
+    help="Join runs into one map, look into a map folder, or write its tiles as one file.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -70,3 +73,74 @@ def export_command(
 
 map_app.command("grid")(grid)
 map_app.command("height")(height)
+
+
+@map_app.command("merge")
+def merge_command(
+    runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', in the order of time.", metavar="RUN…")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the joint map.")] = Path("merged"),
+    remove_dynamic: Annotated[
+        bool, typer.Option("--remove-dynamic", help="Leave out what was seen through, and report what changed.")
+    ] = False,
+    config: Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="One setting, e.g. sessions.least_encounters=5; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier merge there.")] = False,
+) -> None:
+    """Join runs whose start poses nobody knows into one map, and say which of them did not meet.
+
+    Exit code 3: no two of the runs met, and there is no joint map.
+    """
+    from boxplus.runs.sessions.config import MergeConfig
+    from boxplus.runs.sessions.merge_run import merge_runs
+    from boxplus.runs.settings_file import load_settings
+
+    chosen = load_settings(MergeConfig, config, settings or ())
+    result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite)
+    _show(result.summary)
+    if not result.summary.joined:
+        typer.echo(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
+        raise typer.Exit(3)
+    typer.echo(f"{_counts(result.summary)} → {output}")
+
+
+@map_app.command("update")
+def update_command(
+    merged: Annotated[Path, typer.Argument(help="Output folder of 'boxplus map merge'.", metavar="MAP")],
+    runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', later ones.", metavar="RUN…")],
+) -> None:
+    """Go on with a joint map: join further runs with it, in its frame and with its settings.
+
+    Exit code 3: none of the runs met the map, which stays as it was.
+    """
+    from boxplus.runs.sessions.update_run import update_map
+
+    result, alignment = update_map(merged, runs)
+    if result is None:
+        for number, session in enumerate(alignment.sessions):
+            if number >= len(alignment.sessions) - len(runs):
+                typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
+        typer.echo(f"none of the runs met the map: {merged} stays as it was")
+        raise typer.Exit(3)
+    _show(result.summary)
+    typer.echo(f"{_counts(result.summary)} → {merged}")
+
+
+def _show(summary: MergeSummary) -> None:
+    """Where each session is, or why it is apart."""
+    for session in summary.sessions:
+        if session.T_world_session is not None and session.sigma is not None:
+            x, y, z = session.T_world_session[4:]
+            typer.echo(f"{session.name}: joined, at ({x:.2f}, {y:.2f}, {z:.2f}) m ± {100.0 * max(session.sigma[3:]):.0f} cm")
+        else:
+            typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
+    for text in summary.warnings:
+        typer.echo(f"warning: {text}", err=True)
+
+
+def _counts(summary: MergeSummary) -> str:
+    removed = "" if summary.removed_points is None else f", {summary.removed_points:,} seen through and kept in removed.ply"
+    changes = "" if summary.changes is None else f", {summary.changes} places changed"
+    return f"{summary.map_points:,} points{removed}{changes}"

@@ -46,7 +46,7 @@ class SlamFolder(RunFolder):
 
     @property
     def spool(self) -> Path:
-        """Registered scans while the run goes on; gone afterwards."""
+        """Registered scans, each with its pose along the odometry: what a map of several sessions is made of."""
         return self.path / "scans.spool"
 
     @property

@@ -127,7 +127,6 @@ class _Run:
         own.graph.unlink(missing_ok=True)  # of a run that was interrupted: what is there belongs together, or is not there
         self._facts("running").write(own.summary)
         spool = ScanSpool(own.spool, config.map.voxel, go_on=self._resume) if config.map.save else None
-        is_over = False
         try:
             with (
                 search,
@@ -141,9 +140,7 @@ class _Run:
                         progress=progress, view=view, companion=beside, should_stop=should_stop,
                     )  # fmt: skip
                 outcome = search.finish(lambda: progress(_waiting(search)))
-            result = self._write(odometry, outcome, spool, search.seconds)
-            is_over = result.summary.state == "finished"
-            return result
+            return self._write(odometry, outcome, spool, search.seconds)
         except BaseException as problem:
             named = str(problem) if isinstance(problem, BoxplusError) else f"{type(problem).__name__}: {problem}"
             stopped = isinstance(problem, KeyboardInterrupt)
@@ -152,7 +149,7 @@ class _Run:
             raise
         finally:
             if spool is not None:
-                spool.close(remove=is_over)
+                spool.close()
 
     def _finished_odometry(self, beside: Beside) -> RunSummary:
         """The odometry had come to its end; its local maps reach up to there."""

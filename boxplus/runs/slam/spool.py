@@ -124,18 +124,23 @@ class ScanSpool:
                 file.seek(count * (16 if has_intensity else 12), os.SEEK_CUR)
         return np.array(times, dtype=np.int64), np.array(poses).reshape(-1, 7)
 
-    def close(self, *, remove: bool = False) -> None:
-        """Close the file; safe to call twice.
-
-        Raises:
-            OutputError: it cannot be removed.
-        """
+    def close(self) -> None:
+        """Close the file; safe to call twice."""
         self._file.close()
-        try:
-            if remove:
-                self.path.unlink(missing_ok=True)
-        except OSError as error:
-            raise output_error(self.path, error) from error
+
+
+def read_spool(path: Path) -> Iterator[SpooledScan]:
+    """The scans of a spool that was closed, in order.
+
+    Raises:
+        InputError: it cannot be read, or ends within a scan.
+    """
+    try:
+        with path.open("rb") as file:
+            while (scan := _next_scan(file)) is not None:
+                yield scan
+    except (OSError, ValueError, struct.error) as error:
+        raise InputError("the scans of a finished run of 'boxplus slam'", f"{path}: {error}", "run it again") from error
 
 
 def _next_scan(file: BinaryIO) -> SpooledScan | None:

@@ -21,7 +21,8 @@ class SessionsConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     slam: SlamConfig = Field(
-        SlamConfig(least_overlap=0.6), description="descriptors, registration and what a fit has to be, as for loops"
+        SlamConfig(least_overlap=0.6, rival_fit=0.85),
+        description="descriptors, registration and what a fit has to be, as for loops",
     )
     reach: float = Field(
         25.0, gt=0, description="two places that fit as well this far apart cannot be told from each other: no encounter [m]"

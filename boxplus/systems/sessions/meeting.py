@@ -32,7 +32,7 @@ from boxplus.systems.slam.verification import verify
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _SIGMAS_OF_REACH = 7.0  # standard deviations of the position of a proposal that make up the reach in which rivals are tried
 _TILT, _YAW = 0.03, 0.1  # rad, of a proposal
-_RIVAL_AGREEMENT, _AS_GOOD = 0.6, 0.95  # of density images and of fitting points, for a rival that is turned
+_RIVAL_AGREEMENT = 0.6  # of density images, for a rival that is turned
 _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
 _BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: by which two likenesses of one alignment differ
 _PREDICTED = 2  # places that are looked at for each local map of the query session
@@ -168,7 +168,7 @@ class _Meeting:
             other = register(own, there, start, c.registration)
             if other is None:
                 continue
-            if fitting_share(own, there, other.T_target_source, tolerance, c.registration) >= _AS_GOOD * here:
+            if fitting_share(own, there, other.T_target_source, tolerance, c.registration) >= c.rival_fit * here:
                 turn = se3.log(se3.compose(se3.inverse(loop.T_place_query), other.T_target_source))[:3]
                 return f"the maps fit as well turned by {np.rad2deg(np.linalg.norm(turn)):.0f}°"
         return None

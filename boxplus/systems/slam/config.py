@@ -58,4 +58,5 @@ class SlamConfig(BaseModel):
     innovation: float = Field(0.999, gt=0, lt=1, description="probability of a true loop to agree with the odometry")
     odometry_scale: float = Field(1.5, gt=0, description="factor of the odometry's standard deviations in that test")
     rival_distance: float = Field(1.5, gt=0, description="as good a fit this far away makes a loop ambiguous [m]")
+    rival_fit: float = Field(0.95, gt=0, le=1, description="as good: with this share of the points that fit")
     gravity_sigma: float = Field(0.005, gt=0, description="standard deviation of the vertical of a local map [rad]")

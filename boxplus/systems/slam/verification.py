@@ -21,7 +21,6 @@ Floats = NDArray[np.float64]
 
 _RIVAL_AGREEMENT = 0.6  # of two density images, against that where the query was laid, for a shift to be tried
 _RIVALS = 3  # tried
-_AS_GOOD = 0.95  # of the share of points that fit, for a rival
 _TOLERANCE = 2.5  # standard deviations from a plane within which a point fits
 _SAME_MINIMUM = 0.5  # m: a start that comes back to within this is no rival
 _BASIN_ROTATION, _BASIN_POSITION = 0.1, 1.0  # rad, m: by which density images misplace a true loop
@@ -169,7 +168,7 @@ def _rival(
         other = register(own, there, start, config.registration)
         if other is None:
             continue
-        if fitting_share(own, there, other.T_target_source, tolerance, config.registration) < _AS_GOOD * fitting:
+        if fitting_share(own, there, other.T_target_source, tolerance, config.registration) < config.rival_fit * fitting:
             continue
         moved = np.linalg.norm(other.T_target_source[4:] - T[4:])
         if moved < _SAME_MINIMUM or _is_open(found, other.T_target_source):

@@ -22,7 +22,7 @@ from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import read_loop_decisions
 from boxplus.runs.slam.result import SlamResult, load_slam_result
 from boxplus.runs.slam.slam_run import run_slam
-from boxplus.runs.slam.spool import ScanSpool, SpooledScan
+from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
 from boxplus.sensors.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.gnss import GnssConfig
@@ -81,7 +81,7 @@ def test_the_folder_holds_the_corrected_results_and_the_odometry_s_own(finished:
     corrected, own = read_trajectory(folder.trajectory), read_trajectory(folder.odometry.trajectory)
     np.testing.assert_array_equal(corrected.times, own.times)
     assert corrected.status == own.status
-    assert not folder.spool.exists()
+    assert folder.spool.stat().st_size > 0
     points = len(read_ply(folder.map_ply).points)  # merging thins what came in apart from each other
     assert 0.95 * summary.map_points < points <= summary.map_points and points > 1000
 
@@ -199,8 +199,11 @@ def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path
         np.testing.assert_array_equal(got.T_odo_body, T)
         assert set(map(tuple, got.p_body.tolist())) <= set(map(tuple, put.p_body.tolist()))
         assert (got.intensity is None) == (put.intensity is None)
-    spool.close(remove=True)
-    assert not (tmp_path / "spool").exists()
+    spool.close()
+    assert [scan.time_ns for scan in read_spool(tmp_path / "spool")] == [0, 1, 2, 0, 0]
+    (tmp_path / "spool").write_bytes((tmp_path / "spool").read_bytes()[:-5])
+    with pytest.raises(InputError, match="run it again"):
+        list(read_spool(tmp_path / "spool"))
 
 
 def test_a_spool_goes_on_from_a_mark_with_the_same_bytes(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ OUTDOORS = DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
 INDOORS = DriftConfig(
     speed=1.5, step_m=1.0, corner_radius=1.0, height=1.2, max_range=40.0, vertical_fov_deg=(-25.0, 25.0), channels=16
 )
-QUICK = SessionsConfig(slam=SlamConfig(least_overlap=0.6, descriptor=DescriptorConfig(candidates=2)))
+QUICK = SessionsConfig(slam=SlamConfig(least_overlap=0.6, rival_fit=0.85, descriptor=DescriptorConfig(candidates=2)))
 Sessions = tuple[list[Session], list[MappedDrive]]
 
 

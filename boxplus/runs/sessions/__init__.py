@@ -1,0 +1,1 @@
+"""`boxplus map merge`: several runs of one place, one map."""

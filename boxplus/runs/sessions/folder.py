@@ -1,0 +1,94 @@
+"""The output folder of `boxplus map merge` (docs/output_folder.md)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from boxplus.errors import InputError
+from boxplus.formats.output import replaced_folder
+from boxplus.runs.output_folder import SUMMARY, program_of
+from boxplus.runs.run_folder import is_map_file
+
+PROGRAM = "boxplus map merge"
+_OWN = re.compile(
+    r"run\.json|config\.yaml|encounters\.csv|changes\.csv|map\.ply|removed\.ply|sessions/[^/]+\.(csv|tum|kitti\.txt)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MergeFolder:
+    """The paths of the results."""
+
+    path: Path
+
+    @property
+    def summary(self) -> Path:
+        """Facts: sessions, where they are, what is apart and why."""
+        return self.path / SUMMARY
+
+    @property
+    def config(self) -> Path:
+        """The settings as used."""
+        return self.path / "config.yaml"
+
+    @property
+    def encounters(self) -> Path:
+        """Every pair of local maps of two sessions that was looked at."""
+        return self.path / "encounters.csv"
+
+    @property
+    def changes(self) -> Path:
+        """What vanished and appeared between sessions."""
+        return self.path / "changes.csv"
+
+    @property
+    def tiles(self) -> Path:
+        """The joint map in tiles."""
+        return self.path / "map"
+
+    @property
+    def map_ply(self) -> Path:
+        """The joint map in one file."""
+        return self.path / "map.ply"
+
+    @property
+    def removed(self) -> Path:
+        """Points that were seen through."""
+        return self.path / "removed.ply"
+
+    @property
+    def sessions(self) -> Path:
+        """Folder of the trajectories in the joint world, one of each session."""
+        return self.path / "sessions"
+
+
+@contextmanager
+def replaced_merge(folder: str | Path, *, overwrite: bool = False) -> Iterator[MergeFolder]:
+    """A folder to write into, which takes the place of `folder` when the block ends well; until then what is there stays whole.
+
+    Raises:
+        InputError: the folder holds something else, or an earlier merge and `overwrite` is not set.
+        OutputError: it cannot be created, cleared or renamed.
+    """
+    path = Path(folder)
+    if path.is_dir() and (content := [file for file in path.rglob("*") if not file.is_dir()]):
+        names = {file: file.relative_to(path) for file in content}
+        is_own = (path / SUMMARY).is_file() and program_of(path / SUMMARY) == PROGRAM
+        foreign = [file for file, name in names.items() if not (_OWN.fullmatch(name.as_posix()) or _is_tile(name))]
+        if not is_own or foreign:
+            raise InputError("a new or empty output folder", f"other files in {path}", "choose another folder with --output")
+        if not overwrite:
+            raise InputError(
+                "a new or empty output folder", f"the results of an earlier merge in {path}",
+                "choose another folder with --output, or add --overwrite to replace them",
+            )  # fmt: skip
+    with replaced_folder(path) as made:
+        yield MergeFolder(made)
+
+
+def _is_tile(name: Path) -> bool:
+    return name.parts[0] == "map" and is_map_file(Path(*name.parts[1:]))

@@ -1,0 +1,209 @@
+"""`boxplus map merge`: runs of `boxplus slam` with unknown start poses in, one map of those that met out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError, printable
+from boxplus.formats.output import atomic_file
+from boxplus.formats.ply import PlyWriter
+from boxplus.formats.trajectory import read_trajectory
+from boxplus.formats.trajectory_writer import TrajectoryWriter
+from boxplus.manifolds import quaternion, se3
+from boxplus.maps.seen_through import SeenThrough
+from boxplus.maps.tiles.store import merge
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+from boxplus.maps.tiles.writer import TileWriter
+from boxplus.runs.run_loop import versions
+from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
+from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
+from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
+from boxplus.runs.sessions.summary import MergeSummary, SessionFacts
+from boxplus.runs.sessions.tables import write_changes, write_encounters
+from boxplus.systems.sessions.encounter import Meeting
+from boxplus.systems.sessions.session import Session
+from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions
+from boxplus.systems.slam.correction import Correction
+
+Floats = NDArray[np.float64]
+Align = Callable[[Sequence[Session]], SessionAlignment]
+
+_THINNED = 2_000_000  # points collected before they are thinned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergeResult:
+    """What a merge leaves in memory: `summary` as in `run.json`, and `alignment` of all sessions."""
+
+    summary: MergeSummary
+    alignment: SessionAlignment
+
+
+def merge_runs(
+    folders: Sequence[str | Path],
+    output: str | Path,
+    config: MergeConfig | None = None,
+    *,
+    remove_dynamic: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Meeting], None] | None = None,
+    align: Align | None = None,
+) -> MergeResult:
+    """Find out which runs met, and write one map of the largest group that did; the runs themselves stay as they are.
+
+    Args:
+        folders: output folders of finished runs of 'boxplus slam', in order of time; the first that is joined gives the frame.
+        output: created; docs/output_folder.md says what it holds. An earlier merge there stays whole until the new one is.
+        config: settings; each has a default.
+        remove_dynamic: leave out of the map what rays of other stretches of way went through, and report what changed.
+        overwrite: replace an earlier merge.
+        progress: called with every pair of sessions.
+        align: says where the sessions are; `align_sessions` over all pairs where it is left out.
+
+    Raises:
+        InputError: fewer than two runs, or one that is none; a folder that holds something else; OpenCV is not installed.
+        OutputError: the disk is full or the folder cannot be written; what was there before stays whole.
+    """
+    began = time.perf_counter()
+    config = config if config is not None else MergeConfig()
+    paths = [Path(folder) for folder in folders]
+    if len({path.resolve() for path in paths}) < max(len(paths), 2):
+        raise InputError("two runs at least, each given once", f"{[str(path) for path in paths]}", "name their output folders")
+    runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
+    with replaced_merge(output, overwrite=overwrite) as own:
+        sessions = [run.session for run in runs]
+        alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
+        world = alignment.worlds[0]
+        summary = _facts(runs, alignment).model_copy(update={"remove_dynamic": remove_dynamic})
+        names = [run.session.name for run in runs]
+        with atomic_file(own.config) as file:
+            file.write(dump_merge_config(config).encode())
+        write_encounters(own.encounters, alignment.meetings, names)
+        if len(world.members) > 1:
+            update = _write_map(own, runs, world, config, remove_dynamic)
+            for number, T in zip(world.members, world.T_world_map, strict=True):
+                _write_trajectory(own, runs[number], T)
+            summary = summary.model_copy(update=update)
+        summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
+        summary.write(own.summary)
+    return MergeResult(summary, alignment)
+
+
+def _facts(runs: Sequence[SessionRun], alignment: SessionAlignment) -> MergeSummary:
+    world = alignment.worlds[0]
+    is_joined = len(world.members) > 1
+    sessions, warnings = [], []
+    for number, run in enumerate(runs):
+        there = is_joined and number in world.members
+        facts = SessionFacts(
+            name=run.session.name,
+            run=printable(str(run.folder.path.resolve())),
+            local_maps=len(run.session.maps),
+            joined=there,
+            apart_because=[] if there else alignment.why_apart(number),
+            doubt=run.doubt,
+        )
+        if there:
+            row = world.members.index(number)
+            T = world.T_world_session[row]
+            rigid = se3.compose(np.broadcast_to(T, run.session.T_session_map.shape), run.session.T_session_map)
+            bend = np.linalg.norm(world.T_world_map[row][:, 4:] - rigid[:, 4:], axis=1).max()
+            sigma = np.sqrt(np.diag(world.covariance[row]))
+            facts = facts.model_copy(
+                update={"T_world_session": T.tolist(), "sigma": sigma.tolist(), "largest_bend_m": float(bend)}
+            )
+        sessions.append(facts)
+        if run.doubt is not None:
+            warnings.append(f"{run.session.name} is not to be trusted itself: {run.doubt}")
+    for other in alignment.worlds[1:]:
+        if is_joined and len(other.members) > 1:
+            them = " and ".join(runs[k].session.name for k in other.members)
+            warnings.append(f"{them} met each other but none of the others: merge them by themselves")
+    return MergeSummary(
+        versions=versions("opencv-python-headless"),
+        created=datetime.now(UTC),
+        sessions=sessions,
+        encounters_looked_at=sum(len(meeting.encounters) for meeting in alignment.meetings),
+        encounters_accepted=sum(len(meeting.accepted) for meeting in alignment.meetings),
+        warnings=warnings,
+    )
+
+
+def _write_map(
+    own: MergeFolder, runs: Sequence[SessionRun], world: JointWorld, config: MergeConfig, remove_dynamic: bool
+) -> dict[str, object]:
+    """Tiles of all scans where the sessions are now, without what was seen through; returns facts."""
+    members = [(runs[number], T) for number, T in zip(world.members, world.T_world_map, strict=True)]
+    seen = _rays_through(members, config) if remove_dynamic else None
+    has_intensity = all(_has_intensity(run, T) for run, T in members)
+    removed = 0
+    with TileWriter(own.tiles, tile_size=config.map.tile_size, voxel=config.map.voxel) as tiles:
+        if seen is None:
+            for run, T in members:
+                for scan in run.scans(T):
+                    tiles.append(scan.points, scan.intensity if has_intensity else None)
+        else:
+            with PlyWriter(own.removed) as apart:
+                for run, T in members:
+                    for scan in run.scans(T):
+                        goes = seen.is_removed(scan.points)
+                        intensity = scan.intensity if has_intensity else None
+                        tiles.append(scan.points[~goes], None if intensity is None else intensity[~goes])
+                        apart.append(scan.points[goes], None if intensity is None else intensity[goes])
+                        removed += int(np.count_nonzero(goes))
+    if config.map.ply:
+        merge(own.tiles, own.map_ply)
+    if seen is None:
+        return {"map_points": tiles.stored}
+    changes = write_changes(own.changes, seen, [run.session.name for run, _ in members], config.map.change_voxels)
+    return {"map_points": tiles.stored, "removed_points": removed, "changes": changes}
+
+
+def _rays_through(members: Sequence[tuple[SessionRun, Floats]], config: MergeConfig) -> SeenThrough:
+    """The rays of all sessions, stretch by stretch, against the points of all of them."""
+    edge = 0.5 * config.seen_through.voxel
+    kept, waiting, count = np.zeros((0, 3), np.float32), list[NDArray[np.float32]](), 0
+    for run, T in members:
+        for scan in run.scans(T):
+            waiting.append(scan.points.astype(np.float32))
+            count += len(scan.points)
+            if count > _THINNED:
+                kept, waiting, count = _thinned([kept, *waiting], edge), [], 0
+    kept = _thinned([kept, *waiting], edge)
+    seen = SeenThrough(kept.astype(np.float64), len(members), config.seen_through)
+    for number, (run, T) in enumerate(members):
+        for origins, ends in run.stretches(T):
+            seen.add_stretch(number, origins, ends)
+    return seen
+
+
+def _thinned(parts: Sequence[NDArray[np.float32]], edge: float) -> NDArray[np.float32]:
+    points = np.concatenate(parts)
+    return np.ascontiguousarray(points[first_per_voxel(points, edge)])
+
+
+def _has_intensity(run: SessionRun, T: Floats) -> bool:
+    return next((scan.intensity is not None for scan in run.scans(T)), True)
+
+
+def _write_trajectory(own: MergeFolder, run: SessionRun, T_world_map: Floats) -> None:
+    """A session's trajectory in the joint world; its covariance is that of the session, against its own first pose."""
+    before = read_trajectory(run.folder.trajectory)
+    none = np.zeros((len(T_world_map), 6, 6))
+    placed = Correction(run.correction.time_ns, run.correction.T_map, T_world_map, none, none, none)
+    poses = placed.apply(before.times, np.hstack([before.q_wxyz, before.p]))
+    R_world_session = quaternion.to_matrix(poses[:, :4]) @ np.swapaxes(quaternion.to_matrix(before.q_wxyz), 1, 2)
+    with TrajectoryWriter(own.sessions, run.session.name) as writer:
+        for k, (time_ns, T) in enumerate(zip(before.times.tolist(), poses, strict=True)):
+            turn = np.eye(6)  # positions are along the world's axes
+            turn[3:, 3:] = R_world_session[k]
+            covariance = np.zeros((6, 6)) if before.covariance is None else turn @ before.covariance[k] @ turn.T
+            status = "ok" if before.status is None else before.status[k]
+            writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance, status)

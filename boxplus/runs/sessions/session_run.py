@@ -1,0 +1,127 @@
+"""A finished run of `boxplus slam` as a session: its local maps and loops, and its scans for the joint map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.manifolds import se3
+from boxplus.maps.local_maps.folder import LocalMapFolder
+from boxplus.runs.output_folder import program_of
+from boxplus.runs.run_summary import read_summary
+from boxplus.runs.slam.folder import PROGRAM, SlamFolder
+from boxplus.runs.slam.graph_file import read_graph
+from boxplus.runs.slam.spool import read_spool
+from boxplus.runs.slam.summary import read_slam_summary
+from boxplus.systems.sessions.session import OwnLoop, Session
+from boxplus.systems.slam.correction import Correction
+
+Floats = NDArray[np.float64]
+
+_ADVICE = "run 'boxplus slam' on the recording, to its end and with a map"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedScan:
+    """A scan in the world.
+
+    Attributes:
+        time_ns: absolute [ns].
+        origin: (3,) where its rays began; points: (N, 3) where they ended [m].
+        intensity: (N,) or None.
+    """
+
+    time_ns: int
+    origin: Floats
+    points: Floats
+    intensity: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionRun:
+    """A run, opened.
+
+    Attributes:
+        folder: its output folder; session: what is aligned; correction: of its own loops.
+        doubt: why the run itself is not to be trusted; None where nothing speaks against it.
+        p_imu_lidar: (3,) the LiDAR in the frame of the poses [m].
+    """
+
+    folder: SlamFolder
+    session: Session
+    correction: Correction
+    doubt: str | None
+    p_imu_lidar: Floats
+
+    def placed(self, T_world_map: Floats) -> Correction:
+        """What takes poses of the odometry into the world in which the local maps are at T_world_map (n, 7)."""
+        none = np.zeros((len(T_world_map), 6, 6))
+        return Correction(self.correction.time_ns, self.correction.T_odo, T_world_map, none, none, none)
+
+    def scans(self, T_world_map: Floats) -> Iterator[PlacedScan]:
+        """Every scan that was kept, in that world.
+
+        Raises:
+            InputError: the file of scans is damaged.
+        """
+        placed = self.placed(T_world_map)
+        for scan in read_spool(self.folder.spool):
+            T = placed.apply([scan.time_ns], scan.T_odo_body[None])[0]
+            points = se3.act(T, scan.p_body.astype(np.float64)).reshape(-1, 3)
+            yield PlacedScan(scan.time_ns, se3.act(T, self.p_imu_lidar), points, scan.intensity)
+
+    def stretches(self, T_world_map: Floats) -> Iterator[tuple[Floats, Floats]]:
+        """Origins and ends (n, 3) of the rays of each local map's stretch of way, in that world [m]."""
+        ends_ns = np.array([local_map.end_ns for local_map in self.session.maps])
+        number, origins, ends = 0, list[Floats](), list[Floats]()
+        for scan in self.scans(T_world_map):
+            own = int(np.searchsorted(ends_ns, scan.time_ns))
+            if own != number and ends:
+                yield np.concatenate(origins), np.concatenate(ends)
+                origins, ends = [], []
+            number = own
+            origins.append(np.broadcast_to(scan.origin, scan.points.shape))
+            ends.append(scan.points)
+        if ends:
+            yield np.concatenate(origins), np.concatenate(ends)
+
+
+def open_session_run(folder: str | Path, name: str) -> SessionRun:
+    """Open the output folder of a run as a session of a name.
+
+    Raises:
+        InputError: not a run of 'boxplus slam', one that did not come to its end, or one that kept no scans.
+    """
+    own = SlamFolder(Path(folder))
+    program = program_of(own.summary) if own.summary.is_file() else None
+    if program != PROGRAM:
+        raise InputError("the output folder of a run of 'boxplus slam'", f"{own.path} ({program or 'no run'})", _ADVICE)
+    summary = read_slam_summary(own.summary)
+    if summary.state != "finished":
+        raise InputError("a run that came to its end", f"{own.path}: {summary.describe_state()}", "go on with it: --resume")
+    if not own.spool.is_file():
+        raise InputError("a run that kept its scans", f"no {own.spool.name} in {own.path}", _ADVICE)
+    stored, outcome = LocalMapFolder(own.local_maps), read_graph(own.graph)
+    placed = outcome.placed  # in the frame of its trajectory and map, which is the Earth's where it was laid onto it
+    maps = [stored[number] for number in range(len(placed.time_ns))]
+    loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
+    extrinsic = read_summary(own.odometry.summary).extrinsic
+    T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
+    session = Session.of(name, maps, placed.T_map, loops)
+    return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3])
+
+
+def session_names(folders: Sequence[Path]) -> list[str]:
+    """A name for each folder: its own, with a number where an earlier one has it too."""
+    seen: dict[str, int] = {}
+    found = []
+    for folder in folders:
+        name = folder.resolve().name
+        seen[name] = seen.get(name, 0) + 1
+        found.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+    return found

@@ -1,0 +1,192 @@
+"""`boxplus map merge` over folders of runs: what is joined, what is apart, what was seen through, and what a full disk leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from boxplus.cli.map import map_app
+from boxplus.errors import InputError, OutputError
+from boxplus.formats.ply import read_ply
+from boxplus.formats.trajectory import read_trajectory
+from boxplus.manifolds import se3
+from boxplus.maps.tiles.store import TileStore
+from boxplus.maps.tiles.writer import TileWriter
+from boxplus.runs.sessions.config import MergeConfig
+from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
+from boxplus.runs.sessions.update_run import update_map
+from boxplus.runs.settings_file import load_settings
+from boxplus.simulation.drifting_drive import DriftConfig, DriftingDrive
+from boxplus.simulation.worlds.world import World, box
+from boxplus.simulation.worlds.worlds import city
+from boxplus.systems.sessions.sessions import align_sessions
+from tests.runs.sessions.runs import written_run
+
+DRIFT = DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
+QUICK = [
+    "sessions.slam={least_overlap: 0.6, rival_fit: 0.85, descriptor: {candidates: 2}}",
+    "map.voxel=0.2",
+    "seen_through.voxel=0.3",
+]
+VAN = (30.0, 3.5, 1.3)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[DriftingDrive]]:
+    """A street on Monday with a van at its side, on Friday without, and a short drive in another city."""
+    base, world = tmp_path_factory.mktemp("runs"), city(2, 2, seed=5)
+    with_van = World([*world.solids, box(VAN, (5.0, 2.0, 2.4))])
+    folders = [base / "monday", base / "friday", base / "elsewhere"]
+    drives = [
+        written_run(folders[0], with_van, [[0.0, 0.0], [60.0, 0.0], [60.0, 40.0]], DRIFT, 5),
+        written_run(folders[1], world, [[60.0, 50.0], [60.0, 0.0], [10.0, 0.0]], DRIFT, 6),
+        written_run(folders[2], city(2, 2, seed=99), [[60.0, 30.0], [60.0, 0.0], [50.0, 0.0]], DRIFT, 7),
+    ]
+    return folders, drives
+
+
+@pytest.fixture(scope="module")
+def merged(runs: tuple[list[Path], list[DriftingDrive]], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MergeResult]:
+    out = tmp_path_factory.mktemp("merged") / "out"
+    return out, merge_runs(runs[0], out, load_settings(MergeConfig, None, QUICK), remove_dynamic=True)
+
+
+def of_van(points: np.ndarray, drive: DriftingDrive) -> np.ndarray:
+    """Points in the frame of Monday's run that lie on the van."""
+    p = se3.act(drive.T_world_body[0], points.astype(np.float64))
+    return np.asarray((np.abs(p - VAN) <= [2.7, 1.2, 1.3]).all(axis=1) & (p[:, 2] > 0.5))
+
+
+def test_runs_that_met_are_one_map_and_the_other_is_apart(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult]
+) -> None:
+    out, result = merged
+    facts = {session["name"]: session for session in json.loads((out / "run.json").read_text())["sessions"]}
+    assert [facts[name]["joined"] for name in ("monday", "friday", "elsewhere")] == [True, True, False]
+    assert len(facts["elsewhere"]["apart_because"]) == 2 and max(facts["friday"]["sigma"][3:]) < 0.3
+    assert result.summary.map_points == TileStore.open(out / "map").point_count > 10_000
+    for name, drive in zip(("monday", "friday"), runs[1], strict=False):
+        found = read_trajectory(out / "sessions" / f"{name}.tum")
+        truth = se3.compose(
+            np.broadcast_to(se3.inverse(runs[1][0].T_world_body[0]), drive.T_world_body.shape), drive.T_world_body
+        )
+        assert np.linalg.norm(found.p - truth[:, 4:], axis=1).max() < 0.4
+    assert not (out / "sessions" / "elsewhere.tum").exists()
+    with (out / "encounters.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == result.summary.encounters_looked_at
+    assert all((row["accepted"] == "1") == (row["refusal"] == "") for row in rows)
+
+
+def test_the_van_that_left_is_kept_apart_and_reported(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult]
+) -> None:
+    out, result = merged
+    monday = runs[1][0]
+    kept, removed = read_ply(out / "map.ply").points, read_ply(out / "removed.ply").points
+    assert len(removed) == result.summary.removed_points
+    assert of_van(removed, monday).sum() > 1.5 * of_van(kept, monday).sum()  # few rays: a scan every two metres, 16 lines
+    assert (~of_van(removed, monday)).sum() < 1e-3 * len(kept)
+    with (out / "changes.csv").open() as file:
+        vanished = [row for row in csv.DictReader(file) if row["what"] == "vanished"]
+    at = se3.act(monday.T_world_body[0], [[float(row[k]) for k in "xyz"] for row in vanished])
+    assert np.linalg.norm(at - VAN, axis=1).min() < 1.5
+
+
+def test_runs_that_did_not_meet_are_left_as_they_are(runs: tuple[list[Path], list[DriftingDrive]], tmp_path: Path) -> None:
+    arguments = ["merge", str(runs[0][0]), str(runs[0][2]), "-o", str(tmp_path / "out"), *(f"--set={text}" for text in QUICK)]
+    result = CliRunner().invoke(map_app, arguments)
+    assert result.exit_code == 3
+    assert "no two of the runs met" in result.output and "elsewhere: apart" in result.output
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.yaml", "encounters.csv", "run.json"]
+
+
+def test_a_full_disk_leaves_the_earlier_map_whole(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, result = merged
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: result.alignment)
+
+    def full(*_: object) -> None:
+        raise OutputError("a full disk")
+
+    monkeypatch.setattr(TileWriter, "append", full)
+    with pytest.raises(OutputError, match="a full disk"):
+        merge_runs(runs[0], out, overwrite=True)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_what_cannot_be_merged_is_refused(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="two runs at least, each given once"):
+        merge_runs([runs[0][0], runs[0][0]], tmp_path / "out")
+    with pytest.raises(InputError, match="the output folder of a run of 'boxplus slam'"):
+        merge_runs([runs[0][0], merged[0]], tmp_path / "out")
+    with pytest.raises(InputError, match="add --overwrite"):
+        merge_runs(runs[0][:2], merged[0])
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="other files in"):
+        merge_runs(runs[0][:2], tmp_path, overwrite=True)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+@contextmanager
+def without(path: Path) -> Iterator[None]:
+    moved = path.with_name(path.name + ".away")
+    path.rename(moved)
+    yield
+    moved.rename(path)
+
+
+def test_a_run_without_its_scans_is_refused(runs: tuple[list[Path], list[DriftingDrive]], tmp_path: Path) -> None:
+    with without(runs[0][0] / "scans.spool"), pytest.raises(InputError, match="a run that kept its scans"):
+        merge_runs(runs[0][:2], tmp_path / "out")
+
+
+def test_an_update_that_met_nobody_leaves_the_map_alone(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, result = merged
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: result.alignment)
+    shown = CliRunner().invoke(map_app, ["update", str(out), str(runs[0][2])])
+    assert shown.exit_code == 3 and "stays as it was" in shown.output and "elsewhere: apart" in shown.output
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def test_an_update_goes_on_with_a_map(
+    runs: tuple[list[Path], list[DriftingDrive]],
+    merged: tuple[Path, MergeResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Sunday meets both, which then need not meet each other again."""
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", partial(align_sessions, pairs=[(0, 2), (1, 2)]))
+    folders, drives = runs
+    sunday, out = tmp_path / "sunday", tmp_path / "out"
+    drive = written_run(sunday, city(2, 2, seed=5), [[5.0, 0.0], [60.0, 0.0], [60.0, 10.0]], DRIFT, 9)
+    shutil.copytree(merged[0], out)
+    first = read_trajectory(out / "sessions" / "monday.tum").p
+    result, _ = update_map(out, [sunday])
+    assert result is not None and [session.name for session in result.summary.joined] == ["monday", "friday", "sunday"]
+    assert np.linalg.norm(read_trajectory(out / "sessions" / "monday.tum").p - first, axis=1).max() < 0.3
+    found = read_trajectory(out / "sessions" / "sunday.tum").p
+    truth = se3.compose(np.broadcast_to(se3.inverse(drives[0].T_world_body[0]), drive.T_world_body.shape), drive.T_world_body)
+    assert np.linalg.norm(found - truth[:, 4:], axis=1).max() < 0.4
+    with pytest.raises(InputError, match="which is"):
+        update_map(out, [folders[1]])
+    sunday.rename(tmp_path / "gone")
+    with pytest.raises(InputError, match="nothing at"):
+        update_map(out, [folders[2]])
