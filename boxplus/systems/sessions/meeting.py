@@ -9,6 +9,7 @@
 4. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
    look like one of the other: refused.
 5. *Support*: enough encounters, of different local maps, along a way.
+6. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
+from boxplus.systems.sessions.other_alignments import fits_otherwise
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.loop import Floats, Loop
@@ -87,6 +89,8 @@ class _Meeting:
         kept = {id(loop) for loop, is_kept in zip(chosen, joined.is_kept, strict=True) if is_kept}
         if refusal := self._too_little([loop for loop in chosen if id(loop) in kept], predicted, confirmed):
             return self._refused(refusal, predicted, confirmed)
+        if otherwise := fits_otherwise(self.place, self.query, joined.T_world_session[1], self.config):
+            return self._refused(otherwise, predicted, confirmed)
         against = "contradicts the encounters that agree with each other"
         final = [
             loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)

@@ -1,0 +1,100 @@
+"""Would two sessions fit as well otherwise, as a whole? Shifted within reach, or turned by a quarter, half or three quarters.
+
+A hall that is the same seen from either end, a corridor with a twin: every local map has its own place there, and none of them a
+rival near by. Only the sessions as wholes have one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.manifolds import se3
+from boxplus.systems.sessions.config import SessionsConfig
+from boxplus.systems.sessions.places import Places
+from boxplus.systems.slam.loop import Floats
+from boxplus.systems.slam.registration import register
+from boxplus.systems.slam.rivals import rival_shifts, turned_rivals
+
+_AGREEMENT = 0.6  # of density images, against that of the alignment found, for another one to be tried
+_SHIFTS = 3  # tried
+_POINTS = 200_000  # of a session, in its density image
+_PAIRS = 8  # of local maps that are laid over each other for one alignment
+_SAME_TURN = 0.2  # rad
+_RMS_FLOOR = 0.02  # m: successive maps that fit better than this say nothing about others
+
+
+def fits_otherwise(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> str | None:
+    """A sentence on another alignment of two sessions whose local maps lie over each other as well; None where there is none.
+
+    Args:
+        T_place_query: (7,) of the sessions' frames, as found.
+    """
+    middle = np.concatenate([[1.0, 0.0, 0.0, 0.0], query.session.T_session_map[:, 4:].mean(axis=0)])
+    own = _cloud(query, se3.inverse(middle))
+    there = _cloud(place, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    T, cell = se3.compose(T_place_query, middle), config.slam.descriptor.cell
+    others = turned_rivals(own, there, T, cell=cell, reach=config.reach, share=_AGREEMENT)
+    least, sigma = config.slam.rival_distance, np.eye(2) * (config.reach / 3.0) ** 2
+    for shift in rival_shifts(own, there, T, cell=cell, least=least, sigma=sigma, share=_AGREEMENT, count=_SHIFTS):
+        moved = T.copy()
+        moved[4:6] += shift
+        others.append(moved)
+    wanted = len(_pairs(place, query, T_place_query, config))
+    for other in others:
+        alignment = se3.compose(other, se3.inverse(middle))
+        pairs = _pairs(place, query, alignment, config)
+        if len(pairs) < config.rival_share * wanted:
+            continue
+        tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).round().astype(int))]
+        fitting = sum(_fits(place, query, pair, alignment, T_place_query, config) for pair in tried)
+        if fitting >= config.least_confirmed * len(tried):
+            xi = se3.log(se3.compose(se3.inverse(T), other))
+            turn = np.rad2deg(np.linalg.norm(xi[:3]))
+            how = f"turned by {turn:.0f}°" if turn > 45.0 else f"{np.linalg.norm(other[4:] - T[4:]):.1f} m away"
+            return f"as wholes they fit as well {how}"
+    return None
+
+
+def _cloud(places: Places, T: Floats) -> NDArray[np.float32]:
+    """Points (N, 3) of a session in its frame moved by T (7,), about as many of each local map."""
+    maps = places.session.maps
+    step = max(sum(len(local_map.points) for local_map in maps) // _POINTS, 1)
+    parts = [
+        se3.act(se3.compose(T, pose), local_map.points[::step].astype(np.float64)).reshape(-1, 3)
+        for local_map, pose in zip(maps, places.session.T_session_map, strict=True)
+    ]
+    return np.concatenate(parts).astype(np.float32)
+
+
+def _pairs(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> list[tuple[int, int]]:
+    """For each local map of the query session the one of the other that lies nearest under an alignment, and near."""
+    positions = place.session.T_session_map[:, 4:]
+    found = []
+    for number, p in enumerate(se3.act(T_place_query, query.session.T_session_map[:, 4:]).reshape(-1, 3)):
+        distance = np.linalg.norm(positions - p, axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] <= config.nearby:
+            found.append((number, nearest))
+    return found
+
+
+def _fits(
+    place: Places, query: Places, pair: tuple[int, int], T_other: Floats, T_place_query: Floats, config: SessionsConfig
+) -> bool:
+    """Whether two local maps overlap as they should, and stay where another alignment puts them, not where the first one does."""
+    number, where = pair
+    if not (len(query.session.maps[number].points) and len(place.session.maps[where].points)):
+        return False
+    T = place.session.T_session_map[where], query.session.T_session_map[number]
+    start, first = (se3.compose(se3.inverse(T[0]), se3.compose(A, T[1])) for A in (T_other, T_place_query))
+    found = register(query.surface(number), place.surface(where), start, config.slam.registration)
+    if found is None:
+        return False
+    from_other, from_first = (se3.log(se3.compose(se3.inverse(A), found.T_target_source)) for A in (start, first))
+    if np.linalg.norm(from_other[3:]) > config.nearby:
+        return False
+    if np.linalg.norm(from_first[:3]) < _SAME_TURN and np.linalg.norm(from_first[3:]) < config.slam.rival_distance:
+        return False  # it came back
+    bound = config.slam.largest_rms * max(query.rms(number), place.rms(where), _RMS_FLOOR)
+    return min(found.overlap) >= config.slam.least_overlap and found.rms <= bound
