@@ -28,7 +28,7 @@ class LocalizationConfig(BaseModel):
     least_overlap: float = Field(0.6, ge=0, le=1, description="share of all points near a point of the map")
     largest_rms: float = Field(0.12, gt=0, description="spread of distances to the map's planes [m]")
     most_seen_through: float = Field(0.2, ge=0, le=1, description="share of directions in which the map has something nearer")
-    decisive: float = Field(2.0, ge=1, description="fit over that of the second-best place to be believed at once")
+    decisive: float = Field(3.0, ge=1, description="fit over that of the second-best place to be believed at once")
     telling: float = Field(0.1, gt=0, lt=1, description="fit more than any other pose to be believed when two queries agree")
     telling_misfit: float = Field(3.0, gt=1, description="or half of that, and so many times less that does not fit")
     track_interval: float = Field(0.3, ge=0, description="time between registrations of a scan to the map [s]")

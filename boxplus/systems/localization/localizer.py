@@ -24,7 +24,7 @@ from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.localization.candidate import Candidate, Query, examine_all, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
-from boxplus.systems.localization.global_search import PlaceImages, same_pose
+from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
 from boxplus.systems.localization.place_map import PlaceMap
 from boxplus.systems.localization.tracking import Matched, Tracker
 
@@ -35,6 +35,7 @@ _AGREE = 1.0, np.deg2rad(5.0), 1.0  # m, rad, m: two queries that say the same, 
 _QUERY_RANGE = 60.0  # m
 _STILL = 1.0  # s after a registration was taken that a pose is localised, where no later one failed
 _HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+_REMEMBERED = 4  # poses that fitted a query
 _NEVER = -(2**62)
 _JUMP_S = 2.0  # between scans, after which nothing is known of the motion between
 
@@ -99,6 +100,7 @@ class Localizer:
         self._tracker: Tracker | None = None
         self._before: tuple[int, Floats] | None = None
         self._promising: Floats | None = None  # T_map_odo of the query before, where it was nearly believed
+        self._earlier: list[tuple[int, Floats]] = []  # place and T_map_odo of what fitted the query before
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         self._begin_search()
 
@@ -153,8 +155,14 @@ class Localizer:
         if len(local_map.points):
             query = Query.of(local_map.points, seen, T_query_body[4:])
             guesses = self._images.guesses(local_map.points, config.candidates)
+            # What fitted before is asked again: a place that the search misses once stays a rival.
+            earlier = [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
+            guesses += [g for g in earlier if not any(same_pose(g.T_map_query, other.T_map_query) for other in guesses)]
             candidates = examine_all(guesses, query, self._map.points_near, config)
             candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
+            T_odo_query = se3.inverse(local_map.T_odo_map)
+            fitting = [candidate for candidate in candidates if candidate.fit >= config.least_fit][:_REMEMBERED]
+            self._earlier = [(one.place, se3.compose(one.T_map_query, T_odo_query)) for one in fitting]
             verdict = self._judge(candidates, local_map, T_query_body)
         self.last_search = Search(time_ns, tuple(candidates), verdict)
         return self.last_search
@@ -224,6 +232,7 @@ class Localizer:
         config = self.config
         self._tracker = None
         self._promising = None
+        self._earlier = []
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         voxel = self._map.voxel
         self._builder = LocalMapBuilder(

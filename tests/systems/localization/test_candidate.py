@@ -31,7 +31,7 @@ def judged(*candidates: Candidate) -> tuple[bool, bool]:
 
 def test_a_rival_that_fits_nearly_as_well_forbids_to_believe() -> None:
     assert judged(candidate(0.9)) == (True, True)
-    assert judged(candidate(0.9), candidate(0.4, 30.0)) == (True, True)
+    assert judged(candidate(0.9), candidate(0.3, 30.0)) == (True, True)
     assert judged(candidate(0.9), candidate(0.6, 30.0)) == (True, False)  # a second query has to agree
     assert judged(candidate(0.9), candidate(0.82, 30.0))[0] is False
     assert judged(candidate(0.9), candidate(0.82, 4.0))[0] is False  # a column farther
