@@ -156,8 +156,7 @@ class Localizer:
             query = Query.of(local_map.points, seen, T_query_body[4:])
             guesses = self._images.guesses(local_map.points, config.candidates)
             # What fitted before is asked again: a place that the search misses once stays a rival.
-            earlier = [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
-            guesses += [g for g in earlier if not any(same_pose(g.T_map_query, other.T_map_query) for other in guesses)]
+            guesses += [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
             candidates = examine_all(guesses, query, self._map.points_near, config)
             candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
             T_odo_query = se3.inverse(local_map.T_odo_map)
