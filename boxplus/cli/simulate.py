@@ -24,6 +24,10 @@ def simulate_command(
     lens: Annotated[Literal["pinhole", "radtan", "equidistant"] | None, typer.Option(help="Lens of the cameras.")] = None,
     scale: Annotated[float, typer.Option(help="Factor on the 752 x 480 pixels of the cameras.", min=0.05, max=4.0)] = 1.0,
     rate: Annotated[float, typer.Option(help="Images a second [Hz].", min=1.0, max=200.0)] = 20.0,
+    gnss: Annotated[
+        Literal["good", "multipath", "late", "swapped"] | None,
+        typer.Option(help="A satellite receiver beside LiDAR and IMU, and what is wrong with it."),
+    ] = None,
     list_all: Annotated[bool, typer.Option("--list", help="List the scenarios and the faults.")] = False,
 ) -> None:
     """Write a simulated recording, its exact ground truth (NAME.gt.tum) and its parameters (NAME.json)."""
@@ -46,8 +50,10 @@ def simulate_command(
         raise InputError("--camera with a scenario of cameras", "none", "add --camera stereo")
     if camera is None and (lens is not None or format in ("euroc", "tum")):
         raise InputError("--camera with --lens and with formats of cameras", "none", "add --camera stereo")
+    if camera is not None and gnss is not None:
+        raise InputError("--gnss with a LiDAR", "--camera", "leave one of them out")
     if camera is None:
-        _simulate_lidar(scenario, output, seed, fault, "ros1" if format == "ros1" else "ros2", duration)
+        _simulate_lidar(scenario, output, seed, fault, "ros1" if format == "ros1" else "ros2", duration, gnss)
         return
 
     from boxplus.simulation.cameras import make_camera_fault, make_rig, simulate_cameras, write_camera_recording
@@ -64,17 +70,24 @@ def simulate_command(
 
 
 def _simulate_lidar(
-    scenario: str, output: Path, seed: int, fault: str | None, format: Literal["ros2", "ros1"], duration: float | None
+    scenario: str,
+    output: Path,
+    seed: int,
+    fault: str | None,
+    format: Literal["ros2", "ros1"],
+    duration: float | None,
+    gnss: str | None,
 ) -> None:
     from boxplus.simulation.faults import make_fault
+    from boxplus.simulation.gnss import RECEIVERS
     from boxplus.simulation.recording_writer import write_recording
     from boxplus.simulation.simulation import simulate
 
     chosen = make_fault(fault) if fault is not None else None
     simulation = simulate(scenario, seed, duration_s=duration)
-    name = scenario if fault is None else f"{scenario}_{fault}"
+    name = "_".join(part for part in (scenario, fault, gnss and f"gnss_{gnss}") if part)
     with _Progress(name) as progress:
-        path = write_recording(simulation, output / name, format, chosen, progress.show)
+        path = write_recording(simulation, output / name, format, chosen, progress.show, RECEIVERS[gnss] if gnss else None)
     typer.echo(f"{path}: {simulation.scan_count} scans, {simulation.config.duration_s:.1f} s")
     typer.echo(f"{output / name}.gt.tum: exact pose of the IMU at 100 Hz")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 from collections.abc import Sequence
 from html import escape
@@ -18,6 +19,7 @@ from boxplus.report.plots import plain
 from boxplus.report.skeleton import html_table, tiles, warnings_section, write_html
 from boxplus.runs.slam.loop_file import why_refused
 from boxplus.runs.slam.result import SlamResult
+from boxplus.sensors.geodesy import EnuFrame
 from boxplus.systems.slam.loop import Loop
 
 _PLACE, _QUERY = "#8a8f98", "#d1495b"
@@ -55,7 +57,7 @@ def _body(result: SlamResult) -> str:
     warnings = [escape(text) for text in summary.warnings]
     if summary.contradiction is not None:
         warnings.insert(0, escape(summary.contradiction))
-    parts = [head, warnings_section(warnings), _overview(result), _table(result), *_pictures(result)]
+    parts = [head, warnings_section(warnings), _overview(result), _earth(result), _table(result), *_pictures(result)]
     return "\n".join(parts)
 
 
@@ -107,6 +109,35 @@ def _from_above(
     axes.set_title(f"{name} [m]", loc="left" if name == "before" else "right", fontsize=10)
     plain(axes)
     return figure
+
+
+def _earth(result: SlamResult) -> str:
+    """The fixes over the ground track, from the run's files; nothing where the recording has none."""
+    facts = result.summary.gnss
+    if facts is None:
+        return ""
+    if facts.origin is None or facts.heading_sigma_deg is None:
+        return f"<section><h2>On the Earth</h2><p>Not laid onto it: {escape(facts.refusal or '')}</p></section>"
+    with result.folder.gnss.open(encoding="utf-8") as file:
+        fixes = list(csv.DictReader(file))
+    lla = [[float(row[name]) for name in ("latitude_deg", "longitude_deg", "height_m")] for row in fixes]
+    p, used = EnuFrame(*facts.origin).to_enu(lla), np.array([row["used"] == "1" for row in fixes])
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*result.outcome.placed.T_map[:, 4:6].T, color=INK, linewidth=1.2, marker=".", label="local maps")
+    axes.scatter(p[used, 0], p[used, 1], s=12.0, color=_PLACE, linewidths=0, label="fixes used")
+    axes.scatter(p[~used, 0], p[~used, 1], s=16.0, color=_QUERY, linewidths=0, label="fixes that fit nothing")
+    axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
+    axes.legend(framealpha=0.9, fontsize=9)
+    plain(axes)
+    rows = [(str(count), escape(reason)) for reason, count in facts.left_out.items()]
+    left_out = html_table(rows, ("fixes", "not used because")) if rows else ""
+    where = f"{facts.origin[0]:.7f}°, {facts.origin[1]:.7f}°, {facts.origin[2]:.2f} m above the ellipsoid of WGS84"
+    text = (
+        f"Origin {where}: look at the place on a map, an offset of the datum is seen nowhere else. {facts.used} fixes; "
+        f"heading known to {facts.heading_sigma_deg:.2f}°, places to {facts.position_sigma_m:.2f} m."
+    )
+    return f"<section><h2>On the Earth</h2><p>{text}</p>{_embedded(figure, 'fixes over the ground track')}{left_out}</section>"
 
 
 def _table(result: SlamResult) -> str:

@@ -43,6 +43,15 @@ class GnssConfig(BaseModel):
     unit: Literal["deg", "rad"] = "deg"
 
 
+RECEIVERS = {
+    "good": GnssConfig(lever=(0.3, 0.0, 0.8)),
+    "multipath": GnssConfig(lever=(0.3, 0.0, 0.8), multipath=2, multipath_s=6.0),
+    "late": GnssConfig(lever=(0.3, 0.0, 0.8), delay_s=0.3),
+    "swapped": GnssConfig(lever=(0.3, 0.0, 0.8), swapped=True),
+}
+"""Receivers by name, for `boxplus simulate --gnss`."""
+
+
 def simulate_gnss(
     time_ns: ArrayLike, T_enu_imu: ArrayLike, origin: EnuFrame, config: GnssConfig | None = None, seed: int = 0
 ) -> GnssFixes:

@@ -18,7 +18,8 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults
 from boxplus.simulation.bag_writer import BagFormat as Format
-from boxplus.simulation.live_recording import IMU_TOPIC, LIDAR_TOPIC
+from boxplus.simulation.gnss import RECEIVERS
+from boxplus.simulation.live_recording import IMU_TOPIC, LIDAR_TOPIC, fixes_of
 from boxplus.simulation.recording_writer import write_recording
 from tests.simulation.small_simulations import small
 
@@ -52,6 +53,18 @@ def test_round_trip(simulation: Simulation, tmp_path: Path, format: Format) -> N
             np.testing.assert_array_equal(written.time_ns, original.time_ns)
             np.testing.assert_array_equal(written.gyro, original.gyro)
             np.testing.assert_array_equal(written.accel, original.accel)
+
+
+def test_a_receiver_takes_part(simulation: Simulation, tmp_path: Path) -> None:
+    path = write_recording(simulation, tmp_path / "fast", "ros2", gnss=RECEIVERS["good"])
+    with open_recording(path, RecordingOptions(gyro_unit="rad/s")) as recording:
+        written, lever = recording.fixes(), recording.info.p_imu_antenna
+        scans = sum(isinstance(event, Scan) for event in recording)
+    expected = fixes_of(simulation, RECEIVERS["good"])
+    np.testing.assert_array_equal(written.time_ns, expected.time_ns)
+    np.testing.assert_array_equal(written.lat_lon_alt, expected.lat_lon_alt)
+    np.testing.assert_array_equal(written.covariance, expected.covariance)
+    assert lever is not None and lever.tolist() == list(RECEIVERS["good"].lever) and scans == simulation.scan_count
 
 
 def test_ground_truth_and_parameters_lie_beside_it(simulation: Simulation, tmp_path: Path) -> None:

@@ -57,7 +57,6 @@ def write_georeference(folder: SlamFolder, found: Georeference, config: Georefer
 
     Raises:
         OutputError: they cannot be written.
-        InputError: the place has no UTM zone, and UTM is wanted.
     """
     with atomic_file(folder.gnss) as file:
         file.write(_fixes(found).encode())
@@ -65,8 +64,8 @@ def write_georeference(folder: SlamFolder, found: Georeference, config: Georefer
         return
     with atomic_file(folder.georeference) as file:
         file.write(_place(found.frame, found).encode())
-    if config.utm:
-        epsg = utm_epsg(found.frame.latitude, found.frame.longitude)
+    epsg = _epsg(found.frame)
+    if config.utm and epsg is not None:
         trajectory = read_trajectory(folder.trajectory)
         rows = to_utm(found.frame.to_geodetic(trajectory.p), epsg)
         lines = [f"# EPSG:{epsg}, heights above the ellipsoid of WGS84", "time_s,easting_m,northing_m,height_m"]
@@ -119,8 +118,11 @@ def gnss_facts(topic: str, found: Georeference, correction: Correction) -> GnssF
     )
 
 
-def gnss_warnings(found: Georeference) -> list[str]:
+def gnss_warnings(found: Georeference, config: GeoreferenceConfig) -> list[str]:
     """What a user has to be told."""
+    if config.utm and found.frame is not None and _epsg(found.frame) is None:
+        other = gnss_warnings(found, config.model_copy(update={"utm": False}))
+        return [*other, "there is no UTM where this is, beyond 84° N or 80° S"]
     if found.refusal is not None:
         return [f"the positions by satellite are not used: {found.refusal}"]
     return [f"positions by satellite: {text}" for text in found.warnings]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
@@ -91,6 +92,8 @@ def georeference(
         return _judged(graph, attached, frame, start, lever, warnings, config)
     except _Refused as refused:
         return replace(none, refusal=str(refused))
+    except SingularProblemError as error:
+        return replace(none, refusal=f"the fixes do not determine where the map lies: {error}")
 
 
 def _start(

@@ -125,6 +125,8 @@ def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
     assert gated + facts.used == len(rows) and 0 < gated < 0.3 * len(rows) and facts.stretches
     utm = np.loadtxt(folder.trajectory_utm, delimiter=",", skiprows=2)
     np.testing.assert_allclose(utm[:, 1:], to_utm(origin.to_geodetic(trajectory.p), 32632), atol=1e-3)
+    page = folder.report.read_text(encoding="utf-8")
+    assert "fixes over the ground track" in page and f"{origin.latitude:.7f}°" in page
     points = read_ply(folder.map_ply).points.mean(axis=0)
     expected = origin.to_enu(GNSS_ORIGIN.to_geodetic([[20.0, 20.0, 0.0]]))[0]  # the middle of the block
     assert np.linalg.norm((points - expected)[:2]) < 15.0
