@@ -16,6 +16,7 @@ from boxplus.manifolds import quaternion
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import poses_between
+from boxplus.systems.georeference.start import extent_of, find_start
 
 _KINDS = {
     "none": "no alignment: the trajectory is in ENU of the origin",
@@ -23,6 +24,7 @@ _KINDS = {
     "se3": "SE(3) alignment",
     "sim3": "Sim(3) alignment (and scale)",
 }
+_SIGMAS, _LEAST_SIGMA, _DRIFT = 3.0, 1.0, 0.01  # of fixes that agree: standard deviations, [m], share of the extent
 _FAR = 6.0  # times the median, an error that is rather the receiver's
 
 
@@ -109,7 +111,8 @@ def compare_with_fixes(
     Args:
         estimate: poses of a body.
         fixes: of the receiver, taken as they are: errors of it count as the estimate's.
-        alignment: `yaw` (heading and place), `se3`, `sim3`, or `none` for a trajectory that is in ENU of `frame`.
+        alignment: `yaw` (heading and place, by fixes most others agree with), `se3`, `sim3`, or `none` for a
+            trajectory that is in ENU of `frame`.
         lever_arm: (3,) the antenna in the body's frame [m]; zero where left out, with a warning.
         frame: origin; the first fix where left out.
         offset_s: added to the stamps of the estimate [s].
@@ -142,15 +145,23 @@ def compare_with_fixes(
     p = poses[:, 4:] + quaternion.to_matrix(poses[:, :4]) @ lever
     frame = frame if frame is not None else EnuFrame(*fixes.lat_lon_alt[matched[0]].tolist())
     p_enu = frame.to_enu(fixes.lat_lon_alt[matched])
-    found = align(p, p_enu, alignment)
-    error = found.scale * p @ found.R_world_estimate.T + found.p_world_estimate - p_enu
     known = fixes.has_covariance[matched]
     variance = fixes.covariance[matched][known]
     sigma = float(np.sqrt(np.median(0.5 * (variance[:, 0, 0] + variance[:, 1, 1])))) if known.any() else None
+    heard = _agreeing(p, p_enu, sigma) if alignment == "yaw" else np.ones(len(p), dtype=np.bool_)
+    found = align(p[heard], p_enu[heard], alignment)
+    error = found.scale * p @ found.R_world_estimate.T + found.p_world_estimate - p_enu
     return FixComparison(
         frame, found, fixes.time_ns[matched], error, len(fixes) - len(matched), dict(fixes.rejected), sigma,
         tuple(_doubts(error, sigma, lever_arm is not None, estimate.warnings)),
     )  # fmt: skip
+
+
+def _agreeing(p: NDArray[np.float64], p_enu: NDArray[np.float64], sigma: float | None) -> NDArray[np.bool_]:
+    """(M,) fixes to align by: those that most others agree with, so that multipath turns nothing; all where there are none."""
+    tolerance = _SIGMAS * max(sigma if sigma is not None else 0.0, _LEAST_SIGMA) + _DRIFT * extent_of(p)
+    start = find_start(p, p_enu, np.full(len(p), tolerance))
+    return start.inliers if start is not None and start.share > 0.5 else np.ones(len(p), dtype=np.bool_)
 
 
 def _doubts(error: NDArray[np.float64], sigma: float | None, has_lever: bool, before: tuple[str, ...]) -> list[str]:
