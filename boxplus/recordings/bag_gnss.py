@@ -55,7 +55,7 @@ def antenna_of(
     found = None if not frame or frame == imu_frame else chain(transforms, imu_frame, frame)
     key = "p_imu_antenna"
     if found is None:
-        text = f"static transforms do not connect {imu_frame!r} and the antenna's frame {frame!r}: give --gnss-lever-arm"
+        text = f"no static transforms from {imu_frame!r} to the antenna's frame {frame!r}: 'boxplus slam' has --gnss-lever-arm"
         return None, Evidence(key, "unknown", "warning", text)
     T, way = found
     value = ", ".join(f"{x:.3f}" for x in T[:3, 3])

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
+from boxplus.recordings.bag_gnss import NAV_SAT_FIX
 from boxplus.recordings.cameras.open import has_cameras_only, open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.recordings.gnss_source import read_fixes
 from boxplus.recordings.info import Evidence, Topic, Verdict
 from boxplus.recordings.open import open_recording
-from boxplus.recordings.options import RecordingOptions
+from boxplus.recordings.options import NO_GNSS, RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_cover, check_points, check_rate, check_rejected
 from boxplus.runs.inspection.agreement_checks import Compared, check_agreement
 from boxplus.runs.inspection.cameras.examination import examine_cameras
-from boxplus.runs.inspection.gnss_checks import check_gnss
+from boxplus.runs.inspection.gnss_checks import check_gnss, check_receivers
 from boxplus.runs.inspection.imu_checks import check_finite, check_rest, check_saturation, first_second, quiet_stretch
 from boxplus.runs.inspection.lidar_checks import examine_other_lidars
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
@@ -189,6 +191,9 @@ def _examine(
     imu = log.all_imu()
     if info.gnss_topic:
         found += check_gnss(recording.fixes(), np.array(log.scan_start_ns, np.int64), usable(imu))
+    receivers = [topic.name for topic in info.topics if topic.type == NAV_SAT_FIX and topic.count]
+    if len(receivers) > 1 and options.gnss_topic != NO_GNSS:
+        found += check_receivers({topic: read_fixes(info.path, topic) for topic in receivers})
     if not len(imu):
         return
     found += check_rate("imu", imu.time_ns, gap_factor=3.0, slow_hz=_SLOW_IMU_HZ)

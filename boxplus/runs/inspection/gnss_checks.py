@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from boxplus.sensors.geodesy import EnuFrame, utm_epsg
 from boxplus.sensors.gnss import STATUS_NAMES, GnssFixes
 from boxplus.sensors.imu import ImuSamples
 
+_APART = 10.0  # [m] more than antennas of one vehicle and their noise
 _BEYOND = "beyond 90° of latitude or 180° of longitude"
 _LEAST_SIGMA = 1e-3  # no receiver knows a position to less than a millimetre
 _FASTEST = 100.0  # [m/s] between two fixes; faster is a jump
@@ -42,6 +44,39 @@ def check_gnss(fixes: GnssFixes, scan_ns: NDArray[np.int64], imu: ImuSamples) ->
     text = f"{jumps} of {len(steps)} steps are faster than {_FASTEST:g} m/s, the longest goes {steps.max():.1f} m"
     found.append(Evidence("gnss_jumps", str(jumps), "warning" if jumps else "ok", text))
     return found + _check_sense(fixes, p_enu, imu)
+
+
+def check_receivers(receivers: Mapping[str, GnssFixes]) -> list[Evidence]:
+    """Whether several receivers say the same: a datum, or heights of another kind, are off by the same everywhere.
+
+    Args:
+        receivers: fixes by topic, two at least.
+    """
+    (first, reference), *others = receivers.items()
+    found = []
+    for topic, fixes in others:
+        inside = (fixes.time_ns >= reference.time_ns[:1].max(initial=0)) & (
+            fixes.time_ns <= reference.time_ns[-1:].max(initial=0)
+        )
+        if inside.sum() < 2 or len(reference) < 2:
+            text = f"no fixes of {first} and {topic} at the same time: they cannot be compared"
+            found.append(Evidence("gnss_receivers", "unchecked", "warning", text))
+            continue
+        frame = EnuFrame(*np.median(reference.lat_lon_alt, axis=0).tolist())
+        p, q = frame.to_enu(reference.lat_lon_alt), frame.to_enu(fixes.lat_lon_alt[inside])
+        at = np.column_stack([np.interp(fixes.time_ns[inside], reference.time_ns, p[:, k]) for k in range(3)])
+        offset = np.median(q - at, axis=0)
+        scatter = 1.4826 * float(np.median(np.linalg.norm(q - at - offset, axis=1)))
+        ground, height = float(np.linalg.norm(offset[:2])), abs(float(offset[2]))
+        listed = ", ".join(f"{x:+.1f}" for x in offset)
+        text = f"{topic} lies {listed} m east, north, up of {first} (median; it scatters by {scatter:.1f} m)"
+        if ground > _APART or height > 2.0 * _APART:
+            kind = "another datum" if ground > _APART else "heights above the sea and above the ellipsoid"
+            text += f": {kind}; which one is right, a map or a survey mark tells"
+            found.append(Evidence("gnss_receivers", f"{np.linalg.norm(offset):.1f} m apart", "error", text))
+        else:
+            found.append(Evidence("gnss_receivers", f"{np.linalg.norm(offset):.1f} m apart", "ok", text))
+    return found
 
 
 def _check_status(fixes: GnssFixes) -> list[Evidence]:

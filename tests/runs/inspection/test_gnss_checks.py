@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.recordings.info import Evidence
-from boxplus.runs.inspection.gnss_checks import check_gnss
+from boxplus.runs.inspection.gnss_checks import check_gnss, check_receivers
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.sensors.imu import ImuSamples
@@ -61,3 +61,22 @@ def test_metres_in_the_place_of_degrees_are_an_error_and_nothing_is_a_warning() 
     found = {evidence.key: evidence for evidence in check_gnss(metres, time_ns, imu)}
     assert found["gnss_status"].verdict == "error" and "metres" in found["gnss_status"].text
     assert found["gnss_rate"].verdict == "warning"
+
+
+@pytest.mark.parametrize(
+    ("shift", "verdict", "word"),
+    [
+        ((0.5, 0.0, 0.5), "ok", ""),
+        ((90.0, -120.0, 3.0), "error", "another datum"),
+        ((0.0, 0.0, 48.0), "error", "heights above the sea"),
+    ],
+)
+def test_two_receivers_that_differ_by_a_datum(shift: tuple[float, float, float], verdict: str, word: str) -> None:
+    time_ns, poses, _ = circle()
+    one, other = (
+        simulate_gnss(time_ns, poses, ORIGIN, GnssConfig(datum_shift=by), seed) for seed, by in ((1, (0.0, 0.0, 0.0)), (2, shift))
+    )
+    (found,) = check_receivers({"/fix": one, "/rtk": other})
+    assert found.verdict == verdict and word in found.text
+    (late,) = check_receivers({"/fix": one, "/rtk": other.shifted(10**12)})
+    assert late.verdict == "warning"
