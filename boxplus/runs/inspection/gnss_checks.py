@@ -55,10 +55,9 @@ def check_receivers(receivers: Mapping[str, GnssFixes]) -> list[Evidence]:
     (first, reference), *others = receivers.items()
     found = []
     for topic, fixes in others:
-        inside = (fixes.time_ns >= reference.time_ns[:1].max(initial=0)) & (
-            fixes.time_ns <= reference.time_ns[-1:].max(initial=0)
-        )
-        if inside.sum() < 2 or len(reference) < 2:
+        begin, end = (reference.time_ns[0], reference.time_ns[-1]) if len(reference) else (0, 0)
+        inside = (fixes.time_ns >= begin) & (fixes.time_ns <= end)
+        if inside.sum() < 2:
             text = f"no fixes of {first} and {topic} at the same time: they cannot be compared"
             found.append(Evidence("gnss_receivers", "unchecked", "warning", text))
             continue
