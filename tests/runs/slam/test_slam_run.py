@@ -105,7 +105,7 @@ def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> Non
     page = finished.folder.report.read_text(encoding="utf-8")
     for loop in loops:
         assert f"[{loop.query}, {loop.place}]" in page
-    assert page.count("<img alt=") == 2 + sum(loop.measured > 0 for loop in loops)
+    assert page.count("<img alt=") == 3 + sum(loop.measured > 0 for loop in loops)
     assert finished.folder.odometry.report.exists()
     assert sum(finished.result.summary.loops_refused.values()) == sum(not loop.is_accepted for loop in loops)
 
