@@ -44,6 +44,7 @@ Floats = NDArray[np.float64]
 _GRAVITY = 9.81
 _FEWEST_PLANES = 6
 _SECOND_AXIS = 0.1  # rad/s
+_MARGIN = 5.0  # of the noise that the odometry assumes, over that of the samples
 _BIAS_SIGMA = np.array([0.3] * 3 + [0.03] * 3)  # m/s², rad/s, of the first keyframe
 
 
@@ -119,22 +120,24 @@ def refine(
     refines_mounting, extrinsic = _mounting_is_refined(run, config)
     tell("finding planes", 0.0)
     T_lidar = T_before = lidar_poses(state.T_world_imu, state.T_imu_lidar)
-    planes = judging = planes_of(run, T_lidar, keyframes, config)
+    planes, information = planes_of(run, T_lidar, keyframes, config)
+    judging = planes
     costs = []
     for number in range(config.rounds):
         if number:
             tell("finding planes", number / config.rounds)
             T_lidar = lidar_poses(state.T_world_imu, state.T_imu_lidar)
-            planes = planes_of(run, T_lidar, keyframes, config)
-        seen = keyframe_clusters(run, T_lidar, keyframes, planes)
+            planes, information = planes_of(run, T_lidar, keyframes, config)
+        seen = keyframe_clusters(run, T_lidar, keyframes, planes, information)
         tell("moving keyframes", (number + 0.4) / config.rounds)
         is_last = number + 1 == config.rounds
         state, planes, is_held, cost, covariance = _move_keyframes(
             run, state, keyframes, planes, seen, config, refines_mounting, is_last
         )
         tell("moving scans", (number + 0.6) / config.rounds)
-        state, own = _move_scans(run, state, planes, is_held, config, is_last)
+        state, own = _move_scans(run, state, planes, np.where(is_held, information, 0.0), config, is_last)
         costs.append(cost)
+    own = own + _bending(run)
     tell("judging", 1.0)
     T_after = lidar_poses(state.T_world_imu, state.T_imu_lidar)
     return Refinement(
@@ -170,6 +173,16 @@ def _anchored(state: RefinedState, first: Floats) -> RefinedState:
     T = se3.compose(np.broadcast_to(move, state.T_world_imu.shape), state.T_world_imu)
     velocity_bias = np.hstack([state.velocity_bias[:, :3] @ R.T, state.velocity_bias[:, 3:]])
     return replace(state, T_world_imu=T, velocity_bias=velocity_bias, gravity_direction=R @ state.gravity_direction)
+
+
+def _bending(run: FinishedRun) -> Floats:
+    """Covariances (N, 6, 6) of what the gyroscope's own noise turns the middle of a slice by, against its end."""
+    seconds = np.diff(run.time_ns, prepend=run.time_ns[0]) * 1e-9
+    seconds[0] = seconds[1]
+    covariance = np.zeros((len(run), 6, 6))
+    turn = (run.noise.gyro / _MARGIN) ** 2 * seconds / 3.0
+    covariance[:, np.arange(3), np.arange(3)] = turn[:, None]
+    return covariance
 
 
 def _relative_to_first(T: Floats, covariance: Floats, first: Floats) -> Floats:
@@ -241,7 +254,7 @@ def _move_keyframes(
 
 
 def _move_scans(
-    run: FinishedRun, state: RefinedState, planes: PlaneMap, is_held: NDArray[np.bool_], config: RefinementConfig, is_last: bool
+    run: FinishedRun, state: RefinedState, planes: PlaneMap, information: Floats, config: RefinementConfig, is_last: bool
 ) -> tuple[RefinedState, Floats]:
     """Every scan by itself on the planes, which are held, and between its neighbours in time."""
     problem = Problem()
@@ -250,7 +263,7 @@ def _move_scans(
     between = preintegrated(run, np.arange(len(run)), state.velocity_bias)
     imu = ImuPreintegration(between, gravity=_GRAVITY * state.gravity_direction)
     problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:], name="imu")
-    forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, is_held)
+    forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, information)
     problem.add_residuals(PoseQuadratic(forms, state.T_world_imu[:, 4:]), poses, name="planes")
     _add_bias_prior(problem, states)
     solution = problem.solve(

@@ -43,22 +43,34 @@ def lidar_poses(T_world_imu: Floats, T_imu_lidar: Floats) -> Floats:
     return se3.compose(T_world_imu, np.broadcast_to(T_imu_lidar, T_world_imu.shape))
 
 
-def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: RefinementConfig) -> PlaneMap:
-    """The planes of the map as it is, each through all the points that lie on it."""
+def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: RefinementConfig) -> tuple[PlaneMap, Floats]:
+    """The planes of the map as it is, each through all the points that lie on it, and the information of one point on each (P,).
+
+    What a plane is not flat by, a keyframe sees with all of its points alike: with σ_f of `config.plane_flatness` and n points a
+    keyframe, their mean is known to σ²/n + σ_f², as if each of them had the variance σ² + n σ_f².
+    """
     voxels = VoxelSums(config.smallest_voxel)
     for k, R, p, points in _placed(run, T_lidar, judging=False):
         voxels.add(points, R, p, int(keyframes.of_scan[k]))
     planes = find_planes(voxels, config)
     world = np.zeros((len(planes), 4, 4))
-    for _, R, p, points in _placed(run, T_lidar, judging=False):
+    latest, seen_by = np.full(len(planes), -1), np.zeros(len(planes))
+    for k, R, p, points in _placed(run, T_lidar, judging=False):
         found, own = planes.clusters_of(points, R, p)
         world[found] += _moved(own, R, p - planes.centres[found])
-    return planes.refitted(world)
+        seen_by[found] += latest[found] != keyframes.of_scan[k]
+        latest[found] = keyframes.of_scan[k]
+    planes = planes.refitted(world)
+    planes = planes.without(planes.thickness > config.plane_roughness * _usual(planes.thickness, world[:, 3, 3]))
+    each = world[:, 3, 3] / np.maximum(seen_by, 1.0)
+    variance = np.maximum(planes.thickness, _LEAST_SIGMA) ** 2 + each * config.plane_flatness**2
+    return planes, 1.0 / variance
 
 
-def keyframe_clusters(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap) -> KeyframeClusters:
+def keyframe_clusters(
+    run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap, information: Floats
+) -> KeyframeClusters:
     """What every keyframe sees with the scans around it, of the planes that two keyframes see."""
-    information = _information(planes)
     relative = se3.compose(se3.inverse(T_lidar[keyframes.scan[keyframes.of_scan]]), T_lidar)
     R_key, p_key = quaternion.to_matrix(relative[:, :4]), relative[:, 4:]
     total = np.zeros((len(planes), 4, 4))
@@ -86,16 +98,13 @@ def keyframe_clusters(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, p
     return KeyframeClusters(np.concatenate(keyframe)[often], all_planes[often], np.concatenate(clusters)[often])
 
 
-def scan_forms(
-    run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, is_held: NDArray[np.bool_]
-) -> Floats:
-    """Q (N, 13, 13) of every scan on the planes that are held (P,), for `PoseQuadratic` about the poses' positions."""
-    information = _information(planes)
+def scan_forms(run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats) -> Floats:
+    """Q (N, 13, 13) of every scan on the planes (P,), for `PoseQuadratic` about the poses' positions; none where it is zero."""
     R_L, p_L = quaternion.to_matrix(T_imu_lidar[:4]), T_imu_lidar[4:]
     forms = np.zeros((len(run), 13, 13))
     for k, R, p, points in _placed(run, lidar_poses(T_world_imu, T_imu_lidar), judging=False):
         found, own = planes.clusters_of(points, R, p)
-        seen = is_held[found]
+        seen = information[found] > 0.0
         found = found[seen]
         body = _moved(own[seen], R_L, np.broadcast_to(p_L, (len(found), 3))) * information[found, None, None]
         normals = planes.planes[found, :3]
@@ -124,9 +133,11 @@ def _placed(run: FinishedRun, T_lidar: Floats, *, judging: bool) -> Iterator[tup
             yield k, R[k], T_lidar[k, 4:], np.ascontiguousarray(points[chosen])
 
 
-def _information(planes: PlaneMap) -> Floats:
-    information: Floats = np.maximum(planes.thickness, _LEAST_SIGMA) ** -2.0
-    return information
+def _usual(values: Floats, weights: Floats) -> float:
+    """The weighted median."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])]) if len(values) and total[-1] > 0.0 else np.inf
 
 
 def _moved(clusters: Floats, R: Floats, p: Floats) -> Floats:
