@@ -82,11 +82,6 @@ class PlaneMap:
         thickness[seen] = np.sqrt(np.maximum(values[seen, 0], 0.0))
         return replace(self, planes=planes, centres=centres, thickness=thickness)
 
-    def without(self, gone: NDArray[np.bool_]) -> PlaneMap:
-        """With nothing on the planes that are `gone` (P,); the others keep their numbers."""
-        plane_of = np.where((self.plane_of >= 0) & gone[self.plane_of], np.int32(-1), self.plane_of).astype(np.int32)
-        return replace(self, plane_of=plane_of)
-
     def clusters_of(
         self, points: NDArray[np.float32], R: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -24,7 +24,7 @@ class Sharpness:
     """How sharp a map is.
 
     Attributes:
-        thickness: root mean square distance of points from their planes [m]; NaN without any.
+        thickness: root mean square distance of points from their planes, weighted [m]; NaN without any.
         entropy: of the points about the middle of their plane [nats].
         points, planes: how many that rests on.
     """
@@ -35,9 +35,14 @@ class Sharpness:
     planes: int
 
 
-def sharpness(clusters: NDArray[np.float64]) -> Sharpness:
-    """The sharpness of points given by Σ [x; 1][x; 1]ᵀ (P, 4, 4) on each plane, x from near its middle [m]."""
-    kept = clusters[clusters[:, 3, 3] >= _FEWEST_POINTS]
+def sharpness(clusters: NDArray[np.float64], variance: NDArray[np.float64] | float = 1.0) -> Sharpness:
+    """The sharpness of points given by Σ [x; 1][x; 1]ᵀ (P, 4, 4) on each plane, x from near its middle [m].
+
+    Args:
+        variance: (P,) that a point on each plane is worth the inverse of: smooth planes say more than rough ones.
+    """
+    enough = clusters[:, 3, 3] >= _FEWEST_POINTS
+    kept, worth = clusters[enough], 1.0 / np.broadcast_to(variance, len(clusters))[enough]
     count = kept[:, 3, 3]
     if not len(kept):
         return Sharpness(float("nan"), float("nan"), 0, 0)
@@ -47,7 +52,7 @@ def sharpness(clusters: NDArray[np.float64]) -> Sharpness:
     entropy = 0.5 * np.log(2.0 * np.pi * np.e * np.maximum(values, _FLOOR)).sum(axis=1)
     total = count.sum()
     return Sharpness(
-        thickness=float(np.sqrt(np.maximum((count * values[:, 0]).sum() / total, 0.0))),
+        thickness=float(np.sqrt(np.maximum((worth * count * values[:, 0]).sum() / (worth * count).sum(), 0.0))),
         entropy=float((count * entropy).sum() / total),
         points=int(total),
         planes=len(kept),

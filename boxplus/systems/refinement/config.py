@@ -17,12 +17,14 @@ class RefinementConfig(PlaneVoxelConfig):
     keyframe_rotation_deg: float = Field(10.0, gt=0, description="or after this turn [deg]")
     keyframe_seconds: float = Field(1.0, gt=0, description="or after this time [s]")
     extrinsic_estimation: Literal["off", "on", "gated"] = Field(
-        "off", description="refine T_imu_lidar: never, always, or only where the motion turns about two axes"
+        "off", description="refine T_imu_lidar: never, always, or where the motion turns about two axes"
     )
     extrinsic_rotation_sigma_deg: float = Field(0.5, gt=0, description="standard deviation of the rotation in T_imu_lidar [deg]")
     extrinsic_translation_sigma: float = Field(0.02, gt=0, description="standard deviation of the translation in T_imu_lidar [m]")
     plane_roughness: float = Field(
-        1.6, gt=1, description="thickness of a plane over that of the usual one, at most: what is thicker is curved, or no surface"
+        1.6,
+        gt=1,
+        description="thickness of a plane over what the noise of the range makes it, at most: what is thicker is curved",
     )
     plane_flatness: float = Field(0.001, ge=0, description="what a plane is not flat by, as each keyframe sees it [m]")
     max_iterations: int = Field(10, ge=1, description="steps of the solver in each round")

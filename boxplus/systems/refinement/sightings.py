@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _JUDGED = 5  # of so many points one takes no part and judges the result
+_LEAST_FACING = 0.05  # squared cosine of the angle at which a plane is seen
+_SMOOTH = 0.005  # m, thickness of a plane that is never too rough
 _LEAST_SIGMA = 0.002  # m, of a distance from a plane
 
 
@@ -46,6 +48,9 @@ def lidar_poses(T_world_imu: Floats, T_imu_lidar: Floats) -> Floats:
 def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: RefinementConfig) -> tuple[PlaneMap, Floats]:
     """The planes of the map as it is, each through all the points that lie on it, and the information of one point on each (P,).
 
+    It is zero where the plane is thicker than the noise of the range makes one that is seen under its angles: what is curved is
+    no plane.
+
     What a plane is not flat by, a keyframe sees with all of its points alike: with σ_f of `config.plane_flatness` and n points a
     keyframe, their mean is known to σ²/n + σ_f², as if each of them had the variance σ² + n σ_f².
     """
@@ -54,17 +59,24 @@ def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: R
         voxels.add(points, R, p, int(keyframes.of_scan[k]))
     planes = find_planes(voxels, config)
     world = np.zeros((len(planes), 4, 4))
+    facing = np.zeros(len(planes))  # sum over points of the squared cosine of the angle at which the plane is seen
     latest, seen_by = np.full(len(planes), -1), np.zeros(len(planes))
     for k, R, p, points in _placed(run, T_lidar, judging=False):
         found, own = planes.clusters_of(points, R, p)
         world[found] += _moved(own, R, p - planes.centres[found])
         seen_by[found] += latest[found] != keyframes.of_scan[k]
         latest[found] = keyframes.of_scan[k]
+        mean = own[:, :3, 3] / own[:, 3:, 3]
+        along = np.einsum("ki,ki->k", planes.planes[found, :3] @ R, mean) / np.linalg.norm(mean, axis=1)
+        facing[found] += own[:, 3, 3] * along**2
     planes = planes.refitted(world)
-    planes = planes.without(planes.thickness > config.plane_roughness * _usual(planes.thickness, world[:, 3, 3]))
-    each = world[:, 3, 3] / np.maximum(seen_by, 1.0)
+    count = world[:, 3, 3]
+    facing = np.maximum(facing / np.maximum(count, 1.0), _LEAST_FACING)
+    usual = np.maximum(facing * _usual(planes.thickness**2 / facing, count), _SMOOTH**2)
+    is_rough = planes.thickness**2 > config.plane_roughness**2 * usual
+    each = count / np.maximum(seen_by, 1.0)
     variance = np.maximum(planes.thickness, _LEAST_SIGMA) ** 2 + each * config.plane_flatness**2
-    return planes, 1.0 / variance
+    return planes, np.where(is_rough, 0.0, 1.0 / variance)
 
 
 def keyframe_clusters(
@@ -94,7 +106,7 @@ def keyframe_clusters(
         total[found] += _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
     close(current)
     all_planes = np.concatenate(plane)
-    often = np.bincount(all_planes, minlength=len(planes))[all_planes] >= 2
+    often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)
     return KeyframeClusters(np.concatenate(keyframe)[often], all_planes[often], np.concatenate(clusters)[often])
 
 
@@ -121,7 +133,8 @@ def judge(run: FinishedRun, T_before: Floats, T_after: Floats, planes: PlaneMap)
         found, own = planes.clusters_of(points, R, p)
         for side, (turn, shift) in enumerate(((R, p), (R_after[k], p_after[k]))):
             world[side, found] += _moved(own, turn, shift - planes.centres[found])
-    return sharpness(world[0]), sharpness(world[1])
+    variance = np.maximum(planes.thickness, _LEAST_SIGMA) ** 2
+    return sharpness(world[0], variance), sharpness(world[1], variance)
 
 
 def _placed(run: FinishedRun, T_lidar: Floats, *, judging: bool) -> Iterator[tuple[int, Floats, Floats, NDArray[np.float32]]]:
