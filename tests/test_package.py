@@ -133,6 +133,15 @@ def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
     assert "boxplus = boxplus.cli:main" in entries
 
 
+def test_sources_that_texts_name_are_there_for_their_readers() -> None:
+    pages = sorted((ROOT / "docs").rglob("*.md"))
+    cited = {(path, name) for path in SOURCES for name in re.findall(r"docs/[\w/]+\.md", path.read_text(encoding="utf-8"))}
+    assert len(cited) > 100
+    assert not [f"{path.relative_to(ROOT)}: {name}" for path, name in sorted(cited) if not (ROOT / name).is_file()]
+    private = re.compile(r"\b(SPEC|SPEC_SYSTEMS|DESIGN|ERRATA|MODELS)(\.md)?\b(?!\s*=)")
+    assert not [str(path.relative_to(ROOT)) for path in (*SOURCES, *pages) if private.search(path.read_text(encoding="utf-8"))]
+
+
 @pytest.mark.parametrize("path", [pytest.param(path, id=str(path.relative_to(ROOT))) for path in SOURCES])
 def test_house_rules(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
