@@ -44,6 +44,17 @@ class PoseDirections:
     weak: NDArray[np.bool_]
     basis: NDArray[np.float64]
 
+    def weakened(self, weight: float = 0.0) -> NDArray[np.float64]:
+        """(6, 6) what is left of a small motion [θ, p] with its share along the weak directions times `weight`.
+
+        At 0 this is the projector Π = V_s V_sᵀ N onto the others, which are conjugate to the weak ones in N.
+        """
+        if not self.weak.any():
+            return np.eye(6)
+        # The inverse of V is Vᵀ N.
+        left: NDArray[np.float64] = (self.basis * np.where(self.weak, weight, 1.0)) @ np.linalg.inv(self.basis)
+        return left
+
     def closest_to(self, axis: NDArray[np.float64]) -> int:
         """The direction closest to a shift along a unit `axis` (3,)."""
         return int(np.argmax(np.abs(axis @ self.vectors[3:])))
@@ -86,14 +97,12 @@ def project_out_weak(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A and b without what they claim about the weak directions of the pose; what they say of the others stays whole.
 
-    The projector Π = V_s V_sᵀ N maps weak directions to zero and leaves the others, which are conjugate to them in N: ΠᵀAΠ, Πᵀb.
+    With the projector Π of `PoseDirections.weakened`: ΠᵀAΠ, Πᵀb.
     """
     if not directions.weak.any():
         return A, b
-    strong = ~directions.weak
-    dual = np.linalg.inv(directions.basis)  # Vᵀ N
     projector = np.eye(12)
-    projector[:6, :6] = directions.basis[:, strong] @ dual[strong]
+    projector[:6, :6] = directions.weakened()
     return projector.T @ A @ projector, projector.T @ b
 
 

@@ -78,7 +78,7 @@ def plane_tilt(
     (up, std), (early, _), (late, _) = (found for found in vertical if found is not None)
     # A registration that has gone astray accelerates out of nothing.
     std = float(np.hypot(std, 0.5 * np.arccos(np.clip(early @ late, -1.0, 1.0))))
-    directions = _directions(_normals(part, scans, config))
+    directions = plane_directions(_normals(part, scans, config))
     count = 3 if _tilt(directions, up, 3) is not None else 2
     tilt = _tilt(directions, up, count)
     if tilt is None:
@@ -134,7 +134,7 @@ def _up(path: LidarPath, imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> t
 
 
 def _normals(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> NDArray[np.float64]:
-    """(N, 3) normals where the surroundings are plane."""
+    """(N, 3) normals where the surroundings are plane, by several scans together."""
     middle_ns = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans])
     chosen = np.unique(np.linspace(0, len(path) - 1, _SCANS).astype(int))
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
@@ -144,6 +144,11 @@ def _normals(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig)
         if len(found):
             points = voxel_filter(scans[int(found[0])].p_lidar)[1].astype(np.float64)
             tree.insert(points @ path.R_path_lidar[k].T + path.p_path_lidar[k], downsample=True)
+    return plane_normals(tree)
+
+
+def plane_normals(tree: IkdTree) -> NDArray[np.float64]:
+    """(N, 3) unit normals at those points of a map, at most some thousands, that lie in a plane with their neighbours."""
     points = tree.points()
     points = points[:: max(len(points) // _MOST_POINTS, 1)]
     neighbours = tree.nearest(points, _NEIGHBOURS).points
@@ -155,7 +160,7 @@ def _normals(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig)
     return normals
 
 
-def _directions(normals: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:
+def plane_directions(normals: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:
     """Tight bundles of normals, the largest first: mean direction (3,) and share."""
     directions: list[tuple[NDArray[np.float64], float]] = []
     left, total = normals, len(normals)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, strong_covariance
+from boxplus.filtering.degeneracy import strong_covariance
 from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.map_datum import Correction
 from boxplus.maps.ikd_tree import IkdTree
@@ -98,7 +98,7 @@ def align(
         if said.used < config.min_points:
             expected = cov_prior[_LAST_POSE, _LAST_POSE]
             return Alignment(prior, cov_prior, False, said, measurement, expected, None, steps, False)
-        keep = _weakened(said.directions, _WEAK_WEIGHT)
+        keep = said.directions.weakened(_WEAK_WEIGHT)
         J = motion.jacobians(middles)
         H, gradient = _normal_equations(keep @ J, A_parts, b_parts)
         deviation = information @ np.concatenate([motion.first.minus(prior.first), motion.last.minus(prior.last)])
@@ -109,7 +109,7 @@ def align(
         steps += 1
         scale = np.tile(np.repeat([1.0, motion.seconds], 6), 2)
         converged = bool(np.abs(delta * scale).max() < _CONVERGED)
-    strong = _weakened(said.directions, 0.0)
+    strong = said.directions.weakened()
     A, gradient = _normal_equations(strong @ J, A_parts, b_parts)
     cov = np.linalg.inv(A + information)
     gain = cov[_LAST_POSE] @ (A_parts[:, :6, :6] @ strong @ J).sum(axis=0).T @ strong
@@ -131,12 +131,3 @@ def _normal_equations(
     """A (24, 24) and b (24,) of both states, from those of the parts' poses and their derivatives (n, 6, 24)."""
     flat = J.reshape(-1, 2 * DOF)
     return flat.T @ (A_parts[:, :6, :6] @ J).reshape(-1, 2 * DOF), flat.T @ b_parts[:, :6].ravel()
-
-
-def _weakened(directions: PoseDirections, weight: float) -> NDArray[np.float64]:
-    """(6, 6): a small motion of the pose, its weak directions by a weight."""
-    if not directions.weak.any():
-        return np.eye(6)
-    weights = np.where(directions.weak, weight, 1.0)
-    weakened: NDArray[np.float64] = (directions.basis * weights) @ np.linalg.inv(directions.basis)
-    return weakened

@@ -15,10 +15,11 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane
 from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
@@ -151,7 +152,12 @@ def _contradicted(seen: _Beginning) -> list[str]:
     """What the comparison of both sensors finds wrong, a sentence each."""
     T_declared = seen.config.T_declared
     agreement = compare_sensors(seen.scans, seen.imu, seen.config, T_declared=T_declared)
-    return [finding.text for finding in contradictions(agreement, T_declared)]
+    found = [finding.text for finding in contradictions(agreement, T_declared)]
+    if found or T_declared is None:
+        return found
+    # Where no path is found, nothing of the above is decided: what every scan shows for itself is left.
+    tilted = tilted_plane(seen.scans, usable(seen.imu), T_declared[:3, :3], seen.registration)
+    return [] if tilted is None else [tilted]
 
 
 def _check_accelerometer(norm: float) -> None:

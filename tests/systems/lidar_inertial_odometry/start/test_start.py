@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
+from boxplus.manifolds import so3
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -111,6 +112,18 @@ def test_a_turn_that_a_wall_does_not_show_is_no_rest(rate: float) -> None:
     refusal = find_start(_turning(first, np.array([rate, 0.0, 0.0])), settings)
     assert isinstance(refusal, str)
     assert "the surroundings do not show how" in refusal
+
+
+@pytest.mark.parametrize("leaning_deg", [0.0, 20.0])
+def test_where_no_start_is_found_the_wall_says_whether_the_mounting_leans(leaning_deg: float) -> None:
+    first, settings = _before_a_wall(0.6)
+    T = np.eye(4)
+    T[:3, :3] = so3.exp(np.array([0.0, np.deg2rad(leaning_deg), 0.0]))
+    settings = settings.model_copy(update={"T_imu_lidar": tuple(map(tuple, T.tolist()))})
+    seen = _turning(first, T[:3, :3] @ np.array([0.07, 0.0, 0.0]))
+    last = find_start(seen, settings, final=True)
+    assert isinstance(last, str)
+    assert ("deg from level and from upright" in last) == (leaning_deg > 0.0)
 
 
 def _shaken(frame: Frame, seed: int) -> Frame:
