@@ -234,7 +234,9 @@ def test_command(tmp_path: Path, app: typer.Typer) -> None:
 
 
 def test_command_exits_with_one_on_errors(tmp_path: Path, app: typer.Typer) -> None:
-    result = CliRunner().invoke(app, [str(tmp_path / "nothing.bag")])
+    torn = tmp_path / "torn.bag"
+    torn.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    result = CliRunner().invoke(app, [str(torn)])
     assert result.exit_code == 1 and "cannot be read" in result.stdout
     path = write_bag(tmp_path, "ros1", Content())
     result = CliRunner().invoke(app, [str(path), "--point-time-unit", "hours"])

@@ -18,7 +18,7 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from tests.systems.lidar_inertial_odometry.simulated_runs import SPARSE
 
-RUNS, DURATION_S = 60, 3.5
+RUNS, DURATION_S = 30, 3.5
 INSTANTS = (-6, -1)  # half a second before the end, and the end
 
 
