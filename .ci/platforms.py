@@ -27,27 +27,23 @@ PYTHONS = ("3.11", "3.14")
 """The oldest and the newest that are supported."""
 
 
+def resolved(requirements: list[str], tags: list[str], python: str) -> subprocess.CompletedProcess[str]:
+    """What pip says when it is asked for wheels of these requirements."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed", "--only-binary=:all:"]
+        where = [f"--platform={tag}" for tag in tags] + [f"--python-version={python}", f"--target={folder}"]
+        return subprocess.run([*command, *where, *requirements], capture_output=True, text=True, check=False)
+
+
 def main() -> int:
     """Ask for every combination, say what came out."""
     dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     failed = False
     for name, tags in PLATFORMS.items():
         for python in PYTHONS:
-            with tempfile.TemporaryDirectory() as folder:
-                command = [
-                    sys.executable,
-                    "-m",
-                    "pip",
-                    "install",
-                    "--dry-run",
-                    "--quiet",
-                    "--ignore-installed",
-                    "--only-binary=:all:",
-                ]
-                where = [f"--platform={tag}" for tag in tags] + [f"--python-version={python}", f"--target={folder}"]
-                run = subprocess.run([*command, *where, *dependencies], capture_output=True, text=True, check=False)
-            if run.returncode and UNREACHABLE.search(run.stderr):
-                print("platforms: not checked, the package index cannot be reached")
+            run = resolved(dependencies, tags, python)
+            if run.returncode and (UNREACHABLE.search(run.stderr) or resolved(["numpy"], tags, python).returncode):
+                print(f"platforms: not checked, the package index cannot be reached or has no wheels at all for {name}")
                 return 0
             print(f"platforms: Python {python} on {name}: {'no wheel' if run.returncode else 'wheels for everything'}")
             if run.returncode:
