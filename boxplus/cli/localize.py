@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options
+from boxplus.cli.options import takes_recording_options, with_default_threads
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def localize(
     from boxplus.runs.localization.config import load_localization_config
     from boxplus.runs.transform import parse_transform
 
-    odometry: dict[str, object] = {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)}
+    odometry: dict[str, object] = {} if threads is None else {"threads": threads}
     if T_imu_lidar is not None:
         odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
     overrides: dict[str, dict[str, object]] = {
@@ -59,7 +58,7 @@ def localize(
         "odometry": odometry,
         "map": {"save": keep_map},
     }
-    run_config = load_localization_config(config, settings or (), overrides)
+    run_config = with_default_threads(load_localization_config(config, settings or (), overrides))
     folder = output or Path(f"{recording.resolve().stem}_localized")
 
     from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
