@@ -19,6 +19,7 @@ from boxplus.maps.plane_voxels.voxel_sums import (
     SUM,
     SUMS,
     VoxelSums,
+    add_point,
     clusters,
     coordinates,
     key_of,
@@ -278,14 +279,5 @@ def _on_planes(
         if total[0] == 0.0:
             touched[count] = plane
             count += 1
-        total[0] += 1.0
-        total[1] += a
-        total[2] += b
-        total[3] += c
-        total[4] += a * a
-        total[5] += a * b
-        total[6] += a * c
-        total[7] += b * b
-        total[8] += b * c
-        total[9] += c * c
+        add_point(total, a, b, c)
     return count

@@ -42,6 +42,21 @@ def slot_of(key: int, keys: NDArray[np.int64]) -> int:
     return int(slot)
 
 
+@kernel(inline=True)
+def add_point(total: NDArray[np.float64], x: float, y: float, z: float) -> None:
+    """Add one point to the sums (10,) of 1, x, y, z and of their six products."""
+    total[0] += 1.0
+    total[1] += x
+    total[2] += y
+    total[3] += z
+    total[4] += x * x
+    total[5] += x * y
+    total[6] += x * z
+    total[7] += y * y
+    total[8] += y * z
+    total[9] += z * z
+
+
 @kernel
 def _add(
     points: NDArray[np.float32],
@@ -72,17 +87,7 @@ def _add(
         x -= (np.floor(x / cell) + 0.5) * cell
         y -= (np.floor(y / cell) + 0.5) * cell
         z -= (np.floor(z / cell) + 0.5) * cell
-        total = sums[slot]
-        total[0] += 1.0
-        total[1] += x
-        total[2] += y
-        total[3] += z
-        total[4] += x * x
-        total[5] += x * y
-        total[6] += x * z
-        total[7] += y * y
-        total[8] += y * z
-        total[9] += z * z
+        add_point(sums[slot], x, y, z)
     return fresh
 
 
