@@ -16,7 +16,7 @@ from boxplus.formats.output import atomic_file
 from boxplus.formats.ply import PlyWriter
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.formats.trajectory_writer import TrajectoryWriter
-from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds import se3
 from boxplus.maps.seen_through import SeenThrough
 from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
@@ -27,6 +27,7 @@ from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
 from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
 from boxplus.runs.sessions.summary import MergeSummary, SessionFacts
 from boxplus.runs.sessions.tables import write_changes, write_encounters
+from boxplus.runs.slam.corrected import append_moved, turned_covariances
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.session import Session
 from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions
@@ -196,14 +197,8 @@ def _has_intensity(run: SessionRun, T: Floats) -> bool:
 def _write_trajectory(own: MergeFolder, run: SessionRun, T_world_map: Floats) -> None:
     """A session's trajectory in the joint world; its covariance is that of the session, against its own first pose."""
     before = read_trajectory(run.folder.trajectory)
-    none = np.zeros((len(T_world_map), 6, 6))
-    placed = Correction(run.correction.time_ns, run.correction.T_map, T_world_map, none, none, none)
-    poses = placed.apply(before.times, np.hstack([before.q_wxyz, before.p]))
-    R_world_session = quaternion.to_matrix(poses[:, :4]) @ np.swapaxes(quaternion.to_matrix(before.q_wxyz), 1, 2)
+    poses = Correction(run.correction.time_ns, run.correction.T_map, T_world_map).apply(
+        before.times, np.hstack([before.q_wxyz, before.p])
+    )
     with TrajectoryWriter(own.sessions, run.session.name) as writer:
-        for k, (time_ns, T) in enumerate(zip(before.times.tolist(), poses, strict=True)):
-            turn = np.eye(6)  # positions are along the world's axes
-            turn[3:, 3:] = R_world_session[k]
-            covariance = np.zeros((6, 6)) if before.covariance is None else turn @ before.covariance[k] @ turn.T
-            status = "ok" if before.status is None else before.status[k]
-            writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance, status)
+        append_moved(writer, before, poses, turned_covariances(before, poses))

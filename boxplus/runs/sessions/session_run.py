@@ -60,8 +60,7 @@ class SessionRun:
 
     def placed(self, T_world_map: Floats) -> Correction:
         """What takes poses of the odometry into the world in which the local maps are at T_world_map (n, 7)."""
-        none = np.zeros((len(T_world_map), 6, 6))
-        return Correction(self.correction.time_ns, self.correction.T_odo, T_world_map, none, none, none)
+        return Correction(self.correction.time_ns, self.correction.T_odo, T_world_map)
 
     def scans(self, T_world_map: Floats) -> Iterator[PlacedScan]:
         """Every scan that was kept, in that world.

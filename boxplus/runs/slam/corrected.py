@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.output import replaced_folder
-from boxplus.formats.trajectory import read_trajectory
+from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.tiles.store import merge
@@ -27,19 +27,27 @@ def write_corrected_trajectory(folder: SlamFolder, correction: Correction, *, is
         is_closed: whether there is a loop; else poses and covariances are the odometry's.
     """
     odometry = read_trajectory(folder.odometry.trajectory)
-    before = np.hstack([odometry.q_wxyz, odometry.p])
-    poses = correction.apply(odometry.times, before)
-    # Errors of positions are along the world's axes, and the world has turned.
-    turn = np.tile(np.eye(6), (len(poses), 1, 1))
-    turn[:, 3:, 3:] = quaternion.to_matrix(poses[:, :4]) @ np.swapaxes(quaternion.to_matrix(before[:, :4]), 1, 2)
-    covariance = np.zeros((len(poses), 6, 6)) if odometry.covariance is None else odometry.covariance
-    covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
+    poses = correction.apply(odometry.times, np.hstack([odometry.q_wxyz, odometry.p]))
+    covariance = turned_covariances(odometry, poses)
     if is_closed:
         covariance = _closed_covariance(correction, odometry.times, poses, covariance)
     with TrajectoryWriter(folder.path) as writer:
-        for k, (time_ns, T) in enumerate(zip(odometry.times.tolist(), poses, strict=True)):
-            status = "ok" if odometry.status is None else odometry.status[k]
-            writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance[k], status)
+        append_moved(writer, odometry, poses, covariance)
+
+
+def turned_covariances(before: Trajectory, poses: Floats) -> Floats:
+    """(n, 6, 6) of a trajectory whose poses are (n, 7) now: errors of positions are along the world's axes, which have turned."""
+    turn = np.tile(np.eye(6), (len(poses), 1, 1))
+    turn[:, 3:, 3:] = quaternion.to_matrix(poses[:, :4]) @ np.swapaxes(quaternion.to_matrix(before.q_wxyz), 1, 2)
+    covariance = np.zeros((len(poses), 6, 6)) if before.covariance is None else before.covariance
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))
+
+
+def append_moved(writer: TrajectoryWriter, before: Trajectory, poses: Floats, covariance: Floats) -> None:
+    """Write a trajectory with other poses (n, 7) and covariances (n, 6, 6), times and statuses as they were."""
+    for k, (time_ns, T) in enumerate(zip(before.times.tolist(), poses, strict=True)):
+        status = "ok" if before.status is None else before.status[k]
+        writer.append(time_ns, quaternion.to_matrix(T[:4]), T[4:], covariance[k], status)
 
 
 def _closed_covariance(correction: Correction, time_ns: Times, poses: Floats, covariance: Floats) -> Floats:
