@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.recordings.info import RecordingInfo
 from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions
-from boxplus.runs.settings_file import load_settings
+from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 
@@ -38,6 +37,10 @@ class RunConfig(BaseModel):
     recording: RecordingOptions = Field(default_factory=lambda: RecordingOptions())
     odometry: LioConfig = Field(default_factory=lambda: LioConfig())  # type: ignore[call-arg]
     map: MapConfig = Field(default_factory=lambda: MapConfig())  # type: ignore[call-arg]
+
+    def of_odometry(self) -> RunConfig:
+        """The part that `boxplus lio` has, of settings that have more."""
+        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map)
 
 
 def load_run_config(
@@ -73,5 +76,4 @@ def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
         "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config FILE' repeats it.\n"
         "# For another recording delete the lines of section 'recording' that shall be found anew.\n"
     )
-    body: str = yaml.safe_dump(used, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, used)

@@ -74,6 +74,12 @@ def load_settings(
         ) from error
 
 
+def dump_settings(head: str, used: Mapping[str, object]) -> str:
+    """The text of a `config.yaml`: comment lines, then sections of settings as `load_settings` reads them."""
+    body: str = yaml.safe_dump(dict(used), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return head + body
+
+
 def _sections(kind: type[BaseModel]) -> Sections:
     """The models of the sections by name."""
     return {

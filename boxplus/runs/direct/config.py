@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 
 
@@ -37,5 +37,4 @@ def dump_direct_config(config: DirectRunConfig, info: CameraRecordingInfo) -> st
     if any(topic.name == camera.source for topic in info.topics for camera in info.cameras):
         used["recording"]["image_topics"] = [camera.source for camera in info.cameras]
     head = "# Settings of this run, those found from the data included: 'boxplus vo RECORDING --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(used, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, used)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import yaml
 from pydantic import Field
 
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.runs.config import RunConfig
-from boxplus.runs.settings_file import load_settings
+from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.localization.config import LocalizationConfig
 
 
@@ -19,10 +18,6 @@ class LocalizationRunConfig(RunConfig):
 
     local_maps: LocalMapConfig = Field(default_factory=lambda: LocalMapConfig(max_range=50.0))  # type: ignore[call-arg]
     localization: LocalizationConfig = Field(default_factory=lambda: LocalizationConfig())  # type: ignore[call-arg]
-
-    def of_odometry(self) -> RunConfig:
-        """The part that `boxplus lio` has."""
-        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map)
 
 
 def load_localization_config(
@@ -39,5 +34,4 @@ def load_localization_config(
 def dump_localization_config(config: LocalizationRunConfig) -> str:
     """The text of `config.yaml`."""
     head = "# Settings of this run: 'boxplus localize RECORDING --map MAP --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(config.model_dump(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, config.model_dump())

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.runs.config import MapConfig
-from boxplus.runs.settings_file import load_settings
+from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.refinement.config import RefinementConfig
 
 
@@ -36,5 +35,4 @@ def load_refine_config(
 def dump_refine_config(config: RefineRunConfig) -> str:
     """The text of `config.yaml`."""
     head = "# Settings of this run: 'boxplus refine RUN --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(config.model_dump(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, config.model_dump())

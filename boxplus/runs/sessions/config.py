@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.maps.seen_through import SeenThroughConfig
+from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.sessions.config import SessionsConfig
 
 
@@ -33,5 +33,4 @@ class MergeConfig(BaseModel):
 def dump_merge_config(config: MergeConfig) -> str:
     """The text of `config.yaml`."""
     head = "# Settings of this map: 'boxplus map merge RUN… --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(config.model_dump(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, config.model_dump())

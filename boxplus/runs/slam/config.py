@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import yaml
 from pydantic import Field
 
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.runs.config import RunConfig
-from boxplus.runs.settings_file import load_settings
+from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.slam.config import SlamConfig
 
@@ -21,10 +20,6 @@ class SlamRunConfig(RunConfig):
     local_maps: LocalMapConfig = Field(default_factory=lambda: LocalMapConfig())  # type: ignore[call-arg]
     slam: SlamConfig = Field(default_factory=lambda: SlamConfig())  # type: ignore[call-arg]
     gnss: GeoreferenceConfig = Field(default_factory=lambda: GeoreferenceConfig())  # type: ignore[call-arg]
-
-    def of_odometry(self) -> RunConfig:
-        """The part that `boxplus lio` has."""
-        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map)
 
 
 def load_slam_config(
@@ -41,5 +36,4 @@ def load_slam_config(
 def dump_slam_config(config: SlamRunConfig) -> str:
     """The text of `slam/config.yaml`."""
     head = "# Settings of this run: 'boxplus slam RECORDING --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(config.model_dump(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, config.model_dump())

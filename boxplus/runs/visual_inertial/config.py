@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.cameras.options import CameraRecordingOptions
+from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 
 
@@ -30,5 +30,4 @@ def dump_vio_config(config: VioRunConfig, info: CameraRecordingInfo) -> str:
         if any(topic.name == info.imu.source for topic in info.topics):
             found["imu_topic"] = info.imu.source
     head = "# Settings of this run, those found from the data included: 'boxplus vio RECORDING --config FILE' repeats it.\n"
-    body: str = yaml.safe_dump(used, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return head + body
+    return dump_settings(head, used)
