@@ -1,6 +1,7 @@
 # make demo    simulate a walk, run the odometry on it, compare with the truth, write demo/report.html
 # make test    run the test suite
 # make lint    ruff and mypy
+# make docs    the documentation as a site, site/index.html; a warning is an error
 #
 # Each target sets up what it needs in .venv, once. PYTHON names another interpreter, 3.11 or later.
 
@@ -14,7 +15,7 @@ DEMO_ARGS ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet --quiet
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: $(VENV)/.runtime
 	@$(BIN)/boxplus demo -o $(OUTPUT) $(DEMO_ARGS)
@@ -27,8 +28,12 @@ lint: $(VENV)/.dev
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 
+docs: $(VENV)/.docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs --quiet build
+	@echo "site/index.html"
+
 clean:
-	rm -rf $(VENV) $(OUTPUT)
+	rm -rf $(VENV) $(OUTPUT) site
 
 $(VENV)/.python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
@@ -46,4 +51,9 @@ $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
 	@$(PIP) install -e '.[dev,vision]'
+	@touch $(VENV)/.runtime $@
+
+$(VENV)/.docs: pyproject.toml $(VENV)/.python
+	@echo "installing boxplus and the tools for its site into $(VENV) (once; about a minute)"
+	@$(PIP) install -e '.[docs]'
 	@touch $(VENV)/.runtime $@
