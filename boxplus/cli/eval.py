@@ -70,6 +70,7 @@ def evaluate_command(
     KITTI raw folder or its oxts, places alone are compared; --align none takes the origin from the estimate's georeference.yaml.
     """
     from boxplus.evaluation.evaluation import evaluate
+    from boxplus.evaluation.rpe import Delta
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.recordings.gnss_source import holds_fixes
 
@@ -88,8 +89,7 @@ def evaluate_command(
         offset_s=offset,
         max_gap_s=max_gap,
         min_matches=min_matches,
-        rpe_distance_m=rpe_distance or None,
-        rpe_time_s=rpe_time or None,
+        deltas=([Delta(rpe_distance, "m")] if rpe_distance else []) + ([Delta(rpe_time, "s")] if rpe_time else []),
         rpe_pairs=rpe_pairs.value,
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else evaluation.summary())

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
-from boxplus.evaluation.alignment import Alignment, AlignmentKind, align
+from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.statistics import Statistics
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
@@ -100,7 +100,7 @@ def compare_with_fixes(
     estimate: Trajectory,
     fixes: GnssFixes,
     *,
-    alignment: AlignmentKind = "yaw",
+    alignment: PositionAlignment = "yaw",
     lever_arm: ArrayLike | None = None,
     frame: EnuFrame | None = None,
     offset_s: float = 0.0,

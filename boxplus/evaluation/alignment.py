@@ -12,7 +12,8 @@ from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
 
-AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
+PositionAlignment = Literal["none", "yaw", "se3", "sim3"]
+AlignmentKind = Literal["none", "yaw", "se3", "sim3", "origin"]
 
 _COINCIDENT_M = 1e-6
 _COLLINEAR = 1e-3  # second against first principal standard deviation
@@ -23,7 +24,7 @@ class Alignment:
     """x_world = scale · R_world_estimate · x_estimate + p_world_estimate.
 
     Attributes:
-        kind: `none`, `yaw`, `se3` or `sim3`.
+        kind: `none`, `yaw`, `se3`, `sim3` or `origin`.
         R_world_estimate: (3, 3) rotation.
         p_world_estimate: (3,) [m].
         scale: 1 unless `sim3`.
@@ -45,7 +46,13 @@ class Alignment:
         return replace(trajectory, p=p, q_wxyz=quaternion.from_matrix(R), matrices=R, covariance=None, lines=None)
 
 
-def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: AlignmentKind = "se3") -> Alignment:
+def align_origin(estimate: Trajectory, ground_truth: Trajectory) -> Alignment:
+    """The transform that lays the first pose of the estimate onto that of the ground truth, both matched: T_gt,0 T_est,0⁻¹."""
+    R = ground_truth.R[0] @ estimate.R[0].T
+    return Alignment("origin", R, ground_truth.p[0] - R @ estimate.p[0], 1.0, principal_spread(ground_truth.p), False)
+
+
+def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignment = "se3") -> Alignment:
     """Least-squares transform of the estimate's positions onto the ground truth's (Umeyama 1991, eqs. 34-42).
 
     Args:

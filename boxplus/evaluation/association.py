@@ -23,8 +23,9 @@ class Association:
     """Matched poses, in order of time, and how they were found.
 
     Attributes:
-        estimate: (M) the matched poses of the estimate, with their own stamps.
-        ground_truth: (M) the ground truth that belongs to each: measured poses, or interpolated ones.
+        estimate: (M) the matched poses of the estimate.
+        ground_truth: (M) the ground truth that belongs to each: measured poses, or interpolated ones. Both carry the stamps, on
+            the clock of the ground truth, of the one that partners were looked for.
         method: `nearest` stamps, `interpolate`d ground truth, or by `index` for files without stamps.
         estimate_index: (M,) rows of the estimate that were matched.
         ground_truth_index: (M,) rows of the ground truth; when interpolating, the row before.
@@ -33,6 +34,7 @@ class Association:
         offset_s: what was added to the stamps of the estimate before matching [s].
         unmatched_estimate: poses of the estimate without a partner.
         unmatched_ground_truth: poses of the ground truth, within the time of the estimate, without a partner.
+        repeated: matches whose pose, of the ground truth or of the estimate, an earlier match has as well.
         outside: poses of the estimate before the first or after the last pose of the ground truth.
         overlap_s: duration that both cover [s].
         gaps: (start, end) of stretches without matches within the overlap, in seconds after its start.
@@ -49,6 +51,7 @@ class Association:
     offset_s: float
     unmatched_estimate: int
     unmatched_ground_truth: int
+    repeated: int
     outside: int
     overlap_s: float
     gaps: tuple[tuple[float, float], ...]
@@ -59,14 +62,17 @@ class Association:
 
     def lines(self) -> list[str]:
         """The report, one sentence a line."""
-        total = len(self) + self.unmatched_estimate
+        matched = len(np.unique(self.estimate_index))
+        total = matched + self.unmatched_estimate
         if self.method == "index":
             return [f"matched {len(self)} poses by index (the files carry no time stamps)"]
         how = {"nearest": f"nearest stamps within {self.max_difference_s} s", "interpolate": "ground truth interpolated"}
         lines = [
-            f"matched {len(self)} of {total} poses of the estimate ({how[self.method]}); {self.outside} lie outside of the "
+            f"matched {matched} of {total} poses of the estimate ({how[self.method]}); {self.outside} lie outside of the "
             f"ground truth's time, {self.unmatched_ground_truth} poses of the ground truth within it are unmatched"
         ]
+        if self.repeated:
+            lines.append(f"{self.repeated} of the {len(self)} matches repeat a pose: the other trajectory is denser there")
         step = "stamp difference" if self.method == "nearest" else "distance to the nearest measured stamp"
         lines.append(
             f"overlap {self.overlap_s:.3f} s; {step}: median {np.median(self.difference_s) * 1e3:.3f} ms, "
@@ -104,8 +110,10 @@ def associate(
 ) -> Association:
     """Find the pose of the ground truth that belongs to each pose of the estimate.
 
-    `nearest` takes the pose with the nearest stamp; each pose is used once, the closer pair wins. `interpolate`
-    interpolates the ground truth at the stamps of the estimate: positions linearly, rotations along the geodesic of SO(3).
+    `nearest` takes, for each pose of the trajectory that has fewer, the pose of the other with the nearest stamp (the earlier
+    of two), which is what the field's tools do; where both are about as dense, a pose may be taken twice, which is counted.
+    `interpolate` interpolates the ground truth at the stamps of the estimate: positions linearly, rotations along the geodesic
+    of SO(3).
     Trajectories that both lack stamps (KITTI) are matched by index and must be equally long.
 
     Args:
@@ -135,14 +143,21 @@ def associate(
         raise _no_overlap(estimate, ground_truth, offset_s)
     if method == "nearest":
         index_est, index_gt, difference = _nearest(t_est, t_gt, round(max_difference_s * 1e9))
-        matched_gt = ground_truth.select(index_gt)
+        time_ns = t_gt[index_gt] if len(t_gt) < len(t_est) else t_est[index_est]
+        matched_gt = ground_truth.select(index_gt, time_ns)
     else:
         index_est, index_gt, difference = _bracketed(t_est, t_gt, round(max_gap_s * 1e9))
-        matched_gt = _interpolated(ground_truth, index_gt, t_est[index_est])
+        time_ns = t_est[index_est]
+        matched_gt = _interpolated(ground_truth, index_gt, time_ns)
     outside = int(((t_est < t_gt[0]) | (t_est > t_gt[-1])).sum())
     offset = estimate_time_offset(t_est, estimate, t_gt, ground_truth)
     if len(index_est) < min_matches:
-        hint = f"; the motions suggest --offset {offset_s + offset.offset_s:.3f}" if offset else ""
+        hint = ""
+        if offset is not None:
+            shifted = t_est + round(offset.offset_s * 1e9)
+            find, limit = (_nearest, max_difference_s) if method == "nearest" else (_bracketed, max_gap_s)
+            if len(find(shifted, t_gt, round(limit * 1e9))[0]) >= min_matches:
+                hint = f"; the motions suggest --offset {offset_s + offset.offset_s:.3f}"
         raise InputError(
             f"at least {min_matches} matched poses",
             f"{len(index_est)} of {len(estimate)} ({estimate.source} against {ground_truth.source}, {method}, {outside} outside "
@@ -150,8 +165,9 @@ def associate(
             f"raise --max-diff, use --interpolate, or correct the clocks with --offset{hint}",
         )
     within = int(((t_gt >= t_est[0]) & (t_gt <= t_est[-1])).sum())
+    used_est, used_gt = len(np.unique(index_est)), len(np.unique(index_gt))
     return Association(
-        estimate=estimate.select(index_est),
+        estimate=estimate.select(index_est, time_ns),
         ground_truth=matched_gt,
         method=method,
         estimate_index=index_est,
@@ -159,8 +175,9 @@ def associate(
         difference_s=np.asarray(difference * 1e-9, dtype=np.float64),
         max_difference_s=max_difference_s if method == "nearest" else None,
         offset_s=offset_s,
-        unmatched_estimate=len(estimate) - len(index_est),
-        unmatched_ground_truth=max(0, within - len(index_est)) if method == "nearest" else 0,
+        unmatched_estimate=len(estimate) - used_est,
+        unmatched_ground_truth=max(0, within - used_gt) if method == "nearest" else 0,
+        repeated=len(index_est) - min(used_est, used_gt) if method == "nearest" else 0,
         outside=outside,
         overlap_s=float(end - begin) * 1e-9,
         gaps=_gaps(t_est, t_est[index_est], begin, end),
@@ -178,7 +195,7 @@ def _by_index(estimate: Trajectory, ground_truth: Trajectory, min_matches: int) 
         )
     rows = np.arange(count)
     return Association(
-        estimate, ground_truth, "index", rows, rows, np.zeros(count), None, 0.0, 0, 0, 0, 0.0, (), None
+        estimate, ground_truth, "index", rows, rows, np.zeros(count), None, 0.0, 0, 0, 0, 0, 0.0, (), None
     )  # fmt: skip
 
 
@@ -205,17 +222,16 @@ def _no_overlap(estimate: Trajectory, ground_truth: Trajectory, offset_s: float)
 def _nearest(
     t_est: NDArray[np.int64], t_gt: NDArray[np.int64], limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
-    """One-to-one pairs of nearest stamps within `limit` ns: rows of the estimate, of the ground truth, |difference| in ns."""
+    """Pairs of nearest stamps within `limit` ns, looked for from the shorter one: rows of both, |difference| in ns."""
+    if len(t_gt) < len(t_est):
+        index_gt, index_est, difference = _nearest(t_gt, t_est, limit)
+        return index_est, index_gt, difference
     after = np.clip(np.searchsorted(t_gt, t_est), 0, len(t_gt) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(np.abs(t_gt[before] - t_est) <= np.abs(t_gt[after] - t_est), before, after)
     difference = np.abs(t_gt[nearest] - t_est)
-    rows = np.arange(len(t_est))
-    order = np.lexsort((rows, difference, nearest))  # per ground-truth pose, the closest estimate first
-    first = np.r_[True, nearest[order][1:] != nearest[order][:-1]]
-    winners = np.sort(order[first])
-    winners = winners[difference[winners] <= limit]
-    return winners, nearest[winners], difference[winners]
+    rows = np.flatnonzero(difference <= limit)
+    return rows, nearest[rows], difference[rows]
 
 
 def _bracketed(

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, principal_spread
+from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_origin, principal_spread
 from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
-from boxplus.evaluation.rpe import Pairs, RelativeErrors, relative_errors
+from boxplus.evaluation.frames import Plane, projected
+from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics
+from boxplus.evaluation.time_offset import TimeOffset
 from boxplus.formats.trajectory import Trajectory
-from boxplus.manifolds import so3
+from boxplus.manifolds import quaternion, so3
+
+DELTAS = (Delta(10.0, "m"), Delta(1.0, "s"))
+"""The deltas of relative errors that are computed where nothing else is asked for."""
 
 _KINDS = {
     "none": "no alignment",
     "yaw": "yaw alignment (rotation about z and translation)",
     "se3": "SE(3) alignment (rotation and translation)",
     "sim3": "Sim(3) alignment (and scale)",
+    "origin": "alignment of the first poses",
 }
+_NOTICED_OFFSET_S = 0.02  # between clocks; less is not worth a word
+_BETTER = 0.99  # times the error of now, what an offset has to reach to be advised
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,16 +41,22 @@ class Evaluation:
     Attributes:
         association: which poses were compared, and how they were matched.
         alignment: the transform that was applied to the estimate.
-        aligned: (M) matched poses of the estimate, in the frame of the ground truth.
+        aligned_by: of how many matched poses, from the first, the alignment was found; None: of all.
+        plane: that both were projected into after the alignment, or None.
+        aligned: (M) matched poses of the estimate, in the frame of the ground truth (and in the plane).
+        truth: (M) the poses of the ground truth that belong to them, likewise.
         translation_error_m: (M,) absolute translation errors [m].
         rotation_error_deg: (M,) absolute rotation errors [degrees].
-        relative: relative pose errors, by distance and by time, as far as the trajectory is long enough.
+        relative: relative pose errors, one for every delta that the trajectory is long enough for.
         warnings: what to doubt about the numbers, one sentence each.
     """
 
     association: Association
     alignment: Alignment
+    aligned_by: int | None
+    plane: Plane | None
     aligned: Trajectory
+    truth: Trajectory
     translation_error_m: NDArray[np.float64]
     rotation_error_deg: NDArray[np.float64]
     relative: tuple[RelativeErrors, ...]
@@ -61,11 +76,22 @@ class Evaluation:
     def title(self) -> str:
         """How the numbers came about, in one line: to stand above every table and plot of them."""
         matched = {"nearest": "nearest stamps", "interpolate": "interpolated ground truth", "index": "by index"}
-        return f"{len(self.association)} poses ({matched[self.association.method]}), {_KINDS[self.alignment.kind]}"
+        return f"{len(self.association)} poses ({matched[self.association.method]}), {self._how}"
+
+    @property
+    def _how(self) -> str:
+        first = f" by the first {self.aligned_by} poses" if self.aligned_by is not None else ""
+        return _KINDS[self.alignment.kind] + first + (f", in the {self.plane} plane" if self.plane is not None else "")
+
+    def brought(self, trajectory: Trajectory) -> Trajectory:
+        """Other poses of the estimate, matched or not, as `aligned` has them: on clock and in frame of the ground truth."""
+        if trajectory.time_ns is not None:
+            trajectory = replace(trajectory, time_ns=trajectory.time_ns + round(self.association.offset_s * 1e9), lines=None)
+        return projected(self.alignment.apply(trajectory), self.plane)
 
     def summary(self) -> str:
         """The report as text: association first, then alignment, errors and warnings."""
-        lines = ["Association", *self.association.lines(), "", f"Alignment: {_KINDS[self.alignment.kind]}"]
+        lines = ["Association", *self.association.lines(), "", f"Alignment: {self._how}"]
         if self.alignment.kind != "none":
             turn = float(np.degrees(np.linalg.norm(so3.log(self.alignment.R_world_estimate))))
             p = ", ".join(f"{value:.4f}" for value in self.alignment.p_world_estimate)
@@ -74,11 +100,11 @@ class Evaluation:
         lines += ["", f"Absolute trajectory error: {self.title}"]
         lines += [f"translation: {self.ate.line('m')}", f"rotation: {self.ate_rotation.line('°')}"]
         for errors in self.relative:
-            share = 100.0 * errors.translation.mean / errors.delta
-            per = f"{share:.3f} % of the distance" if errors.unit == "m" else f"{errors.translation.mean / errors.delta:.6f} m/s"
+            rate = errors.translation.mean / errors.delta.value
+            per = {"m": f", mean {100.0 * rate:.3f} % of the distance", "s": f", mean {rate:.6f} m/s"}.get(errors.delta.unit, "")
             lines += [
                 "",
-                f"Relative pose error over {errors.delta:g} {errors.unit}: {len(errors.pairs)} pairs, mean {per}",
+                f"Relative pose error over {errors.delta}: {len(errors.pairs)} pairs{per}",
                 f"translation: {errors.translation.line('m')}",
                 f"rotation: {errors.rotation.line('°')}",
             ]
@@ -93,6 +119,7 @@ class Evaluation:
             "association": {
                 "method": a.method,
                 "matches": len(a),
+                "repeated": a.repeated,
                 "unmatched_estimate": a.unmatched_estimate,
                 "unmatched_ground_truth": a.unmatched_ground_truth,
                 "outside": a.outside,
@@ -107,13 +134,16 @@ class Evaluation:
                 "R_world_estimate": self.alignment.R_world_estimate.tolist(),
                 "p_world_estimate": self.alignment.p_world_estimate.tolist(),
                 "scale": self.alignment.scale,
+                "by_first_poses": self.aligned_by,
             },
+            "plane": self.plane,
             "ate_translation_m": asdict(self.ate),
             "ate_rotation_deg": asdict(self.ate_rotation),
             "rpe": [
                 {
-                    "delta": errors.delta,
-                    "unit": errors.unit,
+                    "delta": errors.delta.value,
+                    "unit": errors.delta.unit,
+                    "pairs": len(errors.pairs),
                     "translation_m": asdict(errors.translation),
                     "rotation_deg": asdict(errors.rotation),
                 }
@@ -133,56 +163,82 @@ def evaluate(
     offset_s: float = 0.0,
     max_gap_s: float = 0.25,
     min_matches: int = 10,
-    rpe_distance_m: float | None = 10.0,
-    rpe_time_s: float | None = 1.0,
+    align_by_first: int | None = None,
+    plane: Plane | None = None,
+    deltas: Sequence[Delta] = DELTAS,
     rpe_pairs: Pairs = "consecutive",
+    rpe_path_of: Literal["estimate", "ground_truth"] = "estimate",
 ) -> Evaluation:
     """Compare an estimate with the ground truth. Neither argument is changed.
 
     Args:
         estimate, ground_truth: the trajectories.
-        alignment: `se3`, `sim3`, `yaw` or `none`, from the matched positions (`align`).
+        alignment: `se3`, `sim3`, `yaw` or `none`, from the matched positions (`align`), or `origin`, from the first matched pose.
         method, max_difference_s, offset_s, max_gap_s, min_matches: see `associate`.
-        rpe_distance_m, rpe_time_s: deltas of the relative errors, or None to leave them out; where the trajectory is too
-            short for one (or has no time), a warning says so.
-        rpe_pairs: `consecutive` or `all`.
+        align_by_first: find the alignment from so many matched poses at the beginning only; None: from all.
+        plane: project both into this plane of the ground truth's frame, after the alignment.
+        deltas: of the relative errors; where the trajectory is too short for one (or has no time), a warning says so.
+        rpe_pairs: `consecutive` or `all`. rpe_path_of: whose path says where a pair ends.
 
     Raises:
         InputError: a comparison that would mean nothing: no overlap in time, too few matches, another unit of time or
             length, positions that do not determine the alignment.
     """
-    association = associate(
-        estimate, ground_truth, method, max_difference_s, offset_s=offset_s, max_gap_s=max_gap_s, min_matches=min_matches
-    )
-    matched, truth = association.estimate, association.ground_truth
+
+    def matches(offset_s: float) -> Association:
+        return associate(
+            estimate, ground_truth, method, max_difference_s, offset_s=offset_s, max_gap_s=max_gap_s, min_matches=min_matches
+        )
+
+    association = matches(offset_s)
+    matched = association.estimate
     if alignment != "sim3":
-        _refuse_other_unit(matched, truth)
-    transform = align(matched.p, truth.p, alignment)
-    aligned = transform.apply(matched)
+        _refuse_other_unit(matched, association.ground_truth)
+    transform = _find_alignment(association, alignment, align_by_first)
+    aligned, truth = (projected(poses, plane) for poses in (transform.apply(matched), association.ground_truth))
     translation = translation_errors(aligned, truth)
     rotation = rotation_differences(aligned, truth)
     warnings = [*estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
+    noticed = association.time_offset
+    if noticed is not None and abs(noticed.offset_s) > _NOTICED_OFFSET_S:
+        try:
+            other = matches(association.offset_s + noticed.offset_s)
+            moved = _find_alignment(other, alignment, align_by_first).apply(other.estimate)
+            errors = translation_errors(projected(moved, plane), projected(other.ground_truth, plane))
+            warnings.append(_clock_doubt(noticed, other.offset_s, _rms(translation), _rms(errors)))
+        except InputError:
+            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, _rms(translation), None))
     warnings += _alignment_doubts(transform, translation, rotation)
     relative = []
-    if rpe_time_s is not None and aligned.time_ns is None:
-        rpe_time_s = None
-        warnings.append("no relative error by time: the files carry no time stamps")
-    for distance_m, time_s in ((rpe_distance_m, None), (None, rpe_time_s)):
-        if distance_m is not None or time_s is not None:
-            try:
-                relative.append(relative_errors(aligned, truth, distance_m=distance_m, time_s=time_s, pairs=rpe_pairs))
-            except InputError as error:
-                warnings.append(f"no relative error by {'time' if distance_m is None else 'distance'}: {error}")
+    for delta in deltas:
+        try:
+            relative.append(relative_errors(aligned, truth, delta, pairs=rpe_pairs, path_of=rpe_path_of))
+        except InputError as error:
+            warnings.append(f"no relative error over {delta}: {error}")
     return Evaluation(
         association=association,
         alignment=transform,
+        aligned_by=align_by_first,
+        plane=plane,
         aligned=aligned,
+        truth=truth,
         translation_error_m=translation,
         rotation_error_deg=np.degrees(np.linalg.norm(rotation, axis=1)),
         relative=tuple(relative),
         warnings=tuple(warnings),
     )
+
+
+def _find_alignment(association: Association, kind: AlignmentKind, first: int | None) -> Alignment:
+    estimate, truth = association.estimate, association.ground_truth
+    if kind == "origin":
+        return align_origin(estimate, truth)
+    if first is not None and not 3 <= first <= len(association):
+        raise InputError(
+            f"3 to {len(association)} matched poses to align by", f"{first}", "choose another number, or leave --n-to-align out"
+        )
+    return align(estimate.p[:first], truth.p[:first], kind)
 
 
 def _refuse_other_unit(estimate: Trajectory, ground_truth: Trajectory) -> None:
@@ -214,18 +270,33 @@ def _association_doubts(association: Association, estimate: Trajectory, ground_t
             doubts.append(
                 f"the estimate covers {100 * covered:.0f} % of the ground truth's time: the rest counts as neither good nor bad"
             )
-        offset = association.time_offset
-        if offset is not None and abs(offset.offset_s) > 0.02:
+        if association.repeated:
             doubts.append(
-                f"the clocks may differ by {offset.offset_s:+.3f} s (correlation {offset.correlation:.3f}); try --offset "
-                f"{association.offset_s + offset.offset_s:.3f}"
+                f"{association.repeated} of the {len(association)} matches repeat a pose, and charge the estimate with the "
+                "motion between the stamps: --interpolate does not"
             )
     return doubts
 
 
+def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:
+    """An offset is advised only where the errors do get smaller with it."""
+    motions = (
+        f"the motions fit best with {found.offset_s:+.3f} s added to the estimate's stamps (correlation {found.correlation:.3f})"
+    )
+    if rmse_with is None:
+        return f"{motions}, but the poses cannot be compared with that: no offset is advised"
+    if rmse_with < _BETTER * rmse:
+        return f"{motions}: with --offset {offset_s:.3f} the ATE is {rmse_with:.4g} m instead of {rmse:.4g} m"
+    return f"{motions}, but the ATE is no better with that ({rmse_with:.4g} m, now {rmse:.4g} m): no offset is advised"
+
+
+def _rms(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
 def _alignment_doubts(alignment: Alignment, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> list[str]:
     doubts = []
-    rmse = float(np.sqrt(np.mean(translation**2)))
+    rmse = _rms(translation)
     if alignment.kind in ("se3", "sim3") and alignment.spread_m[1] < rmse:
         doubts.append(
             f"the path strays {alignment.spread_m[1]:.3g} m from a straight line, less than the error of {rmse:.3g} m: the "
@@ -237,8 +308,10 @@ def _alignment_doubts(alignment: Alignment, translation: NDArray[np.float64], ro
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = float(np.degrees(np.sqrt(np.mean(np.sum((rotation - mean) ** 2, axis=1)))))
     if constant > 2.0 and scatter < 0.5 * constant:
+        w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
             f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
-            "and the rotation error and the relative errors contain that"
+            "and the rotation error and the relative errors contain that; the pose of the one body in the other's frame can be "
+            f"given, for this rotation with --transform-right 0,0,0,{x:.5f},{y:.5f},{z:.5f},{w:.5f}"
         )
     return doubts

@@ -58,7 +58,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> Figure:
 def _trajectories(evaluation: Evaluation, ground_truth: Trajectory) -> Figure:
     """From above and from the side, the estimate coloured by its error."""
     figure = _figure(1, 2, (13.0, 6.0))
-    aligned, truth = evaluation.aligned, evaluation.association.ground_truth
+    aligned, truth = evaluation.aligned, evaluation.truth
     for axes, (a, b) in zip(figure.axes, ((0, 1), (0, 2)), strict=True):
         whole, index = ground_truth.p, truth.p
         axes.plot(whole[:, a], whole[:, b], color=_MUTED, linewidth=1.0, label="ground truth")
@@ -88,7 +88,7 @@ def _errors(evaluation: Evaluation) -> Figure:
         axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
     for axes, errors in zip(figure.axes[2:], evaluation.relative, strict=True):
         axes.plot(at[errors.pairs[:, 1]], errors.translation_m, color=_ESTIMATE, linewidth=0.9, marker=".", markersize=3.0)
-        axes.set_ylabel(f"relative error\nover {errors.delta:g} {errors.unit} [m]")
+        axes.set_ylabel(f"relative error\nover {errors.delta} [m]")
     for axes in figure.axes:
         axes.set_ylim(bottom=0.0)
         axes.set_xlim(at[0], at[-1])

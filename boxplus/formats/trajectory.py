@@ -123,11 +123,13 @@ class Trajectory:
         """Sum of the distances between consecutive positions [m]."""
         return float(np.linalg.norm(np.diff(self.p, axis=0), axis=1).sum())
 
-    def select(self, index: NDArray[np.intp]) -> Trajectory:
-        """The poses at `index` (increasing), as a trajectory of their own."""
+    def select(self, index: NDArray[np.intp], time_ns: NDArray[np.int64] | None = None) -> Trajectory:
+        """The poses at `index` (increasing), as a trajectory of their own; with other stamps, where `time_ns` gives them."""
+        if time_ns is None and self.time_ns is not None:
+            time_ns = self.time_ns[index]
         return replace(
             self,
-            time_ns=None if self.time_ns is None else self.time_ns[index],
+            time_ns=time_ns,
             p=self.p[index],
             q_wxyz=self.q_wxyz[index],
             covariance=None if self.covariance is None else self.covariance[index],

@@ -23,21 +23,29 @@ def still(times: list[int]) -> Trajectory:
 @settings(max_examples=200, deadline=None)
 @given(estimate=stamps, truth=stamps, limit=st.integers(1, 500))
 def test_nearest_pairs_against_brute_force(estimate: list[int], truth: list[int], limit: int) -> None:
-    best: dict[int, tuple[int, int]] = {}  # ground truth → (difference, estimate)
-    for i, t in enumerate(estimate):
-        difference, j = min((abs(t - other), j) for j, other in enumerate(truth))
-        if difference <= limit:
-            best[j] = min(best.get(j, (difference, i)), (difference, i))
-    expected = sorted((i, j) for j, (_, i) in best.items())
+    # From every pose of the one that has fewer, the nearest of the other, the earlier of two.
+    few, many = (truth, estimate) if len(truth) < len(estimate) else (estimate, truth)
+    nearest = [(i, min(range(len(many)), key=lambda j: (abs(many[j] - t), j))) for i, t in enumerate(few)]
+    kept = [(i, j) for i, j in nearest if abs(few[i] - many[j]) <= limit]
+    expected = kept if few is estimate else [(j, i) for i, j in kept]
     try:
         found = associate(still(estimate), still(truth), max_difference_s=limit * 1e-9, min_matches=1)
     except InputError:
         assert not expected or max(estimate[0], truth[0]) > min(estimate[-1], truth[-1])
         return
     assert list(zip(found.estimate_index.tolist(), found.ground_truth_index.tolist(), strict=True)) == expected
-    assert found.unmatched_estimate == len(estimate) - len(expected)
+    assert found.unmatched_estimate == len(estimate) - len({i for i, _ in expected})
+    assert found.repeated == len(expected) - min(len({i for i, _ in expected}), len({j for _, j in expected}))
+    assert found.estimate.times.tolist() == found.ground_truth.times.tolist() == [few[i] for i, _ in kept]
     assert found.outside == sum(t < truth[0] or t > truth[-1] for t in estimate)
     np.testing.assert_array_equal(found.difference_s * 1e9 <= limit + 1e-6, True)
+
+
+def test_poses_taken_twice_are_counted() -> None:
+    path = SmoothPath(1)
+    found = associate(path.sample(np.arange(0.0, 20.0, 0.02)), path.sample(np.arange(0.0, 25.0, 0.025)))
+    assert (len(found), found.repeated) == (1000, 200)
+    assert "200 of the 1000 matches repeat a pose: the other trajectory is denser there" in found.lines()
 
 
 def test_interpolation_follows_the_path() -> None:
