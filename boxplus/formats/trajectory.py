@@ -26,6 +26,7 @@ from boxplus.formats.trajectory_rows import (
     parse_row,
     tum_row,
 )
+from boxplus.formats.trajectory_table import Table, read_table
 from boxplus.manifolds import quaternion
 
 QUATERNION_TOLERANCE = 1e-2
@@ -183,6 +184,9 @@ def read_trajectory(path: str | Path, format: Format | Literal["auto"] = "auto")
     Raises:
         InputError: the file is missing, empty, not text, or a line is malformed; the message names file and line.
     """
+    table = read_table(Path(path), format)
+    if table is not None:
+        return _of_table(table, str(path))
     lines, complete = _read_lines(Path(path))
     rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if rows and format != "kitti" and is_header(rows[0][1]):
@@ -209,7 +213,7 @@ def read_trajectory(path: str | Path, format: Format | Literal["auto"] = "auto")
             numbers.append(number)
     if not parsed:
         raise InputError("a trajectory with at least one pose", f"none ({path})", "check the run that should have written it")
-    return _assemble(parsed, numbers, layout, str(path), tuple(warnings))
+    return _of_rows(parsed, numbers, layout, str(path), tuple(warnings))
 
 
 def _read_lines(path: Path) -> tuple[list[str], bool]:
@@ -227,19 +231,45 @@ def _read_lines(path: Path) -> tuple[list[str], bool]:
     return lines, not lines or (text[-1] in "\r\n" and "\0" not in lines[-1])
 
 
-def _assemble(rows: list[Row], numbers: list[int], layout: Format, source: str, warnings: tuple[str, ...]) -> Trajectory:
-    repeated = {i for i in range(1, len(rows)) if rows[i].time_ns is not None and rows[i].time_ns == rows[i - 1].time_ns}
-    if repeated:
-        first = numbers[min(repeated)]
-        warnings += (
-            f"{len(repeated)} poses of {source} repeat the time stamp before them and were left out (first: line {first})",
-        )
-        rows = [row for i, row in enumerate(rows) if i not in repeated]
-        numbers = [number for i, number in enumerate(numbers) if i not in repeated]
+def _of_table(table: Table, source: str) -> Trajectory:
+    values = table.values
+    if table.layout == "kitti":
+        rotation, p = values.reshape(-1, 3, 4)[:, :, :3], values[:, 3::4]
+    else:
+        rotation, p = values[:, [7, 4, 5, 6]], values[:, 1:4]
+    return _assemble(table.time_ns, p, rotation, table.lines, source, ())
+
+
+def _of_rows(rows: list[Row], numbers: list[int], layout: Format, source: str, warnings: tuple[str, ...]) -> Trajectory:
+    time_ns = None if layout == "kitti" else np.array([row.time_ns for row in rows], dtype=np.int64)
+    p = np.array([row.p for row in rows], dtype=np.float64)
     rotation = np.array([row.rotation for row in rows], dtype=np.float64)
-    matrices: NDArray[np.float64] | None
     if layout == "kitti":
-        matrices = rotation.reshape(-1, 3, 3)
+        rotation = rotation.reshape(-1, 3, 3)
+    if layout != "csv":
+        return _assemble(time_ns, p, rotation, np.array(numbers), source, warnings)
+    covariance = np.empty((len(rows), 6, 6))
+    covariance[:, UPPER[0], UPPER[1]] = covariance[:, UPPER[1], UPPER[0]] = [row.covariance for row in rows]
+    return _assemble(
+        time_ns, p, rotation, np.array(numbers), source, warnings,
+        None if np.isnan(covariance).all() else covariance, tuple(row.status or "" for row in rows),
+    )  # fmt: skip
+
+
+def _assemble(
+    time_ns: NDArray[np.int64] | None,
+    p: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    source: str,
+    warnings: tuple[str, ...],
+    covariance: NDArray[np.float64] | None = None,
+    status: tuple[str, ...] | None = None,
+) -> Trajectory:
+    """The trajectory of a file's poses, without those that repeat a stamp; `rotation` is (N, 4) wxyz or (N, 3, 3)."""
+    matrices = None
+    if rotation.ndim == 3:
+        matrices = rotation
         with np.errstate(all="ignore"):
             off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
             bad = np.flatnonzero(~((off < QUATERNION_TOLERANCE) & (np.linalg.det(matrices) > 0.0)))
@@ -250,18 +280,23 @@ def _assemble(rows: list[Row], numbers: list[int], layout: Format, source: str, 
                 "check that the file holds 3×4 pose matrices row by row",
             )
         rotation = quaternion.from_matrix(matrices)
-    else:
-        matrices = None
-    covariance = None
-    if layout == "csv":
-        covariance = np.empty((len(rows), 6, 6))
-        covariance[:, UPPER[0], UPPER[1]] = covariance[:, UPPER[1], UPPER[0]] = [row.covariance for row in rows]
+    if time_ns is not None:
+        fresh = np.r_[True, time_ns[1:] != time_ns[:-1]]
+        if not fresh.all():
+            repeated = np.flatnonzero(~fresh)
+            warnings += (
+                f"{len(repeated)} poses of {source} repeat the time stamp before them and were left out "
+                f"(first: line {numbers[repeated[0]]})",
+            )
+            time_ns, p, rotation, numbers = time_ns[fresh], p[fresh], rotation[fresh], numbers[fresh]
+            covariance = None if covariance is None else covariance[fresh]
+            status = None if status is None else tuple(word for word, keep in zip(status, fresh, strict=True) if keep)
     return Trajectory(
-        time_ns=None if layout == "kitti" else np.array([row.time_ns for row in rows], dtype=np.int64),
-        p=np.array([row.p for row in rows], dtype=np.float64),
+        time_ns=time_ns,
+        p=p,
         q_wxyz=rotation,
-        covariance=None if covariance is None or np.isnan(covariance).all() else covariance,
-        status=tuple(row.status or "" for row in rows) if layout == "csv" else None,
+        covariance=covariance,
+        status=status,
         matrices=matrices,
         source=source,
         warnings=warnings,

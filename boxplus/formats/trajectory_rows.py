@@ -42,7 +42,9 @@ def seconds_to_ns(text: str) -> int:
     """
     whole, _, fraction = text.partition(".")
     if whole.isdecimal() and fraction.isdecimal() and len(whole) <= 10 and len(fraction) <= 9:  # the usual form, fast
-        return int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0"))
+        nanoseconds = int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0"))
+        if nanoseconds < 2**63:
+            return nanoseconds
     try:
         seconds = Decimal(text)
     except InvalidOperation:
