@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -30,6 +32,8 @@ _KINDS = {
     "sim3": "Sim(3) alignment (and scale)",
     "origin": "alignment of the first poses",
 }
+_NAMED_TRUTH = re.compile(r"(^|[^a-z])(gt|ground_?-?truth|truth)([^a-z]|$)", re.IGNORECASE)
+_NAMES_OF_RUNS = ("trajectory.tum", "trajectory.csv", "trajectory.kitti.txt")
 _NOTICED_OFFSET_S = 0.02  # between clocks; less is not worth a word
 _BETTER = 0.99  # times the error of now, what an offset has to reach to be advised
 
@@ -198,7 +202,7 @@ def evaluate(
     aligned, truth = (projected(poses, plane) for poses in (transform.apply(matched), association.ground_truth))
     translation = translation_errors(aligned, truth)
     rotation = rotation_differences(aligned, truth)
-    warnings = [*estimate.warnings, *ground_truth.warnings]
+    warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
     noticed = association.time_offset
     if noticed is not None and abs(noticed.offset_s) > _NOTICED_OFFSET_S:
@@ -239,6 +243,18 @@ def _find_alignment(association: Association, kind: AlignmentKind, first: int | 
             f"3 to {len(association)} matched poses to align by", f"{first}", "choose another number, or leave --n-to-align out"
         )
     return align(estimate.p[:first], truth.p[:first], kind)
+
+
+def _order_doubts(estimate: Trajectory, ground_truth: Trajectory) -> list[str]:
+    """Whether the names of the files speak for the two being swapped: the field's tools have the other order."""
+    first, second = (Path(trajectory.source).name for trajectory in (estimate, ground_truth))
+    truths = [_NAMED_TRUTH.search(name) is not None for name in (first, second)]
+    runs = [name in _NAMES_OF_RUNS for name in (first, second)]
+    if truths[0] > truths[1] or runs[1] > runs[0]:
+        return [
+            f"by their names, {first} is the ground truth and {second} the estimate: are they swapped? The ground truth is last"
+        ]
+    return []
 
 
 def _refuse_other_unit(estimate: Trajectory, ground_truth: Trajectory) -> None:

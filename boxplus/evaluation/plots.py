@@ -15,7 +15,8 @@ from boxplus.formats.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_ESTIMATE, _TRUTH, _MUTED = "#1f5fa8", "#222222", "#b0b0b0"
+TRUTH = "#222222"
+_ESTIMATE, _MUTED = "#1f5fa8", "#b0b0b0"
 
 
 def write_plots(evaluation: Evaluation, folder: str | Path, estimate: Trajectory, ground_truth: Trajectory) -> list[Path]:
@@ -29,11 +30,19 @@ def write_plots(evaluation: Evaluation, folder: str | Path, estimate: Trajectory
     Raises:
         OutputError: the folder or a file cannot be written.
     """
-    base = make_folder(folder)
     figures = {"trajectories": _trajectories(evaluation, ground_truth), "errors": _errors(evaluation)}
     if evaluation.association.method != "index":
         figures["association"] = _association(evaluation, estimate, ground_truth)
-    paths = []
+    return save_figures(figures, folder)
+
+
+def save_figures(figures: dict[str, Figure], folder: str | Path) -> list[Path]:
+    """Write `NAME.png` for every figure into a folder, which is created where it does not exist.
+
+    Raises:
+        OutputError: the folder or a file cannot be written.
+    """
+    base, paths = make_folder(folder), []
     for name, figure in figures.items():
         path = base / f"{name}.png"
         with atomic_file(path) as file:
@@ -42,7 +51,8 @@ def write_plots(evaluation: Evaluation, folder: str | Path, estimate: Trajectory
     return paths
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> Figure:
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> Figure:
+    """A figure of that size [inches] with empty axes, drawn without any window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -57,12 +67,12 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> Figure:
 
 def _trajectories(evaluation: Evaluation, ground_truth: Trajectory) -> Figure:
     """From above and from the side, the estimate coloured by its error."""
-    figure = _figure(1, 2, (13.0, 6.0))
+    figure = new_figure(1, 2, (13.0, 6.0))
     aligned, truth = evaluation.aligned, evaluation.truth
     for axes, (a, b) in zip(figure.axes, ((0, 1), (0, 2)), strict=True):
         whole, index = ground_truth.p, truth.p
         axes.plot(whole[:, a], whole[:, b], color=_MUTED, linewidth=1.0, label="ground truth")
-        axes.plot(index[:, a], index[:, b], color=_TRUTH, linewidth=1.2, label="ground truth, matched")
+        axes.plot(index[:, a], index[:, b], color=TRUTH, linewidth=1.2, label="ground truth, matched")
         points = axes.scatter(
             aligned.p[:, a], aligned.p[:, b], c=evaluation.translation_error_m, s=6.0, cmap="viridis", label="estimate", zorder=3
         )
@@ -78,12 +88,12 @@ def _trajectories(evaluation: Evaluation, ground_truth: Trajectory) -> Figure:
 def _errors(evaluation: Evaluation) -> Figure:
     """Absolute and relative errors over time (over the pose number where there is no time)."""
     at, label = _abscissa(evaluation)
-    figure = _figure(2 + len(evaluation.relative), 1, (11.0, 2.6 * (2 + len(evaluation.relative))))
+    figure = new_figure(2 + len(evaluation.relative), 1, (11.0, 2.6 * (2 + len(evaluation.relative))))
     absolute = ((evaluation.translation_error_m, "translation [m]"), (evaluation.rotation_error_deg, "rotation [°]"))
     for axes, (values, name) in zip(figure.axes, absolute, strict=False):
         axes.plot(at, values, color=_ESTIMATE, linewidth=0.9)
         rmse = float(np.sqrt(np.mean(values**2)))
-        axes.axhline(rmse, color=_TRUTH, linewidth=0.8, linestyle="--", label=f"rmse {rmse:.4g}")
+        axes.axhline(rmse, color=TRUTH, linewidth=0.8, linestyle="--", label=f"rmse {rmse:.4g}")
         axes.set_ylabel(f"absolute error,\n{name}")
         axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)
     for axes, errors in zip(figure.axes[2:], evaluation.relative, strict=True):
@@ -100,14 +110,14 @@ def _errors(evaluation: Evaluation) -> Figure:
 def _association(evaluation: Evaluation, estimate: Trajectory, ground_truth: Trajectory) -> Figure:
     """Where on the time axis both trajectories have poses, which were matched, and how far apart the stamps are."""
     association = evaluation.association
-    figure = _figure(2, 1, (11.0, 5.0))
+    figure = new_figure(2, 1, (11.0, 5.0))
     timeline, differences = figure.axes
     begin = min(estimate.times[0] + round(association.offset_s * 1e9), ground_truth.times[0])
     stamps = _seconds(estimate.times + round(association.offset_s * 1e9), begin)
     unmatched = np.ones(len(stamps), dtype=bool)
     unmatched[association.estimate_index] = False
     rows = (
-        ("ground truth", _seconds(ground_truth.times, begin), _TRUTH),
+        ("ground truth", _seconds(ground_truth.times, begin), TRUTH),
         ("estimate, matched", stamps[~unmatched], _ESTIMATE),
         (f"estimate, unmatched ({int(unmatched.sum())})", stamps[unmatched], "#c0392b"),
     )

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from boxplus.cli.eval import evaluate_command
 from boxplus.errors import InputError
-from boxplus.formats.trajectory import Trajectory, write_csv, write_tum
+from boxplus.evaluation.frames import transformed
+from boxplus.formats.trajectory import Trajectory, read_trajectory, write_csv, write_tum
 
 app = typer.Typer()
 app.command()(evaluate_command)
@@ -60,3 +61,70 @@ def test_offset_and_refusals(files: tuple[str, str]) -> None:
     assert "two trajectories that overlap in time" in str(result.exception)
     assert CliRunner().invoke(app, [*files, "--align", "affine"]).exit_code == 2
     assert isinstance(CliRunner().invoke(app, [*files, "--format", "kitti"]).exception, InputError)
+
+
+def test_several_estimates_come_in_one_table_and_one_plot(files: tuple[str, str], tmp_path: Path) -> None:
+    short = read_trajectory(files[0]).select(np.arange(100))
+    write_tum(tmp_path / "short.tum", short)
+    (tmp_path / "broken.tum").write_text("1 2 3\n")
+    names = [files[0], str(tmp_path / "short.tum"), str(tmp_path / "broken.tum")]
+    result = CliRunner().invoke(
+        app, [*names, files[1], "--plot", str(tmp_path / "plots"), "--rpe-turn", "20", "--rpe-frames", "5"]
+    )
+    assert isinstance(result.exception, InputError)
+    assert "3 estimates that can be compared – got 1 that cannot" in str(result.exception)
+    head, *rows = result.stdout.splitlines()
+    assert head.split()[:4] == ["estimate", "matches", "ATE", "rmse"]
+    assert [row.split()[:2] for row in rows[:2]] == [["estimate", "400"], ["short", "100"]]
+    for delta in ("10 m", "1 s", "20°", "5 frames"):
+        assert f"RPE {delta} rmse m" in head
+    assert "broken: not compared, expected a trajectory in TUM" in result.stdout
+    assert "not compared over the same stretch of 39.9 s: short (0.0 to 9.9 s)" in result.stdout
+    alone = json.loads(CliRunner().invoke(app, [names[1], files[1], "--json", "--rpe-turn", "20", "--rpe-frames", "5"]).stdout)
+    figures = [alone["ate_translation_m"][name] for name in ("rmse", "mean", "median", "max")]
+    assert rows[1].split()[2:6] == [f"{figure:.6f}" for figure in figures]
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"trajectories.png", "errors.png"}
+    together = CliRunner().invoke(app, [*names[:2], files[1], "--json"])
+    assert together.exit_code == 0
+    assert list(json.loads(together.stdout)["estimates"]) == ["estimate", "short"]
+
+
+def test_aligned_trajectories_are_saved_as_they_were_compared(files: tuple[str, str], tmp_path: Path) -> None:
+    truth = read_trajectory(files[1])
+    left, right = np.eye(4), np.eye(4)
+    left[:3] = [[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 2]]
+    right[:3, 3] = [0.0, 0.3, 1.2]
+    late = transformed(read_trajectory(files[0]), left=left, right=right)
+    write_tum(tmp_path / "late.tum", Trajectory(late.times - 500_000_000, late.p, late.q_wxyz))
+    arguments = [str(tmp_path / "late.tum"), files[1], "--offset", "0.5", "--transform-right", "0,0.3,1.2", "--json"]
+    result = CliRunner().invoke(app, [*arguments, "--save-aligned", str(tmp_path / "saved")])
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["ate_translation_m"]["rmse"] == pytest.approx(0.0173, rel=0.1)
+    saved = {path.name: read_trajectory(path) for path in (tmp_path / "saved").iterdir()}
+    assert saved.keys() == {"late.aligned.tum", "ground_truth.tum"}
+    moved_truth = transformed(truth, right=right)
+    np.testing.assert_allclose(saved["ground_truth.tum"].p, moved_truth.p, atol=2e-9)
+    np.testing.assert_array_equal(saved["late.aligned.tum"].times, truth.times)
+    assert np.linalg.norm(saved["late.aligned.tum"].p - moved_truth.p, axis=1).max() < 0.1
+    flat = CliRunner().invoke(
+        app, [*arguments, "--project-to-plane", "xy", "--save-aligned", str(tmp_path / "flat"), "--align", "origin"]
+    )
+    assert json.loads(flat.stdout)["plane"] == "xy"
+    assert not read_trajectory(tmp_path / "flat" / "late.aligned.tum").p[:, 2].any()
+
+
+def test_swapped_arguments_are_noticed(files: tuple[str, str], tmp_path: Path) -> None:
+    assert "swapped" not in CliRunner().invoke(app, [*files]).output
+    result = CliRunner().invoke(app, [files[1], files[0]])
+    assert "by their names, truth.tum is the ground truth and estimate.csv the estimate: are they swapped?" in result.output
+    run = tmp_path / "run"
+    run.mkdir()
+    write_tum(run / "trajectory.tum", read_trajectory(files[0]))
+    assert "by their names" in CliRunner().invoke(app, [files[0], str(run / "trajectory.tum")]).output
+    assert "matched 400 of 400" in CliRunner().invoke(app, [str(run), files[1]]).output
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0")
+    for recording in (tmp_path / "drive.bag", tmp_path):
+        swapped = CliRunner().invoke(app, [str(recording), files[1]])
+        assert "estimated trajectories first, the ground truth last" in str(swapped.exception)
+    against = CliRunner().invoke(app, [*files, str(tmp_path / "drive.bag")])
+    assert "one estimate, its places alone, against positions by satellite – got another one" in str(against.exception)
