@@ -30,7 +30,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PYTHON_PAGES = [
     ROOT / "README.md",
-    *(ROOT / "docs" / f"{name}.md" for name in ("library_use", "least_squares", "bundle_adjustment", "pose_graphs")),
+    *(
+        ROOT / "docs" / f"{name}.md"
+        for name in ("library_use", "least_squares", "bundle_adjustment", "pose_graphs", "extending", "coming_from")
+    ),
 ]
 
 
