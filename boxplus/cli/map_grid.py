@@ -66,19 +66,27 @@ def height(
     z: _Z = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Write the heights of the ground, or of what stands on it, as a GeoTIFF in the map's own frame."""
+    """Write the heights of the ground, or of what stands on it, as a GeoTIFF (pip install 'boxplus[geo]').
+
+    In the map's own frame; of a run of 'boxplus slam' with positions by satellite with its place on the Earth and heights
+    above the ellipsoid of WGS84.
+    """
     import numpy as np
 
-    from boxplus.formats.geotiff import write_geotiff
+    from boxplus.formats.geotiff import require_rasterio, write_geotiff
     from boxplus.maps.floor_plan.occupancy import FloorPlanConfig
     from boxplus.runs.map_from_above import MapFromAbove
 
     path = output or folder / "height.tif"
     _check_new([path], overwrite)
+    require_rasterio()
     above = MapFromAbove(folder, FloorPlanConfig(ground_cell=resolution, slope=slope), z)
     _warn(above.store.report)
     heights, raster = above.surface() if surface else above.ground()
-    write_geotiff(path, heights, raster.cell, (raster.x, raster.y))
+    projection = None if above.frame is None else above.frame.projection
+    heights = above.above_ellipsoid(heights)
+    what = "height [m]" if above.frame is None else "height above the ellipsoid of WGS84 [m]"
+    write_geotiff(path, heights, raster.cell, (raster.x, raster.y), projection=projection, description=what)
     known = np.isfinite(heights)
     extent = f"{np.nanmin(heights):.2f} to {np.nanmax(heights):.2f} m" if known.any() else "no ground"
     typer.echo(f"{raster.columns} × {raster.rows} cells of {raster.cell:g} m, {known.mean():.0%} known, {extent} → {path}")

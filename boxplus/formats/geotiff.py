@@ -1,64 +1,76 @@
-"""Heights over a grid as GeoTIFF, without any library: one band of float32, uncompressed."""
+"""Heights over a grid as GeoTIFF, by rasterio (extra `geo`): one band of float32, compressed."""
 
 from __future__ import annotations
 
-import struct
+import os
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.output import atomic_file
+from boxplus.formats.output import TEMPORARY_SUFFIX, output_error
 
-_TYPES = {"ascii": (2, 1, ""), "short": (3, 2, "H"), "long": (4, 4, "I"), "double": (12, 8, "d")}
+_BLOCK = 256  # cells of a tile's side
 
 
-def write_geotiff(path: str | Path, heights: NDArray[np.float64], resolution: float, origin: tuple[float, float]) -> None:
-    """Write a raster in a local metric frame (no coordinate reference system); NaN is "no data".
+def require_rasterio() -> Any:
+    """The module, asked for before a long computation whose result it has to write.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import rasterio
+    except ImportError as error:
+        raise InputError("rasterio, to write a GeoTIFF", "an installation without it", "pip install 'boxplus[geo]'") from error
+    return rasterio
+
+
+def write_geotiff(
+    path: str | Path,
+    heights: NDArray[np.float64],
+    resolution: float,
+    origin: tuple[float, float],
+    *,
+    projection: str | None = None,
+    description: str = "height [m]",
+) -> None:
+    """Write a raster of heights; NaN is "no data".
 
     Args:
         heights: (rows, columns) [m], row 0 at the bottom (smallest y).
         resolution: side of a cell [m]; origin: x, y of the lower left corner [m].
+        projection: what x and y are, as a PROJ string; None: a local frame, and the file has no coordinate reference system.
+        description: of the band.
 
     Raises:
-        InputError: 4 GB or more, which TIFF cannot hold.
+        InputError: rasterio is not installed, or the projection is none.
         OutputError: it cannot be written.
-
-    Sources: TIFF 6.0 (Adobe 1992); OGC GeoTIFF 1.1 (ModelPixelScale, ModelTiepoint); GDAL_NODATA is GDAL's.
     """
+    rasterio = require_rasterio()
+    target = Path(path)
+    temporary = target.with_name(target.name + TEMPORARY_SUFFIX)
+    try:
+        crs = None if projection is None else rasterio.crs.CRS.from_proj4(projection)
+    except rasterio.errors.CRSError as error:
+        raise InputError("a projection that PROJ knows", f"{projection!r} ({error})", "correct it") from error
     rows, columns = heights.shape
-    if 4 * rows * columns >= 2**32 - 4096:
-        raise InputError("less than 4 GB of heights", f"{columns:,} × {rows:,} cells", "take larger cells (--resolution)")
-    values = np.ascontiguousarray(heights[::-1], dtype="<f4")
-    top = origin[1] + rows * resolution
-    keys = [1, 1, 0, 2, 1024, 0, 1, 32767, 1025, 0, 1, 1]  # a frame of one's own; a value is that of its cell's area
-    tags: list[tuple[int, str, list[float] | list[int] | bytes]] = [
-        (256, "long", [columns]),
-        (257, "long", [rows]),
-        (258, "short", [32]),
-        (259, "short", [1]),
-        (262, "short", [1]),
-        (273, "long", [8]),
-        (277, "short", [1]),
-        (278, "long", [rows]),
-        (279, "long", [values.nbytes]),
-        (339, "short", [3]),
-        (33550, "double", [resolution, resolution, 0.0]),
-        (33922, "double", [0.0, 0.0, 0.0, origin[0], top, 0.0]),
-        (34735, "short", keys),
-        (42113, "ascii", b"nan\x00"),
-    ]
-    begin = 8 + values.nbytes
-    entries, more = b"", b""
-    more_at = begin + 2 + 12 * len(tags) + 4
-    for tag, kind, content in tags:
-        number, size, letter = _TYPES[kind]
-        data = content if isinstance(content, bytes) else struct.pack(f"<{len(content)}{letter}", *content)
-        place = data.ljust(4, b"\x00") if len(data) <= 4 else struct.pack("<I", more_at + len(more))
-        entries += struct.pack("<HHI", tag, number, len(data) // size) + place
-        more += data if len(data) > 4 else b""
-    with atomic_file(path) as file:
-        file.write(struct.pack("<2sHI", b"II", 42, begin))
-        file.write(values.tobytes())
-        file.write(struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0) + more)
+    transform = rasterio.transform.from_origin(origin[0], origin[1] + rows * resolution, resolution, resolution)
+    try:
+        temporary.touch()  # says in the system's own words why a folder cannot be written to
+        with rasterio.open(
+            temporary, "w", driver="GTiff", height=rows, width=columns, count=1, dtype="float32", crs=crs, transform=transform,
+            nodata=np.nan, compress="deflate", predictor=3, tiled=True, blockxsize=_BLOCK, blockysize=_BLOCK, BIGTIFF="IF_SAFER",
+        ) as file:  # fmt: skip
+            file.write(heights[::-1].astype(np.float32), 1)
+            file.set_band_description(1, description)
+        os.replace(temporary, target)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):  # rasterio's own are of that kind
+            raise output_error(target, error) from error
+        raise

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+import yaml
 from PIL import Image
 from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.writer import TileWriter
+from boxplus.sensors.geodesy import EnuFrame
 
 
 def run_folder(folder: Path, z_of_second_lap: float = 0.0) -> Path:
@@ -26,6 +30,11 @@ def run_folder(folder: Path, z_of_second_lap: float = 0.0) -> Path:
             z = 1.8 if k < 30 else 1.8 + z_of_second_lap
             writer.append(10**9 + k * 10**8, np.eye(3), [1.0 + 0.6 * (k % 30), 0.0, z], np.zeros((6, 6)), "ok")
     return folder
+
+
+def read_heights(folder: Path) -> tuple[np.ndarray, object]:
+    with rasterio.open(folder / "height.tif") as file:
+        return file.read(1), file.crs
 
 
 def call(*words: object) -> tuple[int, str]:
@@ -45,11 +54,34 @@ def test_floor_plan_and_heights_of_a_run(tmp_path: Path) -> None:
     code, out = call("map", "height", folder)
     assert code == 0 and "0.30 to 0." in out, out
     # Cells that hold the wall alone have the ground beside them, and what a slope of 0.3 would rise to there.
-    assert np.nanmax(np.asarray(Image.open(folder / "height.tif"))) <= 0.3 + 0.3 * 0.5 + 1e-4
+    heights = read_heights(folder)
+    assert np.nanmax(heights[0]) <= 0.3 + 0.3 * 0.5 + 1e-4
+    assert heights[1] is None
     assert call("map", "height", folder, "--surface", "--overwrite")[0] == 0
-    assert np.nanmax(np.asarray(Image.open(folder / "height.tif"))) > 3.5
+    assert np.nanmax(read_heights(folder)[0]) > 3.5
     code, out = call("map", "grid", folder, "-o", tmp_path / "fine", "--resolution", "0.05")
     assert code == 0 and "smaller than the map's voxels" in out
+
+
+def test_heights_of_a_run_on_the_earth_are_above_its_ellipsoid(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run")
+    assert call("map", "height", folder)[0] == 0
+    local, _ = read_heights(folder)
+    place = EnuFrame(48.0, 11.0, 500.0)
+    origin = {"latitude_deg": place.latitude, "longitude_deg": place.longitude, "height_m": place.altitude}
+    (folder / "georeference.yaml").write_text(yaml.safe_dump({"origin": origin}))
+    assert call("map", "height", folder, "--overwrite")[0] == 0
+    laid, crs = read_heights(folder)
+    known = np.isfinite(local)
+    np.testing.assert_array_equal(known, np.isfinite(laid))
+    np.testing.assert_allclose(laid[known], local[known] + 500.0, atol=1e-3)  # 20 m away the Earth curves by 0.03 mm
+    assert crs.to_dict()["proj"] == "tmerc" and crs.to_dict()["lat_0"] == 48.0
+
+
+def test_a_missing_library_is_said_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    code, out = call("map", "height", tmp_path / "no run at all")
+    assert code == 2 and "pip install 'boxplus[geo]'" in out
 
 
 def test_storeys_over_each_other_are_not_mixed(tmp_path: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
+import rasterio
 import yaml
 from PIL import Image
 
-from boxplus.errors import InputError
+from boxplus.errors import InputError, OutputError
 from boxplus.formats.geotiff import write_geotiff
 from boxplus.formats.ros_map import write_ros_map
+from boxplus.sensors.geodesy import EnuFrame
 
 
 def test_a_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
@@ -31,15 +35,27 @@ def test_a_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
 def test_heights_come_back_with_their_place(tmp_path: Path) -> None:
     heights = np.random.default_rng(0).normal(100.0, 5.0, (7, 5))
     heights[2, 3] = np.nan
-    write_geotiff(tmp_path / "h.tif", heights, 0.5, (10.0, -20.0))
-    with Image.open(tmp_path / "h.tif") as image:
-        np.testing.assert_array_equal(np.asarray(image), heights[::-1].astype(np.float32))
-        tags = image.tag_v2  # type: ignore[attr-defined]
-        assert tags[33550] == (0.5, 0.5, 0.0)
-        assert tags[33922] == (0.0, 0.0, 0.0, 10.0, -16.5, 0.0)  # the upper left corner
-        assert tags[42113] == "nan"
+    frame = EnuFrame(48.1, 11.5, 520.0)
+    for projection in (None, frame.projection):
+        write_geotiff(tmp_path / "h.tif", heights, 0.5, (10.0, -20.0), projection=projection, description="up")
+        with rasterio.open(tmp_path / "h.tif") as file:
+            np.testing.assert_array_equal(file.read(1), heights[::-1].astype(np.float32))
+            assert file.xy(6, 0) == (10.25, -19.75)  # the centre of the lower left cell
+            assert file.descriptions == ("up",) and np.isnan(file.nodata)
+            assert (file.crs is None) == (projection is None)
+            crs = file.crs
+    # What another library makes of a cell, with the coordinate system that the file carries.
+    to_file = pyproj.Transformer.from_crs(4326, crs.to_wkt(), always_xy=True)
+    latitude, longitude, _ = frame.to_geodetic([[700.0, -300.0, 12.0]])[0]
+    assert to_file.transform(longitude, latitude) == pytest.approx((700.0, -300.0), abs=0.005)
 
 
-def test_what_tiff_cannot_hold_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="less than 4 GB"):
-        write_geotiff(tmp_path / "h.tif", np.broadcast_to(np.float64(0.0), (40_000, 40_000)), 1.0, (0.0, 0.0))
+def test_geotiffs_that_cannot_be_written_are_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OutputError, match="expected to write"):
+        write_geotiff(tmp_path / "none" / "h.tif", np.zeros((2, 2)), 1.0, (0.0, 0.0))
+    with pytest.raises(InputError, match="a projection that PROJ knows"):
+        write_geotiff(tmp_path / "h.tif", np.zeros((2, 2)), 1.0, (0.0, 0.0), projection="+proj=nothing")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(InputError, match=r"rasterio, to write a GeoTIFF .* pip install 'boxplus\[geo\]'"):
+        write_geotiff(tmp_path / "h.tif", np.zeros((2, 2)), 1.0, (0.0, 0.0))
