@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from boxplus import Euclidean, Pinhole, Problem, SE3Left, losses, marginalize
 from boxplus.manifolds import se3
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals import Prior, Reprojection, UserResidual
 
 FRAMES, SEEN = 10, 19

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from metrics import Metric, run_as_script
 
-from boxplus.runs.config import MapConfig, RunConfig
-from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.run_loop import Progress
 from boxplus.simulation import as_recording, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

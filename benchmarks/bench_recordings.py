@@ -26,8 +26,8 @@ from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion
 from boxplus.recordings.open import open_recording
-from boxplus.runs.config import RunConfig
-from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.config import RunConfig
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.simulation import simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 

@@ -35,12 +35,12 @@ from .manifolds.so3 import SO3 as SO3
 from .manifolds.sphere import S2 as S2
 from .maps.ikd_tree import IkdTree as IkdTree
 from .optimization import losses as losses
-from .optimization.graduated import graduate as graduate
 from .optimization.incremental.options import IncrementalOptions as IncrementalOptions
 from .optimization.incremental.problem import IncrementalProblem as IncrementalProblem
 from .optimization.jacobian_check import check_jacobian as check_jacobian
 from .optimization.marginalization.leak import world_gauge as world_gauge
 from .optimization.marginalization.marginalize import marginalize as marginalize
+from .optimization.outliers.graduated import graduate as graduate
 from .optimization.problem import Problem as Problem
 from .optimization.solution import Solution as Solution
 from .optimization.solver_options import SolverOptions as SolverOptions

@@ -15,10 +15,10 @@ import numpy as np
 
 import boxplus as bp
 from boxplus.manifolds import quaternion
-from boxplus.recordings.bag import scan_from_cloud
-from boxplus.recordings.bag_probe import CLOUD_PARSERS
+from boxplus.recordings.bags.bag import scan_from_cloud
+from boxplus.recordings.bags.messages import MalformedMessageError, parse_imu
+from boxplus.recordings.bags.probe import CLOUD_PARSERS
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
-from boxplus.recordings.messages import MalformedMessageError, parse_imu
 from boxplus.recordings.recording import Tally
 
 

@@ -17,7 +17,7 @@ from boxplus.maps.descriptors.config import DescriptorConfig
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.options import RecordingOptions
-from boxplus.runs.config import MapConfig
+from boxplus.runs.lidar_inertial.config import MapConfig
 from boxplus.simulation import simulate, write_recording
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

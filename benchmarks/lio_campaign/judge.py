@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
-from boxplus.runs.run_summary import RunSummary
+from boxplus.runs.lidar_inertial.summary import RunSummary
 from boxplus.simulation import Motion
 
 FLOOR_M, SHARE_OF_WAY, LIMIT_DEG = 0.05, 0.02, 2.0

@@ -22,10 +22,10 @@ from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
-from boxplus.runs.config import MapConfig, RunConfig
-from boxplus.runs.extrinsic import choose_extrinsic
-from boxplus.runs.odometry_run import run_odometry
-from boxplus.runs.run_summary import RunSummary, read_summary
+from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
+from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.simulation import Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
@@ -90,7 +90,7 @@ def _judged(made: Drawn, outcome: Outcome, truth: Truth, suspects: list[dict[str
 def _in_process(
     opened: Callable[[RecordingOptions], AbstractContextManager[Recording]], made: Draw | RealDraw, work: Path
 ) -> Outcome:
-    """The steps of `boxplus.cli.lio.run`, without a terminal, on a recording in memory or in a file."""
+    """The steps of `boxplus.cli.lidar.lio.run`, without a terminal, on a recording in memory or in a file."""
     given = None if made.T_imu_lidar is None else tuple(map(tuple, made.T_imu_lidar.tolist()))
     config = RunConfig(
         recording=RecordingOptions.model_validate(made.recording_options),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.calibrate_cameras import cameras
+from boxplus.cli.cameras.calibrate_cameras import cameras
 from boxplus.cli.options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 

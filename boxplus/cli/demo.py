@@ -23,10 +23,10 @@ def demo(
     """
     import os
 
-    from boxplus.cli.lio import run
+    from boxplus.cli.lidar.lio import run
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
-    from boxplus.runs.config import load_run_config
+    from boxplus.runs.lidar_inertial.config import load_run_config
     from boxplus.runs.run_folder import RunFolder
     from boxplus.simulation.simulation import simulate
 

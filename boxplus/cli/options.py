@@ -15,7 +15,7 @@ from boxplus.errors import BoxplusError
 from boxplus.recordings.options import OtherLidar, RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.runs.config import RunConfig
+    from boxplus.runs.lidar_inertial.config import RunConfig
 
 ConfigT = TypeVar("ConfigT", bound="RunConfig")
 

@@ -37,8 +37,8 @@ def _run_odometry() -> None:
     import tempfile
     from pathlib import Path
 
-    from boxplus.runs.config import load_run_config
-    from boxplus.runs.odometry_run import run_odometry
+    from boxplus.runs.lidar_inertial.config import load_run_config
+    from boxplus.runs.lidar_inertial.odometry_run import run_odometry
     from boxplus.simulation import SpinningLidar, simulate
     from boxplus.simulation.live_recording import as_recording
 

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, SingularProblemError
-from boxplus.optimization.least_squares import LeastSquares, Values
+from boxplus.optimization.linear_systems.least_squares import LeastSquares, Values
 from boxplus.optimization.observability.null_space import NullSpace, find_null_space
 from boxplus.optimization.observability.singularity import explain_singularity
 from boxplus.optimization.observability.variable_names import variable_names
-from boxplus.optimization.tangents import to_own_tangent
-from boxplus.optimization.variables import VariableRows
+from boxplus.optimization.terms.tangents import to_own_tangent
+from boxplus.optimization.terms.variables import VariableRows
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
 

@@ -12,20 +12,20 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.optimization.connections import check_connections, require_connections
-from boxplus.optimization.elimination import choose_system
-from boxplus.optimization.faded import faded_notes, faded_shares
-from boxplus.optimization.group import Group, ResidualRows
-from boxplus.optimization.held_components import component_mask, held_groups
-from boxplus.optimization.layout import Layout
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.elimination import choose_system
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.losses import Loss, Squared
-from boxplus.optimization.minimize import Callback, minimize, strategy_of
+from boxplus.optimization.minimizers.minimize import Callback, minimize, strategy_of
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
-from boxplus.optimization.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions, options_from
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.connections import check_connections, require_connections
+from boxplus.optimization.terms.faded import faded_notes, faded_shares
+from boxplus.optimization.terms.group import Group, ResidualRows
+from boxplus.optimization.terms.held_components import component_mask, held_groups
+from boxplus.optimization.terms.layout import Layout
+from boxplus.optimization.terms.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
 from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.observability.singularity import describe_null_space
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.variables import VariableRows, Variables
 
 
 @dataclass(frozen=True, slots=True)

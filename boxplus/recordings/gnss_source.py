@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from boxplus.errors import AmbiguityError, RecordingError
-from boxplus.recordings.bag_gnss import NAV_SAT_FIX, bag_fixes
+from boxplus.recordings.bags.gnss import NAV_SAT_FIX, bag_fixes
+from boxplus.recordings.bags.open_container import open_container
 from boxplus.recordings.kitti import sensor_files
 from boxplus.recordings.kitti_oxts import oxts_fixes
-from boxplus.recordings.open_container import open_container
 from boxplus.recordings.options import ANY_GNSS
 from boxplus.sensors.gnss import GnssFixes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.bag import open_bag
+from boxplus.recordings.bags.bag import open_bag
 from boxplus.recordings.kitti import open_kitti
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.pcap import open_pcap

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.bag_probe import find_out, static_chain
-from boxplus.recordings.container import Container
+from boxplus.recordings.bags.container import Container
+from boxplus.recordings.bags.probe import find_out, static_chain
 from boxplus.recordings.info import Evidence, OtherLidarInfo, RecordingInfo
 from boxplus.recordings.options import OtherLidar, RecordingOptions
 from boxplus.recordings.recording import Event, Tally

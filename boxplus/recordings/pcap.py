@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.container import READ_ERRORS
+from boxplus.recordings.bags.container import READ_ERRORS
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
 from boxplus.recordings.options import NO_IMU, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally

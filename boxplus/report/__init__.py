@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from boxplus.report.cameras.visual_data import VisualData
     from boxplus.report.run_data import RunData
-    from boxplus.report.visual_data import VisualData
     from boxplus.runs.direct.summary import DirectSummary
     from boxplus.runs.slam.result import SlamResult
     from boxplus.runs.visual_inertial.summary import VioSummary
@@ -29,12 +29,12 @@ def write_report(run: str | Path | AnyRun) -> Path:
         InputError: no run's folder, or a run without a single estimate.
         OutputError: the files cannot be written.
     """
-    from boxplus.report.direct_page import write_direct_report
+    from boxplus.report.cameras.direct_page import write_direct_report
+    from boxplus.report.cameras.visual_page import write_visual_report
     from boxplus.report.page import write_page
     from boxplus.report.plots import write_plots
     from boxplus.report.run_data import RunData
     from boxplus.report.slam_page import write_slam_report
-    from boxplus.report.visual_page import write_visual_report
     from boxplus.runs.slam.result import SlamResult
 
     data = load_report(run) if isinstance(run, (str, Path)) else run
@@ -55,10 +55,10 @@ def load_report(folder: str | Path) -> AnyRun:
     Raises:
         InputError: no run's folder, a run without a single estimate, or one whose loops are not closed yet.
     """
+    from boxplus.report.cameras.visual_data import load_direct_run, load_visual_run
     from boxplus.report.run_data import load_run
-    from boxplus.report.visual_data import load_direct_run, load_visual_run
-    from boxplus.runs.output_folder import SUMMARY, program_of
     from boxplus.runs.slam.result import load_slam_result
+    from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
     with suppress(OSError):
         program = program_of(Path(folder) / SUMMARY)

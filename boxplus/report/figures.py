@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
-from boxplus.runs.scan_log import SHARES
+from boxplus.runs.lidar_inertial.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}

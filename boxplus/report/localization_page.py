@@ -18,7 +18,7 @@ from boxplus.report.skeleton import html_table, tiles, warnings_section, write_h
 from boxplus.runs.localization.folder import LocalizationFolder
 from boxplus.runs.localization.localization_run import LocalizationResult
 from boxplus.runs.localization.logs import LOG_COLUMNS
-from boxplus.runs.row_log import read_row_log
+from boxplus.runs.storage.row_log import read_row_log
 
 _MAP, _COLORS = "#8a8f98", {"localised": "#2f7d5b", "odometry only": "#e09f3e", "searching": "#c1443c"}
 _POINTS = 60_000  # of the map in the picture

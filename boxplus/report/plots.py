@@ -15,8 +15,8 @@ from boxplus.formats.output import atomic_file, make_folder
 from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
+from boxplus.runs.lidar_inertial.scan_log import SHARES
 from boxplus.runs.run_folder import PLOTS
-from boxplus.runs.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
 _DPI = 130

@@ -12,10 +12,10 @@ from boxplus.errors import InputError
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
-from boxplus.runs.row_log import RowLog
+from boxplus.runs.lidar_inertial.scan_log import read_scan_log
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.run_folder import RunFolder
-from boxplus.runs.run_summary import RunSummary, read_summary
-from boxplus.runs.scan_log import read_scan_log
+from boxplus.runs.storage.row_log import RowLog
 
 _MOST_POINTS = 150_000
 _THIN_FROM = 10 * _MOST_POINTS

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.runs.row_log import RowLog
+from boxplus.runs.storage.row_log import RowLog
 
 
 class Timeline(Protocol):

@@ -13,7 +13,7 @@ from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.info import RecordingInfo
 from boxplus.runs.estimate_statistics import EstimateStatistics
 from boxplus.runs.run_folder import OdometryFolder
-from boxplus.runs.state_codec import read_state, write_state
+from boxplus.runs.storage.state_codec import read_state, write_state
 
 _EVERY_S = 5.0
 _LARGEST_SHARE = 0.05  # of the time of the run: with a large map, checkpoints come less often

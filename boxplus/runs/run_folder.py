@@ -10,8 +10,8 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
-from boxplus.runs.folder_lock import locked_folder
-from boxplus.runs.output_folder import SUMMARY, output_folder
+from boxplus.runs.storage.folder_lock import locked_folder
+from boxplus.runs.storage.output_folder import SUMMARY, output_folder
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")

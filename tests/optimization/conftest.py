@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus import SE3, Euclidean, Pinhole, Problem, SE3Left
 from boxplus.manifolds import se3
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals import RelativePose, Reprojection
 
 

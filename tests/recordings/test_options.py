@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from boxplus.errors import InputError
 from boxplus.recordings import RecordingOptions
-from boxplus.runs.config import load_run_config
+from boxplus.runs.lidar_inertial.config import load_run_config
 
 
 @pytest.mark.parametrize(("low", "high"), [(5.0, 5.0), (50.0, 10.0)])

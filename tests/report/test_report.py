@@ -16,11 +16,11 @@ from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.report import palette, run_data, write_report
 from boxplus.report.run_data import load_run
-from boxplus.runs.config import load_run_config
-from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.config import load_run_config
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.runs.run_folder import PLOTS
-from boxplus.runs.run_summary import read_summary
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
 

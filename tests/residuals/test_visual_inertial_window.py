@@ -16,7 +16,7 @@ from boxplus.evaluation.nees import nees, nees_band
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.manifolds.lines import from_points
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals import (
     ImuNoise,
     ImuPreintegration,

@@ -20,12 +20,12 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
 from boxplus.recordings.recording import Recording
 from boxplus.runs import checkpoint
-from boxplus.runs.config import load_run_config
-from boxplus.runs.odometry_run import run_odometry
-from boxplus.runs.run_summary import read_summary
-from boxplus.runs.scan_log import read_scan_log
-from boxplus.runs.state_codec import read_state, write_state
-from boxplus.runs.statistics import RunStatistics
+from boxplus.runs.lidar_inertial.config import load_run_config
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.scan_log import read_scan_log
+from boxplus.runs.lidar_inertial.statistics import RunStatistics
+from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
@@ -165,7 +165,9 @@ def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
     assert found["objects"][0].imu_samples_read == 5
 
 
-@pytest.mark.parametrize("name", ["os:system", "boxplus.runs.state_codec:Path", "boxplus.errors:printable", "boxplus.no:Thing"])
+@pytest.mark.parametrize(
+    "name", ["os:system", "boxplus.runs.storage.state_codec:Path", "boxplus.errors:printable", "boxplus.no:Thing"]
+)
 def test_a_checkpoint_makes_nothing_but_objects_of_boxplus(tmp_path: Path, name: str) -> None:
     tree = {"dict": [["x", {"object": name, "attributes": {}}]]}
     np.savez(tmp_path / "state.npz", tree=np.frombuffer(json.dumps(tree).encode(), np.uint8))

@@ -13,7 +13,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
-from boxplus.runs.config import load_run_config
+from boxplus.runs.lidar_inertial.config import load_run_config
 from boxplus.simulation import Scenario, Simulation, SpinningLidar, faults, write_recording
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import manoeuvres, trajectories

@@ -13,7 +13,7 @@ from boxplus.cli.simulate import simulate_command
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import RecordingOptions, open_recording
-from boxplus.recordings.open_container import open_container
+from boxplus.recordings.bags.open_container import open_container
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.optimization.losses import SQUARED
-from boxplus.optimization.weighting import weigh_jacobian, weigh_residuals, whiten_jacobian, whiten_residuals
+from boxplus.optimization.terms.weighting import weigh_jacobian, weigh_residuals, whiten_jacobian, whiten_residuals
 from boxplus.residuals.relative_pose import evaluate_rows, linearize_rows
 from boxplus.residuals.relative_pose_2d import evaluate_rows as evaluate_rows_2d
 from boxplus.residuals.relative_pose_2d import linearize_rows as linearize_rows_2d

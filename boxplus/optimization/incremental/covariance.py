@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.incremental.bayes_tree import BayesTree
 from boxplus.optimization.incremental.variables import GrowingVariables
-from boxplus.optimization.variables import VariableRows
+from boxplus.optimization.terms.variables import VariableRows
 
 
 def blocks(tree: BayesTree, rows: VariableRows) -> NDArray[np.float64]:

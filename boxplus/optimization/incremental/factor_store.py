@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.group import Group
 from boxplus.optimization.incremental.contributions import (
     check_relative_poses,
     errors,
@@ -19,7 +18,8 @@ from boxplus.optimization.incremental.contributions import (
 from boxplus.optimization.incremental.growing import grown
 from boxplus.optimization.incremental.variables import GrowingVariables
 from boxplus.optimization.losses import Loss
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
 from boxplus.residuals.residual import Residual

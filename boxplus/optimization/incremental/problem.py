@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, NotFiniteError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.optimization.connections import check_connections, require_connections
-from boxplus.optimization.group import Group, broadcast
 from boxplus.optimization.incremental.bayes_tree import BayesTree, TreeUpdate
 from boxplus.optimization.incremental.covariance import blocks, joint
 from boxplus.optimization.incremental.factor_store import FactorStore, GroupStore, RelativePoseStore
@@ -23,7 +21,9 @@ from boxplus.optimization.incremental.variables import GrowingVariables, gather_
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solver_options import options_from
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.connections import check_connections, require_connections
+from boxplus.optimization.terms.group import Group, broadcast
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
 from boxplus.residuals.residual import Residual

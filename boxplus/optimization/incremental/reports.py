@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.variables import VariableRows, Variables
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.incremental.growing import grown
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

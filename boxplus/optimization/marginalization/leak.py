@@ -18,7 +18,7 @@ from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.observability.world_motions import kinds_of, motions_of
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 
 _AXES = ("x", "y", "z")
 

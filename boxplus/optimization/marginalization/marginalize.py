@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.optimization.group import Group
 from boxplus.optimization.marginalization.leak import Gauge, Leak, leak_of
 from boxplus.optimization.marginalization.rows import Columns, prior_of, triangle_of
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.marginal_prior import MarginalPrior
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.group import Group
 from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, copy_rows, eliminate_columns
-from boxplus.optimization.removal import Masks
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.removal import Masks
+from boxplus.optimization.terms.variables import Variables
 from boxplus.sparse.counting_sort import order_by
 
 _RANK = 1e-10  # share of a column's length: what is left of it below this is rounding

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.group import Group
-from boxplus.optimization.layout import Layout, connected_numbers
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.layout import Layout, connected_numbers
 
 
 @dataclass(frozen=True, slots=True)

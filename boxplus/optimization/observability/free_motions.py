@@ -9,12 +9,12 @@ from itertools import islice, product
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.components import Components
 from boxplus.optimization.observability.null_space import OwnDirections, SharedDirections
 from boxplus.optimization.observability.variable_names import variable_names
 from boxplus.optimization.observability.world_motions import DOF, kinds_of, motions_of, positions_of
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 
 _IS_MOTION = 1e-8  # share of a motion's squared length that may lie outside the free directions
 _IS_DEPENDENT = 1e-12  # motions that move nothing, such as a turn of one point about itself

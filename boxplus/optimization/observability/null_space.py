@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.group import Group
-from boxplus.optimization.layout import connected_numbers
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.components import Components
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.layout import connected_numbers
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
 # A direction is unobservable when its curvature, scaled to a unit diagonal, is below this. Computed from J, gauges come out below

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
-from boxplus.optimization.layout import Layout
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.free_motions import touching_groups, vector_text
 from boxplus.optimization.observability.null_space import OwnDirections
 from boxplus.optimization.observability.variable_names import variable_names
 from boxplus.optimization.observability.world_motions import kinds_of, positions_of
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.layout import Layout
+from boxplus.optimization.terms.variables import Variables
 
 _ALONG = 1e-5  # largest sine of the angle between a direction and the viewing ray it is
 _SAME = 1e-6  # largest difference of directions that are told in one sentence

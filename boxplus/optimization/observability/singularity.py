@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import SingularProblemError
-from boxplus.optimization.group import Group
-from boxplus.optimization.layout import Layout
-from boxplus.optimization.least_squares import LeastSquares, inner
+from boxplus.optimization.linear_systems.least_squares import LeastSquares, inner
 from boxplus.optimization.observability.components import Components
 from boxplus.optimization.observability.free_motions import describe_shared
 from boxplus.optimization.observability.null_space import NullSpace, find_null_space
 from boxplus.optimization.observability.own_motions import describe_own
 from boxplus.optimization.observability.variable_names import variable_names
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.layout import Layout
+from boxplus.optimization.terms.variables import Variables
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
 _SENTENCES = 6  # told before the rest is counted

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.layout import Layout
+from boxplus.optimization.terms.layout import Layout
 
 _LISTED = 4  # ranges named before the rest is counted
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from boxplus.recordings.bags.container import Container, interval
+from boxplus.recordings.bags.messages import MalformedMessageError, parse_imu
+from boxplus.recordings.bags.open_container import open_container
 from boxplus.recordings.cameras.bag_probe import IMAGE_PARSERS, IMU_TYPE, find_out
 from boxplus.recordings.cameras.events import IMU, CameraEvent, CameraRecording, Pending, StampFilter, assembled, in_order
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.cameras.options import CameraRecordingOptions
-from boxplus.recordings.container import Container, interval
-from boxplus.recordings.messages import MalformedMessageError, parse_imu
-from boxplus.recordings.open_container import open_container
 from boxplus.recordings.recording import Tally
 
 _MOST_REASONS = 50

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.cameras import CameraModel
+from boxplus.recordings.bags.container import Channel, Container
+from boxplus.recordings.bags.messages import MalformedMessageError, parse_transforms
+from boxplus.recordings.bags.transforms import Transform, chain
 from boxplus.recordings.cameras.calibration import THIS_IS_THE_BODY, StatedCamera, camera_model
 from boxplus.recordings.cameras.messages import INFO_TYPE, InfoMessage, parse_camera_info
-from boxplus.recordings.container import Channel, Container
-from boxplus.recordings.messages import MalformedMessageError, parse_transforms
-from boxplus.recordings.transforms import Transform, chain
 
 _TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 _MOST_STATIC_MESSAGES = 1000

@@ -9,6 +9,8 @@ import numpy as np
 
 from boxplus._opencv import opencv
 from boxplus.errors import AmbiguityError, RecordingError
+from boxplus.recordings.bags.container import Channel, Container, interval, share
+from boxplus.recordings.bags.messages import MalformedMessageError, parse_imu
 from boxplus.recordings.cameras.bag_calibration import by_topic, given_for, plain_topic, stated_in_bag, static_messages
 from boxplus.recordings.cameras.calibration import StatedRig, read_camchain, usable_mountings
 from boxplus.recordings.cameras.decode import DEPTH_ENCODINGS, MalformedImageError
@@ -22,10 +24,8 @@ from boxplus.recordings.cameras.messages import (
 )
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.cameras.streams import FoundCamera, camera_streams, rate_hz
-from boxplus.recordings.container import Channel, Container, interval, share
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
 from boxplus.recordings.info import Evidence, Topic
-from boxplus.recordings.messages import MalformedMessageError, parse_imu
 from boxplus.recordings.options import RecordingOptions, check_start
 
 IMAGE_PARSERS = {IMAGE_TYPE: parse_image, COMPRESSED_TYPE: parse_compressed}

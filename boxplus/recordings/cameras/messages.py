@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from boxplus.recordings.bags.messages import Cursor, Encoding
 from boxplus.recordings.cameras.decode import MalformedImageError, Pixels, decode_file, decode_raw
-from boxplus.recordings.messages import Cursor, Encoding
 
 IMAGE_TYPE, COMPRESSED_TYPE, INFO_TYPE = "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
 _MOST_COEFFICIENTS = 64

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.bag_probe import CLOUD_PARSERS
+from boxplus.recordings.bags.open_container import open_container
+from boxplus.recordings.bags.probe import CLOUD_PARSERS
 from boxplus.recordings.cameras.bag import open_camera_bag
 from boxplus.recordings.cameras.bag_probe import IMAGE_PARSERS
 from boxplus.recordings.cameras.events import CameraRecording
@@ -14,7 +15,6 @@ from boxplus.recordings.cameras.folders.kitti_raw import is_kitti_raw, open_kitt
 from boxplus.recordings.cameras.folders.numbered import is_kitti_odometry, is_seven_scenes, open_kitti_odometry, open_seven_scenes
 from boxplus.recordings.cameras.folders.tum import is_tum, open_tum
 from boxplus.recordings.cameras.options import CameraRecordingOptions
-from boxplus.recordings.open_container import open_container
 
 
 def has_cameras_only(path: Path) -> bool:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from boxplus.runs.output_folder import output_folder
 from boxplus.runs.run_folder import OdometryFolder
+from boxplus.runs.storage.output_folder import output_folder
 
 
 @dataclass(frozen=True, slots=True)

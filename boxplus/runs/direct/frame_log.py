@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import get_args
 
-from boxplus.runs.row_log import Columns, RowLog, RowLogWriter, read_row_log
+from boxplus.runs.storage.row_log import Columns, RowLog, RowLogWriter, read_row_log
 from boxplus.systems.direct_odometry.estimate import Estimate, Status
 
 FRAME_COLUMNS = Columns(

@@ -17,10 +17,10 @@ from boxplus.maps.descriptors.features import Features
 from boxplus.runs.fleet.executor import Executor
 from boxplus.runs.fleet.status import FleetStatus, RecordingStatus
 from boxplus.runs.fleet.tasks import describe_run, meet_runs, run_recording
-from boxplus.runs.folder_lock import locked_folder
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
 from boxplus.runs.slam.config import SlamRunConfig
+from boxplus.runs.storage.folder_lock import locked_folder
 from boxplus.systems.sessions.candidates import candidate_pairs
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.session import Session

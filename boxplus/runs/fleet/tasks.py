@@ -10,12 +10,12 @@ from boxplus.maps.descriptors.features import Features
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings import open_recording
 from boxplus.runs.fleet.status import RecordingStatus
-from boxplus.runs.output_folder import program_of
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import PROGRAM, SlamFolder
 from boxplus.runs.slam.slam_run import run_slam
 from boxplus.runs.slam.summary import SlamSummary, read_slam_summary
+from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.meeting import meet

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.bag_gnss import NAV_SAT_FIX
+from boxplus.recordings.bags.gnss import NAV_SAT_FIX
 from boxplus.recordings.cameras.open import has_cameras_only, open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.gnss_source import read_fixes

@@ -14,7 +14,7 @@ from boxplus.recordings.open import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
-from boxplus.runs.lidar_facts import watch_of
+from boxplus.runs.lidar_inertial.lidar_facts import watch_of
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.scan_merger import LidarShare
 from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text

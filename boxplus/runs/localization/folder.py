@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from boxplus.runs.output_folder import output_folder
 from boxplus.runs.run_folder import OdometryFolder, RunFolder
+from boxplus.runs.storage.output_folder import output_folder
 
 PROGRAM = "boxplus localize"
 

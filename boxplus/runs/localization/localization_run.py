@@ -17,14 +17,14 @@ from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
 from boxplus.recordings.recording import Recording
-from boxplus.runs.extrinsic import Extrinsic
+from boxplus.runs.lidar_inertial.extrinsic import Extrinsic
+from boxplus.runs.lidar_inertial.odometry_run import View, run_odometry
+from boxplus.runs.lidar_inertial.summary import RunSummary
 from boxplus.runs.localization.config import LocalizationRunConfig, dump_localization_config
 from boxplus.runs.localization.folder import LocalizationFolder, claim_localization_folder
 from boxplus.runs.localization.logs import LocalizationLog, SearchLog, candidate_texts
 from boxplus.runs.localization.summary import LocalizationSummary
-from boxplus.runs.odometry_run import View, run_odometry
 from boxplus.runs.run_loop import Progress, versions
-from boxplus.runs.run_summary import RunSummary
 from boxplus.runs.saved_map.saved_map import SavedMap
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.localization.localizer import Localization, Localizer

@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from boxplus.runs.row_log import Columns, RowLogWriter
+from boxplus.runs.storage.row_log import Columns, RowLogWriter
 from boxplus.systems.localization.localizer import Localization, Search, Status
 
 LOG_COLUMNS = Columns(

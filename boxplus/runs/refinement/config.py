@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from boxplus.runs.config import MapConfig
+from boxplus.runs.lidar_inertial.config import MapConfig
 from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.refinement.config import RefinementConfig
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.runs.output_folder import output_folder
 from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.storage.output_folder import output_folder
 
 PROGRAM = "boxplus refine"
 

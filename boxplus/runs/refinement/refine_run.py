@@ -22,15 +22,15 @@ from boxplus.maps.plane_voxels.thickness import Sharpness
 from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.open import open_recording
-from boxplus.runs.config import RunConfig, load_run_config
-from boxplus.runs.output_folder import program_of
+from boxplus.runs.lidar_inertial.config import RunConfig, load_run_config
+from boxplus.runs.lidar_inertial.scan_log import read_scan_log
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.refinement.config import RefineRunConfig, dump_refine_config
 from boxplus.runs.refinement.folder import RefineFolder
 from boxplus.runs.refinement.summary import MapSharpness, RefineSummary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import peak_memory_mb, versions
-from boxplus.runs.run_summary import RunSummary, read_summary
-from boxplus.runs.scan_log import read_scan_log
+from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.point_store import PointStore

@@ -17,10 +17,10 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
-from boxplus.runs.output_folder import SUMMARY, program_of
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
+from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.formats.output import replaced_folder
-from boxplus.runs.output_folder import SUMMARY, program_of
 from boxplus.runs.run_folder import is_map_file
+from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
 PROGRAM = "boxplus map merge"
 _OWN = re.compile(

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.folder import LocalMapFolder
-from boxplus.runs.output_folder import program_of
-from boxplus.runs.run_summary import read_summary
+from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.slam.folder import PROGRAM, SlamFolder
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.spool import read_spool
 from boxplus.runs.slam.summary import read_slam_summary
+from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.sessions.session import OwnLoop, Session
 from boxplus.systems.slam.correction import Correction
 

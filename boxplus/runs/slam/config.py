@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import Field
 
 from boxplus.maps.local_maps.config import LocalMapConfig
-from boxplus.runs.config import RunConfig
+from boxplus.runs.lidar_inertial.config import RunConfig
 from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.slam.config import SlamConfig

@@ -11,7 +11,7 @@ from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.writer import TileWriter
-from boxplus.runs.config import MapConfig
+from boxplus.runs.lidar_inertial.config import MapConfig
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.spool import ScanSpool
 from boxplus.systems.slam.correction import Correction

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.formats.output import EARLIER_SUFFIX, TEMPORARY_SUFFIX
-from boxplus.runs.folder_lock import locked_folder
-from boxplus.runs.output_folder import output_folder
+from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_folder import RunFolder, is_map_file
-from boxplus.runs.run_summary import read_summary
 from boxplus.runs.slam.summary import read_slam_summary
+from boxplus.runs.storage.folder_lock import locked_folder
+from boxplus.runs.storage.output_folder import output_folder
 
 PROGRAM = "boxplus slam"
 _LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")

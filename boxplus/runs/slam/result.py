@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.local_maps.folder import LocalMapFolder
-from boxplus.runs.run_summary import RunSummary, read_summary
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.summary import SlamSummary, read_slam_summary

@@ -15,11 +15,11 @@ from boxplus.errors import BoxplusError, InputError, OutputError, printable
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings.recording import Recording
-from boxplus.runs.extrinsic import Extrinsic
-from boxplus.runs.odometry_run import View, run_odometry
+from boxplus.runs.lidar_inertial.extrinsic import Extrinsic
+from boxplus.runs.lidar_inertial.odometry_run import View, run_odometry
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.run_facts import State
 from boxplus.runs.run_loop import Progress, versions
-from boxplus.runs.run_summary import RunSummary, read_summary
 from boxplus.runs.slam.beside import Beside, LoopView
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.corrected import write_corrected_map, write_corrected_trajectory

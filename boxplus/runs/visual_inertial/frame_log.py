@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from boxplus.runs.row_log import Columns, RowLog, RowLogWriter, read_row_log, xyz
+from boxplus.runs.storage.row_log import Columns, RowLog, RowLogWriter, read_row_log, xyz
 from boxplus.systems.visual_inertial_odometry.estimate import Status, VioEstimate
 
 FRAME_COLUMNS = Columns(

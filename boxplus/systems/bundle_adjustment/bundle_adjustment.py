@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
-from boxplus.optimization.convex_start import solve_from_convex
 from boxplus.optimization.losses import Loss
-from boxplus.optimization.minimize import Callback
+from boxplus.optimization.minimizers.minimize import Callback
+from boxplus.optimization.outliers.convex_start import solve_from_convex
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty

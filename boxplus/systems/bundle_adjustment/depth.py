@@ -16,7 +16,7 @@ from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.parallax import parallax_ratio
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text

@@ -18,11 +18,11 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Loss
-from boxplus.optimization.minimize import Callback
+from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.camera.line_reprojection import LineReprojection
 from boxplus.residuals.camera.reprojection import Reprojection
 from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, triangulate_lines

@@ -18,7 +18,7 @@ from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.camera.bal_reprojection import BalCamera, BalReprojection
 from boxplus.residuals.camera.reprojection import Reprojection
 from boxplus.residuals.camera.reprojection_tied_intrinsics import ReprojectionTiedIntrinsics

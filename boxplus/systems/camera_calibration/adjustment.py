@@ -31,7 +31,7 @@ from boxplus.optimization import losses
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.camera.on_body import OnBody
 from boxplus.residuals.camera.reprojection_intrinsics import ReprojectionIntrinsics
 from boxplus.residuals.prior import Prior

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from boxplus.errors import SingularProblemError
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.optimization.graduated import graduate
-from boxplus.optimization.group import Group
-from boxplus.optimization.inlier_report import InlierReport, inlier_report
 from boxplus.optimization.losses import Squared
-from boxplus.optimization.minimize import Callback
+from boxplus.optimization.minimizers.minimize import Callback
+from boxplus.optimization.outliers.graduated import graduate
+from boxplus.optimization.outliers.inlier_report import InlierReport, inlier_report
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.pose_graph.problem import LOOPS, problem_with_loops_apart, with_edges
 from boxplus.systems.pose_graph.start import components
 

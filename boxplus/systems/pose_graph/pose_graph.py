@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.optimization.convex_start import convex_cost
 from boxplus.optimization.losses import Loss
-from boxplus.optimization.minimize import Callback
+from boxplus.optimization.minimizers.minimize import Callback
+from boxplus.optimization.outliers.convex_start import convex_cost
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.certificate import Certificate, certify

@@ -13,7 +13,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.chordal_pose import ChordalPose, ChordalPose2D, chordal_weights
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D

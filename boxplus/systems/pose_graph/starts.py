@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.losses import Loss
-from boxplus.optimization.minimize import Callback
+from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions

@@ -27,7 +27,7 @@ from boxplus.manifolds.sphere import S2
 from boxplus.maps.plane_voxels.plane_map import PlaneMap
 from boxplus.maps.plane_voxels.thickness import Sharpness
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.inertial.imu import ImuPreintegration
 from boxplus.residuals.planes.plane_cluster import Plane, PlaneCluster
 from boxplus.residuals.planes.pose_quadratic import PoseQuadratic

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.optimization.graduated import graduate
 from boxplus.optimization.losses import Squared
+from boxplus.optimization.outliers.graduated import graduate
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.optimization.graduated import graduate
-from boxplus.optimization.group import Group
 from boxplus.optimization.losses import Squared
+from boxplus.optimization.outliers.graduated import graduate
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.gravity_direction import GravityDirection
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.slam.loop import Floats, Loop

@@ -10,7 +10,7 @@ from boxplus.manifolds import quaternion
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.variables import VariableRows
+from boxplus.optimization.terms.variables import VariableRows
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 

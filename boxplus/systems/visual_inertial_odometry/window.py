@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from boxplus.manifolds import se3
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
-from boxplus.optimization.group import Group
 from boxplus.optimization.losses import Huber
 from boxplus.optimization.marginalization.leak import Leak, world_gauge
 from boxplus.optimization.marginalization.marginalize import marginalize
 from boxplus.optimization.problem import Problem
+from boxplus.optimization.terms.group import Group
 from boxplus.residuals.camera.inverse_depth import InverseDepthReprojection
 from boxplus.residuals.camera.on_body import OnBody
 from boxplus.residuals.inertial.imu import ImuPreintegration

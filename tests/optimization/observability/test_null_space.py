@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus import Euclidean, Problem, SingularProblemError
-from boxplus.optimization.elimination import choose_system
-from boxplus.optimization.layout import Layout
-from boxplus.optimization.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.elimination import choose_system
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.terms.layout import Layout
 from boxplus.residuals.residual import Residual
 from boxplus.residuals.whitening import Whitening
 from tests.optimization.conftest import dense_normal_equations, make_ring

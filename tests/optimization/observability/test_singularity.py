@@ -7,8 +7,8 @@ import pytest
 
 from boxplus import SE2, SE3, Euclidean, InputError, Line3D, Pinhole, Problem, SE3Left, SingularProblemError
 from boxplus.manifolds import lines, quaternion, se2, se3
-from boxplus.optimization.layout import Layout
 from boxplus.optimization.observability.variable_names import variable_names
+from boxplus.optimization.terms.layout import Layout
 from boxplus.residuals import LineReprojection, Prior, RelativePose, RelativePose2D, Reprojection, UserResidual
 from tests.optimization.conftest import make_ring, make_scene
 

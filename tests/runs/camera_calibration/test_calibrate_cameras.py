@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from boxplus.cli import app
 from boxplus.errors import InputError, RecordingError
 from boxplus.recordings.cameras.calibration import inverse, read_camchain
-from boxplus.report.calibration_report import write_calibration_report
+from boxplus.report.cameras.calibration_report import write_calibration_report
 from boxplus.runs.camera_calibration.camchain import camchain_text
 from boxplus.runs.camera_calibration.corner_file import read_corner_file, write_corner_file
 from boxplus.runs.camera_calibration.inputs import read_imu, read_target

@@ -15,14 +15,14 @@ from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion, se3
 from boxplus.recordings.recording import Recording
 from boxplus.report.localization_page import write_localization_report
-from boxplus.runs.config import load_run_config
+from boxplus.runs.lidar_inertial.config import load_run_config
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.localization.config import LocalizationRunConfig, load_localization_config
 from boxplus.runs.localization.folder import LocalizationFolder, claim_localization_folder
 from boxplus.runs.localization.localization_run import LocalizationResult, run_localization
 from boxplus.runs.localization.logs import LOG_COLUMNS, SEARCH_COLUMNS
-from boxplus.runs.odometry_run import run_odometry
-from boxplus.runs.row_log import read_row_log
 from boxplus.runs.saved_map.saved_map import open_saved_map
+from boxplus.runs.storage.row_log import read_row_log
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import trajectories

@@ -15,7 +15,7 @@ from boxplus.cli import app
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
-from boxplus.runs.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.refinement import refine_run
 from boxplus.runs.refinement.summary import RefineSummary
 from boxplus.simulation import SpinningLidar, simulate

@@ -14,7 +14,7 @@ from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.folder import LocalMapFolder
-from boxplus.runs.run_summary import ExtrinsicFacts, RecordingFacts, RunSummary
+from boxplus.runs.lidar_inertial.summary import ExtrinsicFacts, RecordingFacts, RunSummary
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.graph_file import write_graph
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan

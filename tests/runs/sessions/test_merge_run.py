@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from boxplus.cli.map import map_app
+from boxplus.cli.lidar.map import map_app
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory

@@ -16,7 +16,7 @@ from boxplus.formats.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings.recording import Recording
 from boxplus.report import load_report, write_report
-from boxplus.runs.run_summary import read_summary
+from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import read_loop_decisions

@@ -23,7 +23,7 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.report import write_report
-from boxplus.report.visual_data import load_visual_run
+from boxplus.report.cameras.visual_data import load_visual_run
 from boxplus.runs.cameras.folder import VioFolder
 from boxplus.runs.cameras.landmark_file import read_lines, write_lines
 from boxplus.runs.settings_file import load_settings

@@ -10,7 +10,7 @@ import pytest
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.runs.state_codec import read_state, write_state
+from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

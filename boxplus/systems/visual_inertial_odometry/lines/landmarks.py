@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from boxplus.manifolds import lines as line_manifold
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.lines import Line3D
-from boxplus.optimization.group import Group
 from boxplus.optimization.losses import Huber
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.camera.line_reprojection import LineReprojection
 from boxplus.residuals.camera.on_body import OnBody
 from boxplus.systems.bundle_adjustment.line_triangulation import triangulate_lines

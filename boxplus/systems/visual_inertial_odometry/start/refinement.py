@@ -12,10 +12,10 @@ from boxplus.manifolds import quaternion
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.sphere import S2
-from boxplus.optimization.group import Group
 from boxplus.optimization.losses import Cauchy
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.variables import VariableRows, Variables
+from boxplus.optimization.terms.group import Group
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.camera.inverse_depth import InverseDepthReprojection
 from boxplus.residuals.camera.on_body import OnBody
 from boxplus.residuals.inertial.imu import ImuPreintegration

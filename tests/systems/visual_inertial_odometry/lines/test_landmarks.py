@@ -10,7 +10,7 @@ from boxplus.manifolds.body_pose import BodyPose
 from boxplus.optimization.marginalization.leak import world_gauge
 from boxplus.optimization.marginalization.marginalize import marginalize
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.variables import Variables
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.prior import Prior
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
 from boxplus.systems.visual_inertial_odometry.lines.tracks import LineTracks

@@ -1,0 +1,95 @@
+"""`boxplus vio`: a recording of cameras and an IMU in, a trajectory, landmarks and a report out."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.options import takes_options
+from boxplus.recordings.cameras.options import CameraRecordingOptions
+
+if TYPE_CHECKING:
+    from boxplus.runs.visual_inertial.summary import VioSummary
+    from boxplus.runs.visual_inertial.visual_run import View
+
+
+@takes_options(CameraRecordingOptions)
+def vio(
+    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, EuRoC folder, or images with an IMU.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting, e.g. features=200; may be repeated.", metavar="KEY=VALUE")
+    ] = None,
+    mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the accelerometer gives the scale.")] = False,
+    lines: Annotated[
+        bool,
+        typer.Option("--lines", help="Follow straight lines too: where walls are bare. Takes longer."),
+    ] = False,
+    ground_truth: Annotated[
+        Path | None, typer.Option("--gt", help="Ground truth to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
+    *,
+    options: CameraRecordingOptions,
+) -> None:
+    """Turn a recording of one or more cameras and an IMU into a trajectory, landmarks and a report.
+
+    Calibration comes from the recording or from --calibration, and is never guessed. Exit codes: 0 done, 1 the results
+    could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other), 130
+    interrupted (results up to there are complete).
+    """
+    from boxplus.cli.cameras.camera_run import exit_for, run_cameras
+    from boxplus.runs.cameras.folder import VioFolder
+    from boxplus.runs.settings_file import load_settings
+    from boxplus.runs.visual_inertial.config import VioRunConfig
+    from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+
+    overrides: dict[str, dict[str, object]] = {
+        "recording": options.model_dump(exclude_defaults=True),
+        "odometry": ({"cameras": "first"} if mono else {}) | ({"lines": True} if lines else {}),
+    }
+    run_config = load_settings(VioRunConfig, config, settings or (), overrides)
+    shown: View | None = None
+    if view:
+        from boxplus.report.live_view import LiveCameraView
+
+        shown = LiveCameraView(recording.name)
+    folder = VioFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
+    summary = run_cameras(
+        recording,
+        run_config.recording,
+        folder,
+        partial(run_visual_odometry, folder=folder, config=run_config, view=shown),
+        _rows,
+        lambda _: "yaw",  # position and yaw are what an estimator with gravity leaves open
+        overwrite=overwrite,
+        resume=resume,
+        ground_truth=ground_truth,
+        report=not no_report,
+    )
+    exit_for(summary)
+
+
+def _rows(summary: VioSummary) -> list[tuple[str, str]]:
+    """What the terminal shows of a run of cameras and IMU."""
+    from boxplus.cli.cameras.camera_run import timing_rows
+
+    rows = []
+    if summary.frames_before_start:
+        rows.append(("before the start", f"{summary.frames_before_start} frames without a state"))
+    rows += timing_rows(summary.timing)
+    rows.append(("landmarks", f"{summary.landmarks:,} of {summary.keyframes} keyframes"))
+    if summary.lines:
+        rows.append(("lines", f"{summary.lines:,}"))
+    return rows

@@ -1,0 +1,1 @@
+"""Commands of a LiDAR, of its runs and of their maps."""

@@ -1,0 +1,146 @@
+"""`boxplus map`: join runs into one map, look into a map folder, and write its tiles as one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from boxplus.cli.lidar.map_grid import grid, height
+from boxplus.errors import InputError
+
+if TYPE_CHECKING:
+    from boxplus.runs.sessions.summary import MergeSummary
+
+map_app = typer.Typer(
+    name="map",
+    help="Join runs into one map, look into a map folder, or write its tiles as one file.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+_Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote, or the output folder of the run.", metavar="FOLDER")]
+
+
+def _tiles(folder: Path) -> Path:
+    """The map folder: the one given, or the one inside the output folder of a run."""
+    inner = folder / "map"
+    return inner if (folder / "run.json").is_file() and inner.is_dir() else folder
+
+
+@map_app.command("info")
+def info_command(folder: _Folder) -> None:
+    """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
+    from boxplus.maps.tiles.store import TileStore
+
+    store = TileStore.open(_tiles(folder))
+    size = store.manifest.tile_size_m
+    thinning = "every point" if store.manifest.voxel_m is None else f"one point per {store.manifest.voxel_m:g} m voxel"
+    typer.echo(f"{folder}: {store.point_count:,} points in {len(store.counts)} tiles of {size:g} m, {thinning}")
+    if store.counts:
+        low = [min(index[axis] for index in store.counts) * size for axis in range(3)]
+        high = [(max(index[axis] for index in store.counts) + 1) * size for axis in range(3)]
+        extent = ", ".join(f"{name} {a:g} … {b:g} m" for name, a, b in zip("xyz", low, high, strict=True))
+        typer.echo(f"tiles span {extent}")
+    for sentence in store.report or ("whole: the run that wrote it closed it, and every file is complete",):
+        typer.echo(sentence)
+
+
+@map_app.command("export")
+def export_command(
+    folder: _Folder,
+    ply: Annotated[Path | None, typer.Option(help="PLY file to write; default without --pcd: FOLDER.ply.")] = None,
+    pcd: Annotated[Path | None, typer.Option(help="PCD file to write.")] = None,
+    voxel: Annotated[float | None, typer.Option(help="Keep one point per voxel of this edge [m].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+) -> None:
+    """Write all tiles of a map into one PLY and/or PCD file."""
+    from boxplus.maps.tiles.store import TileStore, merge
+
+    tiles = _tiles(folder)
+    for sentence in TileStore.open(tiles).report:
+        typer.echo(f"warning: {sentence}", err=True)
+    if ply is None and pcd is None:
+        ply = tiles.resolve().parent / f"{tiles.resolve().name}.ply"
+    for path in (ply, pcd):
+        if path is not None and path.exists() and not overwrite:
+            raise InputError("a new file", f"{path}, which exists", "give another path, or --overwrite")
+    count = merge(tiles, ply, pcd, voxel)
+    typer.echo(f"{count:,} points → {' and '.join(str(path) for path in (ply, pcd) if path is not None)}")
+
+
+map_app.command("grid")(grid)
+map_app.command("height")(height)
+
+
+@map_app.command("merge")
+def merge_command(
+    runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', in the order of time.", metavar="RUN…")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the joint map.")] = Path("merged"),
+    remove_dynamic: Annotated[
+        bool, typer.Option("--remove-dynamic", help="Leave out what was seen through, and report what changed.")
+    ] = False,
+    config: Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="One setting, e.g. sessions.least_encounters=5; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier merge there.")] = False,
+) -> None:
+    """Join runs whose start poses nobody knows into one map, and say which of them did not meet.
+
+    Exit code 3: no two of the runs met, and there is no joint map.
+    """
+    from boxplus.runs.sessions.config import MergeConfig
+    from boxplus.runs.sessions.merge_run import merge_runs
+    from boxplus.runs.settings_file import load_settings
+
+    chosen = load_settings(MergeConfig, config, settings or ())
+    result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite)
+    _show(result.summary)
+    if not result.summary.joined:
+        typer.echo(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
+        raise typer.Exit(3)
+    typer.echo(f"{_counts(result.summary)} → {output}")
+
+
+@map_app.command("update")
+def update_command(
+    merged: Annotated[Path, typer.Argument(help="Output folder of 'boxplus map merge'.", metavar="MAP")],
+    runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', later ones.", metavar="RUN…")],
+) -> None:
+    """Go on with a joint map: join further runs with it, in its frame and with its settings.
+
+    Exit code 3: none of the runs met the map, which stays as it was.
+    """
+    from boxplus.runs.sessions.update_run import update_map
+
+    result, alignment = update_map(merged, runs)
+    if result is None:
+        for number, session in enumerate(alignment.sessions):
+            if number >= len(alignment.sessions) - len(runs):
+                typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
+        typer.echo(f"none of the runs met the map: {merged} stays as it was")
+        raise typer.Exit(3)
+    _show(result.summary)
+    typer.echo(f"{_counts(result.summary)} → {merged}")
+
+
+def _show(summary: MergeSummary) -> None:
+    """Where each session is, or why it is apart."""
+    for session in summary.sessions:
+        if session.T_world_session is not None and session.sigma is not None:
+            x, y, z = session.T_world_session[4:]
+            typer.echo(f"{session.name}: joined, at ({x:.2f}, {y:.2f}, {z:.2f}) m ± {100.0 * max(session.sigma[3:]):.0f} cm")
+        else:
+            typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
+    for text in summary.warnings:
+        typer.echo(f"warning: {text}", err=True)
+
+
+def _counts(summary: MergeSummary) -> str:
+    removed = "" if summary.removed_points is None else f", {summary.removed_points:,} seen through and kept in removed.ply"
+    changes = "" if summary.changes is None else f", {summary.changes} places changed"
+    return f"{summary.map_points:,} points{removed}{changes}"

@@ -1,0 +1,1 @@
+"""Commands that optimise a file: bundle adjustment and pose graphs."""

@@ -1,0 +1,1 @@
+"""Gauss-Newton, Levenberg-Marquardt and the dogleg, and the loop that they share."""

@@ -1,0 +1,1 @@
+"""Residuals that do not belong: told from inliers without a good start."""

@@ -1,0 +1,50 @@
+"""Which container a recording's file or folder is."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from boxplus.errors import RecordingError
+from boxplus.recordings.bags.container import READ_ERRORS, Container
+from boxplus.recordings.bags.indexed import IndexedContainer, rosbags_errors
+from boxplus.recordings.bags.sequential import open_sequential
+
+_LOG = logging.getLogger(__name__)
+
+_HEALTHY_ALL_THE_SAME = ("Profile is not ros2", "not supported", "metadata")
+"""Why rosbags declines healthy files: ROS 1 in MCAP, and, in older versions, newer metadata and files without any."""
+
+
+def open_container(path: Path) -> Container:
+    """Open a bag, an MCAP file or a ROS 2 folder; one without a usable index is read from front to back.
+
+    Raises:
+        RecordingError: not such a file, or nothing in it can be read.
+    """
+    files = [path]
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+        if not files:
+            raise RecordingError(
+                "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
+                f"{path.name} with {', '.join(sorted(file.name for file in path.iterdir())[:5]) or 'nothing in it'}",
+                "give the folder that holds them; of ROS 1 bags give one file; folders of images are for open_camera_recording",
+            )
+    try:
+        return IndexedContainer(path, files)
+    except READ_ERRORS + rosbags_errors() as error:
+        reason = str(error) or type(error).__name__
+    _LOG.info("%s has no usable index (%s): reading it from front to back", path, reason)
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    container = open_sequential(files)
+    if container is None:
+        raise RecordingError(
+            "a readable ROS bag or MCAP file",
+            f"{path.name}: {reason}",
+            "copy the recording again; nothing in this file can be read",
+        )
+    if container.damage or not any(benign in reason for benign in _HEALTHY_ALL_THE_SAME):
+        container.damage.append(f"the index cannot be used ({reason}); the messages were collected from front to back")
+    return container

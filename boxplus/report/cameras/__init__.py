@@ -1,0 +1,1 @@
+"""Reports of odometry with cameras and of their calibration."""

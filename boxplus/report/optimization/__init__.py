@@ -1,0 +1,1 @@
+"""Reports of bundle adjustment, of lines and of pose graphs."""

@@ -1,0 +1,1 @@
+"""What lies on disk: folders and their locks, tables that grow, states of objects."""

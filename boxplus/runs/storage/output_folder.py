@@ -1,0 +1,102 @@
+"""The folder that a command writes its results into: one run at a time, and nothing is replaced that nobody asked to replace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from boxplus.errors import InputError
+from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
+from boxplus.runs.storage.folder_lock import LOCK, locked_folder
+
+SUMMARY = "run.json"
+
+
+@contextmanager
+def output_folder(
+    folder: str | Path,
+    program: str,
+    files: Callable[[], Iterable[Path]],
+    folders: Callable[[], Iterable[Path]],
+    *,
+    overwrite: bool = False,
+    holds_results: Callable[[], bool] = lambda: True,
+) -> Iterator[Path]:
+    """A folder to write results into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
+
+    An earlier run is replaced with `overwrite`, or where it has left nothing worth keeping. What a run did not write is never
+    removed.
+
+    Args:
+        program: who writes here, as `run.json` says; the results of another program are not replaced.
+        files, folders: what a run writes, `run.json` included; folders are removed where they are empty, in this order.
+        holds_results: whether there are results beside a `run.json`.
+
+    Raises:
+        InputError: another process is writing there; the folder holds something else, or an earlier run's results and
+            `overwrite` is not set.
+        OutputError: it cannot be created or cleared.
+    """
+    path = make_folder(folder)
+    with locked_folder(path, program) as lock:
+        try:
+            if _has_to_be_cleared(path, program, files, overwrite, lock.began_before, holds_results):
+                # The summary goes last: interrupted here, the folder is still known as a run's.
+                for file in sorted(files(), key=lambda file: file == path / SUMMARY):
+                    for name in (file.name, file.name + TEMPORARY_SUFFIX):
+                        file.with_name(name).unlink(missing_ok=True)
+                for inner in folders():
+                    with suppress(OSError):  # a folder with files of others stays
+                        inner.rmdir()
+        except OSError as error:
+            raise output_error(path, error) from error
+        try:
+            yield path
+        finally:
+            lock.keep_file = not (path / SUMMARY).exists()
+
+
+def _has_to_be_cleared(
+    path: Path,
+    program: str,
+    files: Callable[[], Iterable[Path]],
+    overwrite: bool,
+    began_before: bool,
+    holds_results: Callable[[], bool],
+) -> bool:
+    """Whether there is something to remove, which may be removed; raises where it may not."""
+    found = {file for file in path.rglob("*") if not file.is_dir() and file != path / LOCK}
+    if not found and all(entry.name == LOCK for entry in path.iterdir()):
+        return False
+    if not (path / SUMMARY).is_file():
+        own = set(files())
+        if began_before and all(file in own or file.with_name(file.name.removesuffix(TEMPORARY_SUFFIX)) in own for file in found):
+            return True
+        raise InputError(
+            "a new or empty output folder, or one with an earlier run of boxplus",
+            f"other files in {path}",
+            "choose another folder with --output",
+        )
+    earlier = program_of(path / SUMMARY)
+    if not overwrite and (earlier != program or holds_results()):
+        raise InputError(
+            "a new or empty output folder",
+            f"the results of an earlier run in {path}",
+            "choose another folder with --output, or add --overwrite to replace them",
+        )
+    if earlier not in (program, None):
+        raise InputError(
+            f"an earlier run of '{program}' to replace", f"one of {earlier!r} in {path}", "choose another folder with --output"
+        )
+    return True
+
+
+def program_of(summary: Path) -> str | None:
+    """Who wrote a summary; None where it cannot be read."""
+    try:
+        found = json.loads(summary.read_bytes())
+    except ValueError:
+        return None
+    return str(found.get("program")) if isinstance(found, dict) and "program" in found else None

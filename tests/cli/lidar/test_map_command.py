@@ -1,0 +1,72 @@
+"""`boxplus map info` and `boxplus map export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from boxplus.cli.lidar.map import map_app
+from boxplus.errors import InputError
+from boxplus.formats.pcd import read_pcd
+from boxplus.formats.ply import read_ply
+from boxplus.maps.tiles.writer import TileWriter
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    with TileWriter(tmp_path / "map") as writer:
+        writer.append([[1.0, 2.0, 3.0], [1.01, 2.0, 3.0], [-60.0, 0.0, 0.0]], [1.0, 2.0, 3.0])
+    return tmp_path / "map"
+
+
+def test_info(folder: Path) -> None:
+    result = CliRunner().invoke(map_app, ["info", str(folder)])
+    assert result.exit_code == 0
+    assert "3 points in 2 tiles of 50 m, every point" in result.output
+    assert "tiles span x -100 … 50 m, y 0 … 50 m, z 0 … 50 m" in result.output
+    assert "whole: the run that wrote it closed it" in result.output
+
+
+def test_export(folder: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
+    assert result.exit_code == 0
+    assert len(read_ply(tmp_path / "map.ply")) == 3
+    result = CliRunner().invoke(map_app, ["export", str(folder), "--pcd", str(tmp_path / "a.pcd"), "--voxel", "0.5"])
+    assert result.output.startswith("2 points → ")
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").intensity, [3.0, 1.0])
+
+
+def test_export_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.ply").write_text("mine")
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
+    assert isinstance(result.exception, InputError)
+    assert (tmp_path / "map.ply").read_text() == "mine"
+    assert CliRunner().invoke(map_app, ["export", str(folder), "--overwrite"]).exit_code == 0
+    assert len(read_ply(tmp_path / "map.ply")) == 3
+
+
+def test_the_output_folder_of_a_run_will_do(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    assert "3 points in 2 tiles" in CliRunner().invoke(map_app, ["info", str(tmp_path)]).output
+
+
+def test_a_dot_in_the_folder_is_kept(tmp_path: Path) -> None:
+    with TileWriter(tmp_path / "map.v1") as writer:
+        writer.append([[1.0, 2.0, 3.0]])
+    assert CliRunner().invoke(map_app, ["export", str(tmp_path / "map.v1")]).exit_code == 0
+    assert (tmp_path / "map.v1.ply").is_file()
+
+
+def test_export_of_an_interrupted_run_warns(folder: Path) -> None:
+    writer = TileWriter(folder)
+    result = CliRunner().invoke(map_app, ["export", str(folder)])
+    assert "warning: the run that wrote this map did not close it" in result.output
+    writer.close()
+
+
+def test_no_map(tmp_path: Path) -> None:
+    result = CliRunner().invoke(map_app, ["info", str(tmp_path)])
+    assert isinstance(result.exception, InputError)

@@ -1,0 +1,46 @@
+"""Chains of static transforms, against SciPy."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from boxplus.recordings.bags.transforms import chain
+
+
+def matrix(values: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
+    T[:3, 3] = values[:3]
+    return T
+
+
+@given(seed=st.integers(0, 10_000), length=st.integers(2, 6), flips=st.lists(st.booleans(), min_size=6, max_size=6))
+def test_a_chain_in_either_direction(seed: int, length: int, flips: list[bool]) -> None:
+    rng = np.random.default_rng(seed)
+    edges, expected = [], np.eye(4)
+    for k in range(length - 1):
+        values = np.concatenate((rng.normal(size=3), Rotation.random(random_state=seed + k).as_quat()))
+        if flips[k]:
+            edges.append((f"f{k + 1}", f"f{k}", values))
+            expected = expected @ np.linalg.inv(matrix(values))
+        else:
+            edges.append((f"f{k}", f"f{k + 1}", values))
+            expected = expected @ matrix(values)
+    edges.append(("f0", "elsewhere", values))
+    rng.shuffle(edges)
+    found = chain(edges, "f0", f"f{length - 1}")
+    assert found is not None
+    np.testing.assert_allclose(found[0], expected, atol=1e-9)
+    assert found[1] == [f"f{k}" for k in range(length)]
+
+
+def test_unconnected_broken_and_repeated_edges() -> None:
+    identity = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    assert chain([("a", "b", identity)], "a", "c") is None
+    assert chain([], "a", "b") is None
+    assert chain([("a", "b", np.zeros(7))], "a", "b") is None
+    assert chain([("a", "b", identity * np.nan)], "a", "b") is None
+    moved = identity + np.array([1.0, 0, 0, 0, 0, 0, 0])
+    found = chain([("a", "b", identity), ("a", "b", moved)], "a", "b")
+    assert found is not None and found[0][0, 3] == 1.0
