@@ -66,6 +66,20 @@ def _corridors(seed: int) -> Case:
     return parallel_corridors(), route, DriftConfig(**INDOORS), 3.5
 
 
+def _long(seed: int) -> Case:
+    """2 km through a town, at every crossing left, right or straight on, by chance."""
+    random = np.random.default_rng([seed, 3])
+    at, way = np.array([1, 1]), np.array([1, 0])
+    route = [60.0 * at]
+    for _ in range(34):
+        ways = [np.array(w) for w in ((1, 0), (-1, 0), (0, 1), (0, -1)) if w != tuple(-way)]
+        ways = [w for w in ways if ((at + w >= 0) & (at + w <= 3)).all()]
+        way = ways[random.integers(len(ways))]
+        at = at + way
+        route.append(60.0 * at)
+    return city(3, 3, seed=seed), [corner.tolist() for corner in route], DriftConfig(channels=16, azimuth_steps=240), 8.0
+
+
 def _block(seed: int) -> Case:
     route = [[20.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0], [0.0, 0.0], [60.0, 0.0], [60.0, 25.0]]
     return city(2, 2, seed=seed), route, DriftConfig(channels=24, azimuth_steps=240), 8.0
@@ -73,6 +87,7 @@ def _block(seed: int) -> Case:
 
 WORLDS: dict[str, Callable[[int], Case]] = {
     "block": _block,
+    "long": _long,
     "city": _city,
     "car_park": _car_park,
     "storeys": _storeys,

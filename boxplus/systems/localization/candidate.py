@@ -13,7 +13,7 @@ from boxplus.maps.local_maps.visibility import directions, nearest_ranges
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, same_pose
 from boxplus.systems.localization.standing import standing
-from boxplus.systems.slam.registration import Registration, Surface, register
+from boxplus.systems.slam.registration import Surface, register
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -36,7 +36,8 @@ class Candidate:
         overlap: share of all points within 0.5 m.
         rms: spread of distances to the map's planes [m].
         measured: how many of the six directions the surfaces determine.
-        seen_through: share of directions in which the map has something nearer than what was measured.
+        seen_through: share of directions in which the map has something nearer than what was measured; NaN where something else
+            speaks against it already, and nobody looked.
         refusal: why it is not believed, in a sentence; None where nothing speaks against it.
     """
 
@@ -87,25 +88,36 @@ def examine(guess: Guess, query: Query, surroundings: Surface, config: Localizat
         return Candidate(guess.place, guess.T_map_query, np.eye(6), guess.agreement, 0.0, 0.0, none, 0, none, refusal)
     T = found.T_target_source
     fit = _share_near(query.stands, surroundings, T)
-    through = seen_through(query, surroundings.points, T)
-    measured = 6 - len(found.weak)
     candidate = Candidate(
-        guess.place, T, found.covariance, guess.agreement, fit, found.overlap[0], found.rms, measured, through, None
+        guess.place,
+        T,
+        found.covariance,
+        guess.agreement,
+        fit,
+        found.overlap[0],
+        found.rms,
+        6 - len(found.weak),
+        float("nan"),
+        None,
     )
-    return replace(candidate, refusal=_refusal(candidate, found, config))
+    refusal = _refusal(candidate, config)
+    if refusal is not None:
+        return replace(candidate, refusal=refusal)
+    through = seen_through(query, surroundings.points, T)
+    if through > config.most_seen_through:
+        refusal = f"in {100 * through:.0f} % of directions the map has something nearer than what is seen"
+    return replace(candidate, seen_through=through, refusal=refusal)
 
 
-def _refusal(candidate: Candidate, found: Registration, config: LocalizationConfig) -> str | None:
+def _refusal(candidate: Candidate, config: LocalizationConfig) -> str | None:
     if candidate.measured < 6:
         return f"the surfaces determine {candidate.measured} of 6 directions only"
     if candidate.fit < config.least_fit:
         return f"{100 * candidate.fit:.0f} % of what stands is in the map, {100 * config.least_fit:.0f} % asked for"
     if candidate.overlap < config.least_overlap:
         return f"{100 * candidate.overlap:.0f} % of the points are in the map, {100 * config.least_overlap:.0f} % asked for"
-    if candidate.seen_through > config.most_seen_through:
-        return f"in {100 * candidate.seen_through:.0f} % of directions the map has something nearer than what is seen"
-    if found.rms > config.largest_rms:
-        return f"surfaces lie {100 * found.rms:.1f} cm apart, {100 * config.largest_rms:.0f} cm at most"
+    if candidate.rms > config.largest_rms:
+        return f"surfaces lie {100 * candidate.rms:.1f} cm apart, {100 * config.largest_rms:.0f} cm at most"
     return None
 
 
