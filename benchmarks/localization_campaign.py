@@ -173,7 +173,7 @@ def map_of(drive: DriftingDrive, config: LocalMapConfig) -> SavedMap:
 
 @dataclass(frozen=True)
 class Start:
-    """What came of one start: found when, worst and rms error of the poses given out, seconds of computation by kind."""
+    """What came of one start: found when, worst and rms error of the poses given out, time of the processor by kind."""
 
     found_s: float
     worst_m: float
@@ -208,23 +208,24 @@ class Day:
             seen = scan[np.abs(np.arctan2(scan[:, 1], scan[:, 0])) < FORWARD] if forward else scan
             seconds, self._now_ns = int(time_ns) * 1e-9, begin_ns + int(time_ns)
             self._T_own = se3.compose(T_drive, T)
-            began = time.perf_counter()
+            began = time.process_time()
             found = self.localizer.push(self._now_ns, self._T_own, seen)
-            took[found.search is not None].append(time.perf_counter() - began)
+            took[found.search is not None].append(time.process_time() - began)
             was_lost |= found.T_map_body is None
             if found.search is not None:
                 verdicts.append(_verdict(seconds, found.search))
             if found.T_map_body is not None:
                 xi = se3.log(se3.compose(se3.inverse(truth), found.T_map_body))
-                errors.append([seconds, was_lost, np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])])
+                errors.append([seconds, was_lost, np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:]), found.status == "localised"])
                 if was_lost and not np.isfinite(found_s):
                     found_s = seconds
             if seconds > found_s + FOLLOWED_S:
                 break
-        e = np.array(errors).reshape(-1, 4)
+        e = np.array(errors).reshape(-1, 5)
         stale = e[e[:, 1] == 0]
         if len(stale):
-            verdicts.append(f"held on for {stale[-1, 0]:.1f} s")
+            believed = stale[(stale[:, 4] == 1) & ((stale[:, 3] > FALSE_M) | (stale[:, 2] > FALSE_RAD)), 0].max(initial=0.0)
+            verdicts.append(f"held on for {stale[-1, 0]:.1f} s, as localised for {believed:.1f} s")
         e = e[e[:, 1] == 1]
         return Start(
             found_s,

@@ -13,7 +13,7 @@ from boxplus.maps.local_maps.visibility import directions, nearest_ranges
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, same_pose
 from boxplus.systems.localization.standing import standing
-from boxplus.systems.slam.registration import Surface, register
+from boxplus.systems.slam.registration import Surface, approach, register
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -22,6 +22,8 @@ _NEAR = 0.3  # m, between a point that stands and the map's
 _ASKED = 4000  # points that stand, for the fit
 _SEEN = 0.75  # of the range that was measured; what the map has nearer than this, and by a metre, is seen through
 _FEWEST_DIRECTIONS = 30
+_FAR_WORSE = 0.5  # of the best fit, before the last stage of registration: what fits less is not worth that stage
+_NO_PLANES = "too few points on planes of the map"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,17 +77,16 @@ class Query:
         return cls(points, spread, Surface.of(points), scan, viewpoint)
 
 
-def examine(guess: Guess, query: Query, surroundings: Surface, config: LocalizationConfig) -> Candidate:
-    """Register a query to the map from a guess, and ask what speaks against it.
+def examine(guess: Guess, T_approached: Floats, query: Query, surroundings: Surface, config: LocalizationConfig) -> Candidate:
+    """Register a query to the map, and ask what speaks against it.
 
     Args:
+        T_approached: (7,) T_map_query that `approach` came to from the guess.
         surroundings: the map around the guess, map frame.
     """
-    found = register(query.surface, surroundings, guess.T_map_query, config.registration) if len(surroundings.points) else None
+    found = register(query.surface, surroundings, T_approached, config.registration, is_close=True)
     if found is None:
-        none = float("nan")
-        refusal = "too few points on planes of the map"
-        return Candidate(guess.place, guess.T_map_query, np.eye(6), guess.agreement, 0.0, 0.0, none, 0, none, refusal)
+        return _unfit(guess, guess.T_map_query, 0.0, _NO_PLANES)
     T = found.T_target_source
     fit = _share_near(query.stands, surroundings, T)
     candidate = Candidate(
@@ -165,16 +166,32 @@ def seen_through(query: Query, map_points: Points, T_map_query: Floats) -> float
 def examine_all(
     guesses: list[Guess], query: Query, points_near: Callable[[Floats, float], Points], config: LocalizationConfig
 ) -> list[Candidate]:
-    """Candidates of all guesses, each registered to the map around it."""
+    """Candidates of all guesses, each registered to the map around it; what fits far worse than the best is left at a glance."""
     reach = float(np.quantile(np.linalg.norm(query.points, axis=1), 0.98)) + 5.0
     around: dict[tuple[int, ...], Surface] = {}
-    found: list[Candidate] = []
+    seen: list[tuple[Guess, Surface, Floats | None, float]] = []
     for guess in guesses:
         key = tuple(np.round(guess.T_map_query[4:] / reach * 2.0).astype(int).tolist())
         if key not in around:
             around[key] = Surface.of(points_near(np.array(key) * reach / 2.0, 1.5 * reach))
-        found.append(examine(guess, query, around[key], config))
+        target = around[key]
+        T = approach(query.surface, target, guess.T_map_query, config.registration) if len(target.points) else None
+        seen.append((guess, target, T, 0.0 if T is None else _share_near(query.stands, target, T)))
+    worth = _FAR_WORSE * max((fit for *_, fit in seen), default=0.0)
+    found: list[Candidate] = []
+    for guess, target, T, fit in seen:
+        if T is None:
+            found.append(_unfit(guess, guess.T_map_query, 0.0, _NO_PLANES))
+        elif fit < worth:
+            found.append(_unfit(guess, T, fit, f"{100 * fit:.0f} % of what stands is in the map, far less than elsewhere"))
+        else:
+            found.append(examine(guess, T, query, target, config))
     return found
+
+
+def _unfit(guess: Guess, T_map_query: Floats, fit: float, refusal: str) -> Candidate:
+    none = float("nan")
+    return Candidate(guess.place, T_map_query, np.eye(6), guess.agreement, fit, none, none, 0, none, refusal)
 
 
 def _share_near(points: Points, target: Surface, T: Floats) -> float:

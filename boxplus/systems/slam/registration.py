@@ -81,19 +81,42 @@ def register(
     T_start: Floats,
     config: RegistrationConfig | None = None,
     deformation: Floats | None = None,
+    is_close: bool = False,
 ) -> Registration | None:
     """Lay a source over a target; None where too few points find a plane.
 
     Args:
-        T_start: (7,) T_target_source to start from.
+        T_start: (7,) T_target_source to start from; `is_close` where `approach` has been there.
         deformation: (6, 6) covariance D of what the maps themselves are bent by, on the right of it; none if left out.
 
     Example: docs/slam.md.
     """
     config = config if config is not None else RegistrationConfig()
+    T = _staged(source, target, T_start, config, _STAGES[-1:] if is_close else _STAGES)
+    if T is None:
+        return None
+    distance, _, count = _STAGES[-1]
+    found = _Matched.of(_spread(source.points, count), target, T, distance, config)
+    if found is None:
+        return None
+    covariance, information, weak = found.covariance(config, np.zeros((6, 6)) if deformation is None else deformation)
+    overlap = (
+        _share_near(source.points, target, T, config.near),
+        _share_near(target.points, source, se3.inverse(T), config.near),
+    )
+    return Registration(T, covariance, information, weak, found.lever, overlap, found.scale, len(found.e))
+
+
+def approach(source: Surface, target: Surface, T_start: Floats, config: RegistrationConfig) -> Floats | None:
+    """(7,) T_target_source before the last stage of `register`, from a sixth of its work; None where that gives none."""
+    return _staged(source, target, T_start, config, _STAGES[:-1])
+
+
+def _staged(
+    source: Surface, target: Surface, T_start: Floats, config: RegistrationConfig, stages: tuple[tuple[float, int, int], ...]
+) -> Floats | None:
     T = np.array(T_start, dtype=np.float64)
-    found = None
-    for distance, steps, count in _STAGES:
+    for distance, steps, count in stages:
         points = _spread(source.points, count)
         for _ in range(steps):
             found = _Matched.of(points, target, T, distance, config)
@@ -103,17 +126,7 @@ def register(
             T = se3.compose(T, se3.exp(step))
             if length < _STEP:
                 break
-    if found is None:
-        return None
-    found = _Matched.of(points, target, T, distance, config)
-    if found is None:
-        return None
-    covariance, information, weak = found.covariance(config, np.zeros((6, 6)) if deformation is None else deformation)
-    overlap = (
-        _share_near(source.points, target, T, config.near),
-        _share_near(target.points, source, se3.inverse(T), config.near),
-    )
-    return Registration(T, covariance, information, weak, found.lever, overlap, found.scale, len(found.e))
+    return T
 
 
 def refine(
