@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
-from boxplus.maps.local_maps.visibility import directions, nearest_ranges
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, same_pose
-from boxplus.systems.localization.standing import standing
+from boxplus.systems.localization.standing import seen_through, standing
 from boxplus.systems.slam.registration import Surface, approach, register
 
 Floats = NDArray[np.float64]
@@ -20,8 +19,6 @@ Points = NDArray[np.float32]
 
 _NEAR = 0.3  # m, between a point that stands and the map's
 _ASKED = 4000  # points that stand, for the fit
-_SEEN = 0.75  # of the range that was measured; what the map has nearer than this, and by a metre, is seen through
-_FEWEST_DIRECTIONS = 30
 _FAR_WORSE = 0.5  # of the best fit, before the last stage of registration: what fits less is not worth that stage
 _NO_PLANES = "too few points on planes of the map"
 
@@ -104,7 +101,9 @@ def examine(guess: Guess, T_approached: Floats, query: Query, surroundings: Surf
     refusal = _refusal(candidate, config)
     if refusal is not None:
         return replace(candidate, refusal=refusal)
-    through = seen_through(query, surroundings.points, T)
+    scan = se3.act(T, query.scan.astype(np.float64)).astype(np.float32)
+    map_stands = surroundings.points[standing(surroundings.points)]
+    through = seen_through(scan, map_stands, se3.act(T, query.viewpoint[None])[0])
     if through > config.most_seen_through:
         refusal = f"in {100 * through:.0f} % of directions the map has something nearer than what is seen"
     return replace(candidate, seen_through=through, refusal=refusal)
@@ -142,25 +141,6 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
             return best, f"another pose, {away:.1f} m away, fits nearly as well: {_percent(other)} and {_percent(best)}", False
         at_once = at_once and other.fit * config.decisive <= best.fit
     return best, "", at_once
-
-
-def seen_through(query: Query, map_points: Points, T_map_query: Floats) -> float:
-    """Share of the directions of a scan in which something of the map stands nearer than what was measured; NaN for too few.
-
-    Nearer than the nearest of the direction and those beside it: at the edge of a thing some rays pass and some do not.
-    """
-    from scipy.ndimage import minimum_filter
-
-    viewpoint = se3.act(T_map_query, query.viewpoint[None])[0]
-    scan = se3.act(T_map_query, query.scan.astype(np.float64)).astype(np.float32)
-    stands = map_points[standing(map_points)]
-    measured = nearest_ranges(*directions(scan, viewpoint), 0.0)
-    there = nearest_ranges(*directions(stands, viewpoint), 0.0)
-    asked = np.isfinite(measured) & np.isfinite(there)
-    if np.count_nonzero(asked) < _FEWEST_DIRECTIONS:
-        return float("nan")
-    beside = minimum_filter(measured, size=3, mode=("nearest", "wrap"))
-    return float(np.mean((there < _SEEN * beside - 1.0)[asked]))
 
 
 def examine_all(

@@ -202,7 +202,8 @@ class Localizer:
             self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
             # One that fails ends it at once: a sensor that was carried away is not where the odometry has it.
             self._held_ns = time_ns if matched.measured else _NEVER
-            if matched.share >= config.least_share or not matched.is_mapped:
+            # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.
+            if matched.share >= config.least_share or matched.is_beyond:
                 self._fitting_ns = time_ns
         reason = self._why_lost(time_ns, tracker)
         if reason:

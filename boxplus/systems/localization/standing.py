@@ -1,12 +1,22 @@
-"""What stands: points on vertical runs. Ground, floors and ceilings fit everywhere and tell no place from another."""
+"""What stands: points on vertical runs; and whether a scan sees through it.
+
+Ground, floors and ceilings fit everywhere and tell no place from another.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.maps.local_maps.visibility import directions, nearest_ranges
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
 _COLUMN, _LEVEL = 1.0, 0.5  # m, sides of the cells of the ground, and of height
 _GAP, _LEAST = 2, 2  # levels that a run may leap, and that it has to reach over
+_SEEN = 0.75  # of the range that was measured; what the map has nearer than this, and by a metre, is seen through
+_FEWEST_DIRECTIONS = 30
 
 
 def standing(points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -30,3 +40,22 @@ def standing(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     first = keys[begins]
     last = keys[np.r_[np.flatnonzero(begins)[1:] - 1, len(keys) - 1]]
     return np.asarray((last - first >= _LEAST)[run[of.ravel()]])
+
+
+def seen_through(scan: Points, map_stands: Points, viewpoint: Floats) -> float:
+    """Share of the directions of a scan in which something of the map stands nearer than what was measured; NaN for too few.
+
+    Nearer than the nearest of the direction and those beside it: at the edge of a thing some rays pass and some do not.
+
+    Args:
+        scan: (M, 3) and map_stands: (N, 3) what stands in the map, both in the map's frame, as viewpoint (3,) is [m].
+    """
+    from scipy.ndimage import minimum_filter
+
+    measured = nearest_ranges(*directions(scan, viewpoint), 0.0)
+    there = nearest_ranges(*directions(map_stands, viewpoint), 0.0)
+    asked = np.isfinite(measured) & np.isfinite(there)
+    if np.count_nonzero(asked) < _FEWEST_DIRECTIONS:
+        return float("nan")
+    beside = minimum_filter(measured, size=3, mode=("nearest", "wrap"))
+    return float(np.mean((there < _SEEN * beside - 1.0)[asked]))

@@ -18,7 +18,7 @@ from boxplus.manifolds import se3
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.place_map import PlaceMap
-from boxplus.systems.localization.standing import standing
+from boxplus.systems.localization.standing import seen_through, standing
 from boxplus.systems.slam.registration import Surface, refine
 
 Floats = NDArray[np.float64]
@@ -28,6 +28,7 @@ _MOVED = 0.3  # of the reach of the map in memory, after which it is fetched aga
 _DISTANCE, _STEPS = 0.6, 2  # m of a plane's points, and Gauss-Newton steps
 _FEWEST_STANDING = 40
 _LOOKED_AT = 8  # points of a scan for each one that is registered
+_HALF, _HARDLY = 0.5, 0.1  # of what is asked lies where the map has something
 _MAPPED, _ON_MAP = 2.0, 0.3  # m, to the nearest point of the map: it has something there; the point lies on it
 
 
@@ -38,6 +39,8 @@ class Matched:
     Attributes:
         share: of the points that stand, and where the map has anything within 2 m, those within 0.3 m of it.
         is_mapped: whether it has anything within 2 m of half of them.
+        is_beyond: whether the scan may lie where the map has nothing: it has hardly anything near it, and the scan sees through
+            nothing of what stands in the map. Elsewhere than that, what the map has near has to be what is seen.
         innovation: distance of the registration from the prediction, and its limit, in standard deviations; NaN where there was
             none.
         measured: how many directions it determined; 0 where it was not taken.
@@ -45,6 +48,7 @@ class Matched:
 
     share: float
     is_mapped: bool
+    is_beyond: bool
     innovation: float
     limit: float
     measured: int
@@ -92,23 +96,31 @@ class Tracker:
         stands = points[standing((points @ R_level_body.T).astype(np.float32))]
         around = self._surroundings()
         if around is None:
-            return Matched(0.0, False, math.nan, math.nan, 0)
+            return Matched(0.0, False, True, math.nan, math.nan, 0)
         found = refine(points, around, self.T_map_body, config.registration, distance=_DISTANCE, steps=_STEPS)
         T = self.T_map_body if found is None else found.T_target_source
         asked = stands if len(stands) >= _FEWEST_STANDING else points
-        share, is_mapped = _share(asked, around, T)
+        share, mapped = _share(asked, around, T)
+        is_mapped = mapped >= _HALF
+        is_beyond = mapped < _HARDLY and not self._sees_through(p_body, around)
         if share < config.least_share or not is_mapped:
-            return Matched(share, is_mapped, math.nan, math.nan, 0)
+            return Matched(share, is_mapped, is_beyond, math.nan, math.nan, 0)
         if found is None or len(found.weak) == 6:
-            return Matched(share, True, math.nan, math.nan, 0)
+            return Matched(share, True, False, math.nan, math.nan, 0)
         xi = se3.log(se3.compose(se3.inverse(self.T_map_body), T))
         innovation, limit = self._innovation(xi, found.covariance, 6 - len(found.weak))
         if innovation > limit:
-            return Matched(share, True, innovation, limit, 0)
+            return Matched(share, True, False, innovation, limit, 0)
         P = np.linalg.inv(np.linalg.inv(self.covariance) + found.information)
         self.covariance = 0.5 * (P + P.T)
         self.T_map_body = se3.compose(self.T_map_body, se3.exp(self.covariance @ found.information @ xi))
-        return Matched(share, True, innovation, limit, 6 - len(found.weak))
+        return Matched(share, True, False, innovation, limit, 6 - len(found.weak))
+
+    def _sees_through(self, p_body: Points, around: Surface) -> bool:
+        """Whether a scan passes through what stands in the map, in more directions than changes may account for."""
+        scan = se3.act(self.T_map_body, p_body.astype(np.float64)).astype(np.float32)
+        share = seen_through(scan, around.points[standing(around.points)], self.T_map_body[4:])
+        return share > self._config.most_seen_through
 
     def _innovation(self, xi: Floats, covariance: Floats, measured: int) -> tuple[float, float]:
         from scipy.stats import chi2
@@ -127,11 +139,11 @@ class Tracker:
         return self._around
 
 
-def _share(points: Points, around: Surface, T_map_body: Floats) -> tuple[float, bool]:
-    """Share of points that lie on the map, of those that lie where it has something; and whether that is half of all."""
+def _share(points: Points, around: Surface, T_map_body: Floats) -> tuple[float, float]:
+    """Share of points that lie on the map, of those that lie where it has something; and of these among all."""
     if not len(points):
-        return 0.0, False
+        return 0.0, 0.0
     found = around.tree.nearest(se3.act(T_map_body, points.astype(np.float64)), 1, max_distance=_MAPPED)
     is_mapped = found.counts > 0
     on_map = is_mapped & (found.distances[:, 0] <= _ON_MAP)
-    return float(np.count_nonzero(on_map)) / max(int(np.count_nonzero(is_mapped)), 1), bool(np.mean(is_mapped) >= 0.5)
+    return float(np.count_nonzero(on_map)) / max(int(np.count_nonzero(is_mapped)), 1), float(np.mean(is_mapped))

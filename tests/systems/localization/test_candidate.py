@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.manifolds import se3
-from boxplus.maps.ikd_tree import IkdTree
 from boxplus.simulation.worlds.worlds import yard
-from boxplus.systems.localization.candidate import Candidate, Query, rivalry, seen_through
+from boxplus.systems.localization.candidate import Candidate, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import PlaceImages, same_pose
-from boxplus.systems.localization.standing import standing
-from boxplus.systems.slam.registration import Surface
+from boxplus.systems.localization.standing import seen_through, standing
 from tests.systems.localization.days import INDOORS, drive_of, known_map
 
 HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -47,13 +45,12 @@ def test_a_rival_that_fits_nearly_as_well_forbids_to_believe() -> None:
 def test_a_wall_of_the_map_that_a_scan_sees_past_speaks_against_it() -> None:
     y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-8.0, 8.0, 0.1), np.arange(-1.0, 3.0, 0.1)))
     wall = np.column_stack([np.full_like(y, 10.0), y, z]).astype(np.float32)
-    query = Query(wall, wall, Surface(wall, IkdTree(wall)), wall, np.zeros(3))
     nearer = wall * np.array([0.5, 1.0, 1.0], np.float32)
-    assert seen_through(query, wall, HERE) == 0.0
-    assert seen_through(query, nearer, HERE) > 0.8
+    assert seen_through(wall, wall, np.zeros(3)) == 0.0
+    assert seen_through(wall, nearer, np.zeros(3)) > 0.8
     farther = wall * np.array([2.0, 1.0, 1.0], np.float32)
-    assert seen_through(query, farther, HERE) == 0.0  # something was put in front of it: no contradiction
-    assert np.isnan(seen_through(query, wall[:0], HERE))
+    assert seen_through(wall, farther, np.zeros(3)) == 0.0  # something was put in front of it: no contradiction
+    assert np.isnan(seen_through(wall, wall[:0], np.zeros(3)))
 
 
 def test_only_what_stands_counts() -> None:

@@ -14,6 +14,7 @@ from boxplus.simulation.worlds.world import World
 from boxplus.simulation.worlds.worlds import yard
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.localizer import Localizer
+from boxplus.systems.localization.tracking import Tracker
 from tests.systems.localization.days import INDOORS, KnownMap, drive_of, errors, known_map, own_world, push_all
 
 FEW = LocalizationConfig(candidates=5)
@@ -70,6 +71,20 @@ def test_a_sensor_that_is_carried_away_is_noticed_and_found_again(world: World, 
     end = after[-1].time_ns + 3_000_000_000
     assert localizer.push(end, T_odo[-1], second.scans[-1]).status == "searching"
     assert localizer.lost_because == "no scan for 3.0 s"
+
+
+def test_beyond_the_map_is_only_where_nothing_of_it_is_seen_through(world: World, place_map: KnownMap) -> None:
+    drive = drive_of(world, [[-16, 0], [-3, 0]], seed=7)
+    truth, scan = drive.T_world_body[0], drive.scans[0]
+    # Carried away to the other end: what is seen would lie behind the last wall, where the map has nothing.
+    elsewhere = truth + np.array([0.0, 0.0, 0.0, 0.0, 52.0, 0.0, 0.0])
+    matched = Tracker(place_map, elsewhere, 1e-4 * np.eye(6), LocalizationConfig()).correct(scan, np.eye(3))
+    assert not matched.is_mapped and not matched.is_beyond and matched.share < 0.5
+    # A map that ends 12 m ahead, and one that begins 40 m ahead: what they have is seen where it is.
+    for keep in (place_map.points[:, 0] < -4.0, place_map.points[:, 0] > 24.0):
+        part = replace(place_map, points=place_map.points[keep])
+        matched = Tracker(part, truth, 1e-4 * np.eye(6), LocalizationConfig()).correct(scan, np.eye(3))
+        assert matched.is_beyond or matched.share > 0.5
 
 
 def test_another_place_is_not_found_and_it_is_said_why(place_map: KnownMap) -> None:
