@@ -1,3 +1,9 @@
+from .clouds.pcd import read_pcd as read_pcd
+from .clouds.pcd import write_pcd as write_pcd
+from .clouds.ply import read_ply as read_ply
+from .clouds.ply import write_ply as write_ply
+from .clouds.point_cloud import PointCloud as PointCloud
+from .clouds.scene_ply import write_scene_ply as write_scene_ply
 from .graphs.g2o import read_g2o as read_g2o
 from .graphs.g2o import write_g2o as write_g2o
 from .graphs.pose_graph import PoseGraph as PoseGraph
@@ -5,11 +11,6 @@ from .graphs.pose_graph_file import read_pose_graph as read_pose_graph
 from .graphs.pose_graph_file import write_pose_graph as write_pose_graph
 from .graphs.toro import read_toro as read_toro
 from .graphs.toro import write_toro as write_toro
-from .pcd import read_pcd as read_pcd
-from .pcd import write_pcd as write_pcd
-from .ply import read_ply as read_ply
-from .ply import write_ply as write_ply
-from .point_cloud import PointCloud as PointCloud
 from .reconstructions.bal import BalProblem as BalProblem
 from .reconstructions.bal import read_bal as read_bal
 from .reconstructions.bal import write_bal as write_bal
@@ -23,7 +24,6 @@ from .reconstructions.reconstruction import read_reconstruction as read_reconstr
 from .reconstructions.reconstruction import write_reconstruction as write_reconstruction
 from .reconstructions.vgg_lines import VggLines as VggLines
 from .reconstructions.vgg_lines import read_vgg_lines as read_vgg_lines
-from .scene_ply import write_scene_ply as write_scene_ply
 from .trajectory import Trajectory as Trajectory
 from .trajectory import read_trajectory as read_trajectory
 from .trajectory import write_csv as write_csv

@@ -51,24 +51,30 @@ def info_command(folder: _Folder) -> None:
 @map_app.command("export")
 def export_command(
     folder: _Folder,
-    ply: Annotated[Path | None, typer.Option(help="PLY file to write; default without --pcd: FOLDER.ply.")] = None,
-    pcd: Annotated[Path | None, typer.Option(help="PCD file to write.")] = None,
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="File to write, .ply, .pcd, .las, .laz or .e57; may be repeated; default: FOLDER.ply.",
+            metavar="FILE",
+        ),
+    ] = None,
     voxel: Annotated[float | None, typer.Option(help="Keep one point per voxel of this edge [m].")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Write all tiles of a map into one PLY and/or PCD file."""
+    """Write all tiles of a map into one file: PLY or PCD, LAS or LAZ (pip install 'boxplus[las]'), E57 ('boxplus[e57]')."""
     from boxplus.maps.tiles.store import TileStore, merge
 
     tiles = _tiles(folder)
     for sentence in TileStore.open(tiles).report:
         typer.echo(f"warning: {sentence}", err=True)
-    if ply is None and pcd is None:
-        ply = tiles.resolve().parent / f"{tiles.resolve().name}.ply"
-    for path in (ply, pcd):
-        if path is not None and path.exists() and not overwrite:
+    outputs = output or [tiles.resolve().parent / f"{tiles.resolve().name}.ply"]
+    for path in outputs:
+        if path.exists() and not overwrite:
             raise InputError("a new file", f"{path}, which exists", "give another path, or --overwrite")
-    count = merge(tiles, ply, pcd, voxel)
-    typer.echo(f"{count:,} points → {' and '.join(str(path) for path in (ply, pcd) if path is not None)}")
+    count = merge(tiles, outputs, voxel)
+    typer.echo(f"{count:,} points → {' and '.join(str(path) for path in outputs)}")
 
 
 map_app.command("grid")(grid)

@@ -227,7 +227,7 @@ def _write_scene(path: Path, reconstruction: Reconstruction) -> None:
     """Points in their colours, then the camera centres in red."""
     import numpy as np
 
-    from boxplus.formats.scene_ply import write_scene_ply
+    from boxplus.formats.clouds.scene_ply import write_scene_ply
     from boxplus.report.optimization.bundle_scene import camera_centers
 
     centers = camera_centers(reconstruction)

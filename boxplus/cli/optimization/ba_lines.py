@@ -135,7 +135,7 @@ def _write_scene(path: Path, result: LineAdjustmentResult) -> None:
     """Lines as edges, those that are not determined in red; points in grey, camera centres in dark red."""
     import numpy as np
 
-    from boxplus.formats.scene_ply import write_scene_ply
+    from boxplus.formats.clouds.scene_ply import write_scene_ply
     from boxplus.manifolds import quaternion
 
     data, found = result.data, result.triangulation.found

@@ -251,7 +251,7 @@ def _write_graph_ply(path: Path, graph: PoseGraph) -> None:
     """Positions of the poses, and the edges between them; held poses in red."""
     import numpy as np
 
-    from boxplus.formats.scene_ply import write_scene_ply
+    from boxplus.formats.clouds.scene_ply import write_scene_ply
     from boxplus.systems.pose_graph.problem import positions
     from boxplus.systems.pose_graph.start import held_poses
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.cloud_writer import CloudWriter
+from boxplus.formats.clouds.cloud_file import cloud_writer
+from boxplus.formats.clouds.ply import ply_vertex_count, read_ply
+from boxplus.formats.clouds.point_cloud import as_records
 from boxplus.formats.output import TEMPORARY_SUFFIX
-from boxplus.formats.pcd import PcdWriter
-from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
-from boxplus.formats.point_cloud import as_records
 from boxplus.maps.tiles.journal import read_journal
 from boxplus.maps.tiles.layout import (
     MANIFEST,
@@ -165,26 +164,24 @@ class TileStore:
         return as_records(cloud.points, cloud.intensity)
 
 
-def merge(
-    folder: str | Path, out_ply: str | Path | None = None, out_pcd: str | Path | None = None, voxel: float | None = None
-) -> int:
-    """Write all tiles of a map folder into one PLY and/or PCD file, holding one tile in memory at a time.
+def merge(folder: str | Path, outputs: Sequence[str | Path], voxel: float | None = None) -> int:
+    """Write all tiles of a map folder into files of one cloud each, holding one tile in memory at a time.
 
     Args:
         folder: the map folder; it is not changed.
-        out_ply, out_pcd: files to write; None leaves that format out.
+        outputs: files to write: PLY, PCD, LAS, LAZ (extra `las`) or E57 (extra `e57`), by their endings.
         voxel: keep one point per voxel of this edge [m]; None: as the map was written.
 
     Returns:
         The number of points written.
 
     Raises:
-        InputError: not a map folder, a voxel that is not positive, or neither output named.
+        InputError: not a map folder, a voxel that is not positive, no output, an ending of no format, or one whose library is
+            not installed.
         OutputError: a file cannot be written; nothing incomplete is left behind.
     """
-    outputs = [(PlyWriter, out_ply), (PcdWriter, out_pcd)]
-    if out_ply is None and out_pcd is None:
-        raise InputError("an output file", "neither out_ply nor out_pcd", "name at least one")
+    if not outputs:
+        raise InputError("an output file", "none", "name at least one")
     store = TileStore.open(folder)
     if voxel is not None and not voxel * 2**20 > store.manifest.tile_size_m:
         raise InputError(
@@ -194,7 +191,7 @@ def merge(
         )
     count = 0
     with ExitStack() as stack:
-        writers: list[CloudWriter] = [stack.enter_context(kind(path)) for kind, path in outputs if path is not None]
+        writers = [stack.enter_context(cloud_writer(path)) for path in outputs]
         for tile in store.iter_tiles(voxel):
             for writer in writers:
                 writer.append(tile.points, tile.intensity)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError, OutputError
+from boxplus.formats.clouds.ply import PlyWriter, ply_vertex_count, read_ply
+from boxplus.formats.clouds.point_cloud import as_records
 from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
-from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply
-from boxplus.formats.point_cloud import as_records
 from boxplus.maps.tiles.journal import JournalWriter, read_journal
 from boxplus.maps.tiles.layout import (
     MANIFEST,

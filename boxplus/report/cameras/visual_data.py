@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.report.run_data import sigmas_of
 from boxplus.runs.cameras.folder import CameraRunFolder, DirectFolder, VioFolder

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.clouds.ply import write_ply
 from boxplus.formats.output import atomic_file
-from boxplus.formats.ply import write_ply
 
 _EVERY_S = 10.0
 _LINE_COLUMNS = "x_first,y_first,z_first,x_last,y_last,z_last"

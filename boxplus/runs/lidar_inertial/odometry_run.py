@@ -219,8 +219,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         self.stage = "merging the map"
         self.show_progress()
         began = time.perf_counter()
-        ply, pcd = self._folder.map_ply if settings.ply else None, self._folder.map_pcd if settings.pcd else None
-        self._merged = merge(self._folder.tiles, ply, pcd)
+        self._merged = merge(self._folder.tiles, [self._folder.map_ply] * settings.ply + [self._folder.map_pcd] * settings.pcd)
         self.seconds["merging"] = time.perf_counter() - began
 
     def nothing_found(self) -> InputError:

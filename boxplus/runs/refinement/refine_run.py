@@ -229,7 +229,10 @@ class _RefineRun:
             stored = tiles.stored
         if settings.ply or settings.pcd:
             folder = self._folder
-            merge(folder.tiles, folder.map_ply if settings.ply else None, folder.map_pcd if settings.pcd else None)
+            merge(
+                folder.tiles,
+                [folder.map_ply] * settings.ply + [folder.map_pcd] * settings.pcd,
+            )
         return stored
 
     def _tell(self, stage: str, share: float) -> None:

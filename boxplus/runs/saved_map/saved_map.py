@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.pcd import read_pcd
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.pcd import read_pcd
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError, printable
+from boxplus.formats.clouds.ply import PlyWriter
 from boxplus.formats.output import atomic_file
-from boxplus.formats.ply import PlyWriter
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import se3
@@ -160,7 +160,7 @@ def _write_map(
                         apart.append(scan.points[goes], None if intensity is None else intensity[goes])
                         removed += int(np.count_nonzero(goes))
     if config.map.ply:
-        merge(own.tiles, own.map_ply)
+        merge(own.tiles, [own.map_ply])
     if seen is None:
         return {"map_points": tiles.stored}
     changes = write_changes(own.changes, seen, [run.session.name for run, _ in members], config.map.change_voxels)

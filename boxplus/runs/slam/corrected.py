@@ -83,5 +83,5 @@ def write_corrected_map(folder: SlamFolder, settings: MapConfig, spool: ScanSpoo
         for scan, T in zip(spool.scans(), T_map_body, strict=True):
             tiles.append(se3.act(T, scan.p_body.astype(np.float64)), scan.intensity)
     if settings.ply or settings.pcd:
-        merge(folder.tiles, folder.map_ply if settings.ply else None, folder.map_pcd if settings.pcd else None)
+        merge(folder.tiles, [folder.map_ply] * settings.ply + [folder.map_pcd] * settings.pcd)
     return tiles.stored

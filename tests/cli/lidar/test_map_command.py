@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 
 from boxplus.cli.lidar.map import map_app
 from boxplus.errors import InputError
-from boxplus.formats.pcd import read_pcd
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.cloud_file import read_cloud
+from boxplus.formats.clouds.pcd import read_pcd
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.maps.tiles.writer import TileWriter
 
 
@@ -34,9 +35,12 @@ def test_export(folder: Path, tmp_path: Path) -> None:
     result = CliRunner().invoke(map_app, ["export", str(folder)])
     assert result.exit_code == 0
     assert len(read_ply(tmp_path / "map.ply")) == 3
-    result = CliRunner().invoke(map_app, ["export", str(folder), "--pcd", str(tmp_path / "a.pcd"), "--voxel", "0.5"])
+    result = CliRunner().invoke(
+        map_app, ["export", str(folder), "-o", str(tmp_path / "a.pcd"), "-o", str(tmp_path / "a.laz"), "--voxel", "0.5"]
+    )
     assert result.output.startswith("2 points → ")
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd").intensity, [3.0, 1.0])
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.laz").intensity, [3.0, 1.0])
 
 
 def test_export_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:

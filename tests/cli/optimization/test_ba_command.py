@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from typer.testing import CliRunner, Result
 
 from boxplus.cli import app
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.reconstructions.bal import read_bal, write_bal
 from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
 from boxplus.formats.reconstructions.gbp import read_gbp, write_gbp

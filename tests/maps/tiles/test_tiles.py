@@ -18,8 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError, OutputError
-from boxplus.formats.pcd import read_pcd
-from boxplus.formats.ply import PlyWriter, read_ply
+from boxplus.formats.clouds.pcd import read_pcd
+from boxplus.formats.clouds.ply import PlyWriter, read_ply
 from boxplus.maps.tiles.journal import read_journal
 from boxplus.maps.tiles.layout import list_journals
 from boxplus.maps.tiles.store import TileStore, merge
@@ -302,24 +302,24 @@ def test_merge(tmp_path: Path) -> None:
     with TileWriter(tmp_path / "map", 20.0, 300) as writer:
         for seed in range(5):
             writer.append(cloud(200, seed), np.arange(200))
-    count = merge(tmp_path / "map", tmp_path / "a.ply", tmp_path / "a.pcd")
+    count = merge(tmp_path / "map", [tmp_path / "a.ply", tmp_path / "a.pcd"])
     assert count == 1000
     ply, pcd = read_ply(tmp_path / "a.ply"), read_pcd(tmp_path / "a.pcd")
     expected = np.concatenate([np.column_stack([cloud(200, seed), np.arange(200, dtype=np.float32)]) for seed in range(5)])
     for back in (ply, pcd):
         assert multiset(np.column_stack([back.points, back.intensity])) == multiset(expected)
-    thinned = merge(tmp_path / "map", tmp_path / "b.ply", voxel=10.0)
+    thinned = merge(tmp_path / "map", [tmp_path / "b.ply"], voxel=10.0)
     assert thinned == len({tuple(cell) for cell in np.floor(expected[:, :3] / 10.0).tolist()})
     assert len(read_ply(tmp_path / "b.ply")) == thinned
-    with pytest.raises(InputError, match="an output file – got neither"):
-        merge(tmp_path / "map")
+    with pytest.raises(InputError, match="an output file – got none"):
+        merge(tmp_path / "map", [])
     with pytest.raises(InputError, match="voxel above"):
-        merge(tmp_path / "map", tmp_path / "c.ply", voxel=0.0)
+        merge(tmp_path / "map", [tmp_path / "c.ply"], voxel=0.0)
 
 
 def test_empty_map_merges_to_an_empty_cloud(tmp_path: Path) -> None:
     TileWriter(tmp_path / "map").close()
-    assert merge(tmp_path / "map", tmp_path / "a.ply") == 0
+    assert merge(tmp_path / "map", [tmp_path / "a.ply"]) == 0
     assert len(read_ply(tmp_path / "a.ply")) == 0
 
 

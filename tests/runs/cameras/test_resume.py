@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.runs.direct.config import DirectRunConfig

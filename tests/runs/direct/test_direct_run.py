@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from boxplus.cameras.wide_angle import Equidistant
 from boxplus.cli import app
 from boxplus.errors import InputError, RecordingError
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.recordings.cameras.open import open_camera_recording

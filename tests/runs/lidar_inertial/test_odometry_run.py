@@ -18,8 +18,8 @@ import pytest
 import yaml
 
 from boxplus.errors import InputError, OutputError
-from boxplus.formats.pcd import read_pcd
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.pcd import read_pcd
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.maps.tiles.store import TileStore
 from boxplus.recordings.recording import Event, Recording

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.formats.ply import read_ply, write_ply
+from boxplus.formats.clouds.ply import read_ply, write_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion, se3
 from boxplus.recordings.recording import Recording

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from boxplus.cli import app
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.pcd import write_pcd
-from boxplus.formats.ply import write_ply
+from boxplus.formats.clouds.pcd import write_pcd
+from boxplus.formats.clouds.ply import write_ply
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.config import LocalMapConfig

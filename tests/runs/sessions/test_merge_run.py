@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from boxplus.cli.lidar.map import map_app
 from boxplus.errors import InputError, OutputError
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
 from boxplus.maps.tiles.store import TileStore

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from boxplus.errors import InputError
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings.recording import Recording
 from boxplus.report import load_report, write_report

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.evaluation.evaluation import evaluate
-from boxplus.formats.ply import read_ply
+from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions

@@ -9,18 +9,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError, OutputError
+from boxplus.formats.clouds.point_cloud import as_records
 from boxplus.formats.output import TEMPORARY_SUFFIX, output_error
-from boxplus.formats.point_cloud import as_records
 
 
 class CloudWriter(ABC):
     """Streams points to a file: memory does not grow, and the file gets its name only when it is whole.
 
-    The points go to a temporary file beside `path`. `close` writes the number of points into the header and renames it;
-    leaving a `with` block by an exception removes it instead. Whether there are intensities is settled by the first block.
+    The points go to a temporary file beside `path`. `close` completes and renames it; leaving a `with` block by an exception
+    removes it instead. Whether there are intensities is settled by the first block.
 
     Args:
         path: the file to write; one of that name is replaced.
@@ -41,16 +42,23 @@ class CloudWriter(ABC):
         except OSError as error:
             raise output_error(self.path, error) from error
 
-    @staticmethod
     @abstractmethod
-    def header(count: int, with_intensity: bool) -> bytes:
-        """The header for `count` points; its length must not depend on `count`."""
+    def _begin(self, file: BinaryIO, with_intensity: bool) -> None:
+        """Before the first block, which may not come before the end."""
+
+    @abstractmethod
+    def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
+        """Write (N, 3) or (N, 4) records: x, y, z and, where there is one, the intensity."""
+
+    @abstractmethod
+    def _finish(self, file: BinaryIO) -> None:
+        """After the last block: complete what the file says about itself."""
 
     def append(self, points: ArrayLike, intensity: ArrayLike | None = None) -> None:
         """Write a block of points.
 
         Args:
-            points: (N, 3) [m], stored as float32.
+            points: (N, 3) [m], as float32.
             intensity: (N,) or None; in every block or in none.
 
         Raises:
@@ -68,8 +76,8 @@ class CloudWriter(ABC):
         try:
             if self._with_intensity is None:
                 self._with_intensity = intensity is not None
-                file.write(self.header(0, self._with_intensity))
-            file.write(records.data)
+                self._begin(file, self._with_intensity)
+            self._write(file, records)
         except OSError as error:
             self.abort()
             raise output_error(self.path, error) from error
@@ -81,7 +89,7 @@ class CloudWriter(ABC):
         return self._file
 
     def close(self) -> None:
-        """Write the count, flush to the disk and give the file its name; safe to call twice.
+        """Complete the file, flush it to the disk and give it its name; safe to call twice.
 
         Raises:
             OutputError: the disk is full or the file cannot be written; nothing is left behind.
@@ -89,8 +97,10 @@ class CloudWriter(ABC):
         if self._file is None:
             return
         try:
-            self._file.seek(0)
-            self._file.write(self.header(self.count, bool(self._with_intensity)))
+            if self._with_intensity is None:
+                self._with_intensity = False
+                self._begin(self._file, False)
+            self._finish(self._file)
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
@@ -117,3 +127,22 @@ class CloudWriter(ABC):
             self.close()
         else:
             self.abort()
+
+
+class RecordWriter(CloudWriter):
+    """Files that are a header and then the records as they lie in memory."""
+
+    @staticmethod
+    @abstractmethod
+    def header(count: int, with_intensity: bool) -> bytes:
+        """The header for `count` points; its length must not depend on `count`."""
+
+    def _begin(self, file: BinaryIO, with_intensity: bool) -> None:
+        file.write(self.header(0, with_intensity))
+
+    def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
+        file.write(records.data)
+
+    def _finish(self, file: BinaryIO) -> None:
+        file.seek(0)
+        file.write(self.header(self.count, bool(self._with_intensity)))

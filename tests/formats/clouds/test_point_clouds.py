@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from boxplus.errors import InputError, OutputError
-from boxplus.formats.cloud_writer import CloudWriter
-from boxplus.formats.pcd import PcdWriter, read_pcd, write_pcd
-from boxplus.formats.ply import PlyWriter, ply_vertex_count, read_ply, write_ply
-from boxplus.formats.point_cloud import PointCloud
+from boxplus.formats.clouds.cloud_writer import RecordWriter
+from boxplus.formats.clouds.pcd import PcdWriter, read_pcd, write_pcd
+from boxplus.formats.clouds.ply import PlyWriter, ply_vertex_count, read_ply, write_ply
+from boxplus.formats.clouds.point_cloud import PointCloud
 
 KINDS = [pytest.param((PlyWriter, read_ply), id="ply"), pytest.param((PcdWriter, read_pcd), id="pcd")]
-Kind = tuple[type[CloudWriter], Callable[[Path], PointCloud]]
+Kind = tuple[type[RecordWriter], Callable[[Path], PointCloud]]
 blocks = st.lists(arrays(np.float32, st.tuples(st.integers(0, 5), st.just(4))), max_size=4)
 
 

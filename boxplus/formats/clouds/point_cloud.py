@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
+
+FARTHEST_M = 65_536.0
+"""Coordinates with more digits than float32 has are read as far as this: beyond, they would be moved by more than 4 mm."""
 
 HEADER_LIMIT = 64 * 1024
 """A point cloud header is shorter than this [bytes]; what is longer is no header."""
@@ -133,6 +136,24 @@ def read_text_table(file: BinaryIO, path: Path, columns: int, count: int, first_
     return np.stack(rows) if rows else np.empty((0, columns))
 
 
+def as_points(columns: Sequence[NDArray[np.generic]], path: Path) -> NDArray[np.float32]:
+    """(N, 3) float32 of the columns x, y, z.
+
+    Raises:
+        InputError: coordinates so far from the origin (of a map projection, say) that float32 would move them by millimetres.
+    """
+    for axis, values in zip("xyz", columns, strict=True):
+        if values.dtype.kind in "iu" or values.dtype.itemsize > 4:
+            farthest = float(np.max(np.abs(values[np.isfinite(values)], dtype=np.float64), initial=0.0))
+            if farthest > FARTHEST_M:
+                raise InputError(
+                    f"coordinates within {FARTHEST_M / 1e3:.0f} km of the origin, which float32 holds to 4 mm",
+                    f"{axis} up to {farthest:.1f} m ({path})",
+                    "subtract a local origin from them first",
+                )
+    return np.stack([values.astype(np.float32) for values in columns], axis=1)
+
+
 def cloud_from_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> PointCloud:
     """Pick x, y, z and intensity out of a file's columns.
 
@@ -142,8 +163,7 @@ def cloud_from_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> P
     lower = {name.lower(): values for name, values in columns.items()}
     if not {"x", "y", "z"} <= lower.keys():
         raise InputError("points with x, y and z", f"{', '.join(columns) or 'nothing'} ({path})", "name the coordinates x, y, z")
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite
-        points = np.stack([lower[axis].astype(np.float32) for axis in "xyz"], axis=1)
+    points = as_points([lower[axis] for axis in "xyz"], path)
     for name in ("intensity", "scalar_intensity", "reflectivity", "i"):
         if name in lower:
             return PointCloud(points, np.ascontiguousarray(lower[name], dtype=np.float32))

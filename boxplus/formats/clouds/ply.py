@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.cloud_writer import CloudWriter
-from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
+from boxplus.formats.clouds.cloud_writer import RecordWriter
+from boxplus.formats.clouds.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
@@ -37,7 +37,7 @@ class _Element:
     lists: list[str]  # properties of variable length
 
 
-class PlyWriter(CloudWriter):
+class PlyWriter(RecordWriter):
     """Streams points (float32 x, y, z and optionally intensity) to a binary little-endian PLY file."""
 
     @staticmethod

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.cloud_writer import CloudWriter
-from boxplus.formats.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
+from boxplus.formats.clouds.cloud_writer import RecordWriter
+from boxplus.formats.clouds.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
 
 _KNOWN = {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-class PcdWriter(CloudWriter):
+class PcdWriter(RecordWriter):
     """Streams points (float32 x, y, z and optionally intensity) to a binary PCD file."""
 
     @staticmethod

@@ -1,0 +1,132 @@
+"""LAS and LAZ point clouds (version 1.4, point format 6) through laspy and lazrs, the extra `las`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from boxplus.errors import InputError, OutputError
+from boxplus.formats.clouds.cloud_writer import CloudWriter
+from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
+
+_EXACT = "intensity_exact"
+_SCALE = 1e-4  # m: LAS keeps coordinates as whole multiples of it
+_FARTHEST = _SCALE * (2**31 - 1)
+_LARGEST = 65_535  # of LAS' own intensity
+
+
+class LasWriter(CloudWriter):
+    """Streams points to a LAS file, compressed where the name ends in .laz.
+
+    Coordinates are kept to 0.05 mm, in the frame they come in: the file names no coordinate reference system. LAS has whole
+    intensities from 0 to 65535; beside the rounded one each point keeps its own as `intensity_exact`.
+
+    Args:
+        path: the file to write; one of that name is replaced.
+
+    Raises:
+        InputError: laspy or lazrs is not installed.
+        OutputError: the file cannot be created.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._laspy = _import()
+        super().__init__(path)
+        self._writer: Any = None
+
+    def _begin(self, file: BinaryIO, with_intensity: bool) -> None:
+        header = self._laspy.LasHeader(version="1.4", point_format=6)
+        header.scales, header.offsets = np.full(3, _SCALE), np.zeros(3)
+        header.generating_software = "boxplus"
+        if with_intensity:
+            header.add_extra_dim(self._laspy.ExtraBytesParams(_EXACT, "f4", "intensity, not rounded"))
+        compressed = self.path.suffix.lower() == ".laz"
+        self._writer = self._laspy.open(file, mode="w", header=header, do_compress=compressed, closefd=False)
+
+    def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
+        xyz = records[:, :3].astype(np.float64)
+        if not np.abs(xyz).max(initial=0.0) < _FARTHEST:
+            self.abort()
+            raise InputError(
+                f"finite coordinates within {_FARTHEST / 1e3:.0f} km of the origin", "others", "write the points as PLY or PCD"
+            )
+        if not len(xyz):
+            return
+        points = self._laspy.ScaleAwarePointRecord.zeros(len(xyz), header=self._writer.header)
+        points.x, points.y, points.z = xyz.T
+        points.return_number[:] = 1
+        points.number_of_returns[:] = 1
+        if self._with_intensity:
+            points.intensity = np.clip(np.nan_to_num(np.round(records[:, 3])), 0, _LARGEST).astype(np.uint16)
+            points[_EXACT] = records[:, 3]
+        with self._explained():
+            self._writer.write_points(points)
+
+    def _finish(self, file: BinaryIO) -> None:
+        with self._explained():
+            self._writer.close()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """The compressor has an error of its own for what the disk says."""
+        import lazrs
+
+        try:
+            yield
+        except lazrs.LazrsError as error:
+            self.abort()
+            raise OutputError(f"expected to write {self.path} – got {error} – check the disk and the folder") from error
+
+
+def write_las(path: str | Path, points: ArrayLike, intensity: ArrayLike | None = None) -> None:
+    """Write (N, 3) points [m] and optional (N,) intensities to a LAS or LAZ file in one go; see `LasWriter`.
+
+    Raises:
+        InputError: shapes that do not match, or laspy is not installed.
+        OutputError: the file cannot be written.
+    """
+    with LasWriter(path) as writer:
+        writer.append(points, intensity)
+
+
+def read_las(path: str | Path) -> PointCloud:
+    """Read the points of a LAS or LAZ file; intensities where they are not all zero.
+
+    Raises:
+        InputError: laspy is not installed; the file is missing, cut or malformed; coordinates that float32 cannot hold.
+    """
+    laspy, source = _import(), Path(path)
+    with opened(source, "LAS") as file:
+        try:
+            cloud = laspy.read(file, closefd=False)
+            found = len(cloud.points)
+            columns = [np.asarray(cloud.x), np.asarray(cloud.y), np.asarray(cloud.z)]
+            exact = _EXACT in cloud.point_format.extra_dimension_names
+            intensity = np.asarray(cloud[_EXACT] if exact else cloud.intensity, dtype=np.float32)
+        except _faults() as error:
+            raise InputError("a whole LAS or LAZ file", f"{path}: {error}", "give another file, or write it again") from error
+    if found != cloud.header.point_count:
+        raise InputError(f"{cloud.header.point_count} points, as the header says", f"{found} ({path})", "the file was cut")
+    return PointCloud(as_points(columns, source), intensity if exact or intensity.any() else None)
+
+
+def _import() -> Any:
+    try:
+        import laspy
+        import lazrs  # noqa: F401  laspy finds it by itself
+    except ImportError as error:
+        raise InputError("laspy and lazrs, for LAS and LAZ", "an installation without", "pip install 'boxplus[las]'") from error
+    return laspy
+
+
+def _faults() -> tuple[type[BaseException], ...]:
+    """What laspy and lazrs raise about a file that is not right."""
+    import lazrs
+    from laspy.errors import LaspyException
+
+    return LaspyException, lazrs.LazrsError, ValueError, OverflowError, MemoryError, KeyError, AttributeError, EOFError
