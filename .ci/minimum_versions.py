@@ -23,8 +23,11 @@ UNREACHABLE = re.compile(r"NewConnectionError|Max retries|ConnectTimeout|ReadTim
 SMOKE = """
 import sys
 from pathlib import Path
+import numpy as np
 import boxplus
 from boxplus.cli import app
+from boxplus.formats.clouds.cloud_file import cloud_writer, read_cloud
+from boxplus.formats.geotiff import write_geotiff
 from boxplus.recordings import open_recording
 from boxplus.simulation import SpinningLidar, simulate, write_recording
 
@@ -41,6 +44,13 @@ commands = (
     ["pgo", str(folder / "square.g2o"), "-o", str(folder / "graph")],
     ["inspect", str(next(folder.glob("ros1*")))],
 )
+points = np.arange(30.0).reshape(10, 3)
+for ending in ("las", "laz", "e57"):
+    with cloud_writer(folder / f"a.{ending}") as writer:
+        writer.append(points, points[:, 0])
+    cloud = read_cloud(folder / f"a.{ending}")
+    assert np.allclose(cloud.points, points) and np.allclose(cloud.intensity, points[:, 0]), ending
+write_geotiff(folder / "a.tif", points, 0.5, (0.0, 0.0), projection="+proj=tmerc +lat_0=48 +lon_0=11 +datum=WGS84")
 for command in commands:
     try:
         app(command, prog_name="boxplus")
@@ -49,11 +59,15 @@ for command in commands:
 """
 
 
+EXTRAS = ("las", "e57", "geo")
+"""Optional dependencies that the smoke test uses as well."""
+
+
 def minima() -> list[str]:
-    """The declared dependencies, each at its lower bound."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    """The declared dependencies and those of `EXTRAS`, each at its lower bound."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     pinned = []
-    for requirement in declared:
+    for requirement in sum((project["optional-dependencies"][name] for name in EXTRAS), project["dependencies"]):
         bound = re.fullmatch(r"([\w.-]+)\s*>=\s*([\w.]+)((?:\s*,[^;]*)?)\s*(;.*)?", requirement)
         if bound is None:
             sys.exit(f"pyproject.toml: expected NAME>=VERSION - got {requirement!r} - declare a lower bound")
