@@ -23,6 +23,10 @@ class Radial:
 
     Raises:
         InputError: a coefficient is not finite.
+
+    Example:
+        >>> bp.Radial(-0.1, 0.01).coefficients
+        (-0.1, 0.01)
     """
 
     k1: float
@@ -43,6 +47,10 @@ class RadialTangential:
 
     Raises:
         InputError: a coefficient is not finite.
+
+    Example:
+        >>> bp.RadialTangential(-0.283, 0.0739, 1.9e-4, 1.8e-5).coefficients
+        (-0.283, 0.0739, 0.00019, 1.8e-05)
     """
 
     k1: float

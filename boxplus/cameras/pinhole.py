@@ -138,6 +138,15 @@ class Pinhole:
 
     Raises:
         InputError: a number is not finite, a focal length not positive, `z_min` negative.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0, bp.Radial(-0.1, 0.01))
+        >>> pixels, seen = camera.project([[0.2, 0.0, 2.0], [0.0, 0.0, -1.0]])  # ahead, and behind
+        >>> pixels[0].round(2), seen
+        (array([369.95, 240.  ]), array([ True, False]))
+        >>> rays, found = camera.unproject(pixels[:1], depth=2.0)
+        >>> rays.round(6)
+        array([[0.2, 0. , 2. ]])
     """
 
     code: ClassVar[int] = PINHOLE

@@ -149,7 +149,7 @@ class Equidistant(_WideAngle):
         InputError: a number is not finite, a focal length not positive, `nearest` negative.
 
     Example:
-        >>> camera = Equidistant(190.98, 190.97, 254.93, 256.90, 3.48e-3, 7.15e-4, -2.05e-3, 2.03e-4)
+        >>> camera = bp.Equidistant(190.98, 190.97, 254.93, 256.90, 3.48e-3, 7.15e-4, -2.05e-3, 2.03e-4)
         >>> pixels, seen = camera.project([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])     # sideways, and straight behind
         >>> seen.tolist()
         [True, False]
@@ -195,7 +195,7 @@ class DoubleSphere(_WideAngle):
         InputError: a number is not finite or outside of its range, a focal length not positive, `nearest` negative.
 
     Example:
-        >>> camera = DoubleSphere(349.56, 349.53, 365.89, 249.31, xi=-0.2409, alpha=0.5658)
+        >>> camera = bp.DoubleSphere(349.56, 349.53, 365.89, 249.31, xi=-0.2409, alpha=0.5658)
         >>> bearings, found = camera.bearings([[365.89, 249.31]])
         >>> bearings.tolist(), found.tolist()
         ([[0.0, 0.0, 1.0]], [True])

@@ -53,6 +53,12 @@ class Evaluation:
         rotation_error_deg: (M,) absolute rotation errors [degrees].
         relative: relative pose errors, one for every delta that the trajectory is long enough for.
         warnings: what to doubt about the numbers, one sentence each.
+
+    Example:
+        >>> truth = bp.read_trajectory("flight.gt.tum")
+        >>> result = bp.evaluate(truth, truth, alignment="none")
+        >>> result.ate.rmse, float(result.translation_error_m.max())
+        (0.0, 0.0)
     """
 
     association: Association
@@ -187,6 +193,12 @@ def evaluate(
     Raises:
         InputError: a comparison that would mean nothing: no overlap in time, too few matches, another unit of time or
             length, positions that do not determine the alignment.
+
+    Example:
+        >>> truth = bp.read_trajectory("flight.gt.tum")
+        >>> result = bp.evaluate(truth, truth, alignment="none")
+        >>> result.ate.rmse
+        0.0
     """
 
     def matches(offset_s: float) -> Association:

@@ -90,8 +90,7 @@ def iterated_update(
         max_iterations: most steps after the first.
         min_used: fewest parts of the measurement that make an update.
 
-    Example:
-        >>> posterior = iterated_update(x, cov, PlaneMeasurement(points, tree, config, with_extrinsic=False))
+    A scan against the map: `iterated_update(x, cov, PlaneMeasurement(points, tree, config, with_extrinsic=False))`.
     """
     x = x_prior.copy()
     delta = np.zeros(TANGENT)

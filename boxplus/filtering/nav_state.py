@@ -57,6 +57,13 @@ class NavState:
         gravity_world: (3,) float64 [m/s²], pointing down.
         R_imu_lidar: (3, 3) float64.
         p_imu_lidar: (3,) float64, origin of the LiDAR in the IMU frame [m].
+
+    Example:
+        >>> zero = np.zeros(3)
+        >>> state = bp.NavState(np.eye(3), zero, zero, zero, zero, np.array([0.0, 0.0, -9.81]), np.eye(3), zero)
+        >>> moved = state.boxplus(np.eye(24)[3])  # a metre along x
+        >>> moved.p_world_imu.tolist(), float(moved.boxminus(state)[3])
+        ([1.0, 0.0, 0.0], 1.0)
     """
 
     R_world_imu: NDArray[np.float64]

@@ -50,6 +50,11 @@ class Trajectory:
     Raises:
         InputError: on construction, when shapes do not match, a value is not finite, a quaternion is not of unit length
             (within 1e-2; closer ones are normalised) or the times do not increase. The message names source and line.
+
+    Example:
+        >>> way = bp.Trajectory(np.array([0, 10**9]), np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[1.0, 0, 0, 0]] * 2))
+        >>> len(way.p), way.status
+        (2, None)
     """
 
     time_ns: NDArray[np.int64] | None
@@ -183,6 +188,11 @@ def read_trajectory(path: str | Path, format: Format | Literal["auto"] = "auto")
 
     Raises:
         InputError: the file is missing, empty, not text, or a line is malformed; the message names file and line.
+
+    Example:
+        >>> truth = bp.read_trajectory("flight.gt.tum")  # the format is told by the columns
+        >>> truth.p.shape[1], bool((np.diff(truth.time_ns) > 0).all())
+        (3, True)
     """
     table = read_table(Path(path), format)
     if table is not None:
@@ -310,6 +320,12 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         InputError: the trajectory has no time stamps.
         OutputError: the file cannot be written.
+
+    Example:
+        >>> way = bp.Trajectory(np.array([0, 10**9]), np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[1.0, 0, 0, 0]] * 2))
+        >>> bp.formats.write_tum("way.tum", way)
+        >>> bp.read_trajectory("way.tum").time_ns.tolist()
+        [0, 1000000000]
     """
     times = trajectory.times.tolist()
     with atomic_file(path) as file:
@@ -321,6 +337,12 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> way = bp.Trajectory(np.array([0, 10**9]), np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[1.0, 0, 0, 0]] * 2))
+        >>> bp.formats.write_kitti("way.txt", way)
+        >>> bp.read_trajectory("way.txt").time_ns is None  # the format has no times
+        True
     """
     with atomic_file(path) as file:
         file.writelines(kitti_row(*row).encode() for row in zip(trajectory.R, trajectory.p, strict=True))
@@ -332,6 +354,12 @@ def write_csv(path: str | Path, trajectory: Trajectory) -> None:
     Raises:
         InputError: the trajectory has no time stamps.
         OutputError: the file cannot be written.
+
+    Example:
+        >>> way = bp.Trajectory(np.array([0, 10**9]), np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[1.0, 0, 0, 0]] * 2))
+        >>> bp.formats.write_csv("way.csv", way)
+        >>> bp.read_trajectory("way.csv").p.tolist()
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
     times = trajectory.times.tolist()
     covariance = trajectory.covariance

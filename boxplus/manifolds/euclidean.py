@@ -19,6 +19,13 @@ class Euclidean(KernelManifold):
 
     Raises:
         InputError: n is not a positive whole number.
+
+    Example:
+        >>> plane = bp.Euclidean(2)
+        >>> plane.boxplus([1.0, 2.0], [0.5, 0.0])
+        array([1.5, 2. ])
+        >>> bp.Euclidean(2) == plane, plane.tangent_names
+        (True, ('x', 'y'))
     """
 
     n: int

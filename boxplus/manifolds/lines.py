@@ -112,7 +112,14 @@ def from_points(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, repr=False)
 class _Line3D(KernelManifold):
-    """Lines (5,) moved by [θ, δ] (4,): U Exp(θ), phi + δ. Opposite directions of a line are different points."""
+    """Lines (5,) moved by [θ, δ] (4,): U Exp(θ), phi + δ. Opposite directions of a line are different points.
+
+    Example:
+        >>> from boxplus.manifolds import lines
+        >>> line = lines.from_points([0.0, 0.0, 1.0], [1.0, 0.0, 1.0])  # along x, at z = 1
+        >>> line.shape, bp.Line3D.boxminus(line, line)
+        ((5,), array([0., 0., 0., 0.]))
+    """
 
     name = "Line3D"
     size = 5

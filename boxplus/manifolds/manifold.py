@@ -19,6 +19,10 @@ class Manifold(ABC):
         size: numbers stored for a point.
         dof: numbers of a tangent, and degrees of freedom.
         tangent_names: (dof,) what each tangent direction moves, with its unit, for messages, such as `rotation x [rad]`.
+
+    Example:
+        >>> bp.SE2.boxminus(bp.SE2.boxplus([0.0, 1.0, 2.0], [0.1, 0.0, 0.0]), [0.0, 1.0, 2.0])
+        array([0.1, 0. , 0. ])
     """
 
     name: str

@@ -18,6 +18,13 @@ class Product(KernelManifold):
 
     Raises:
         InputError: no component, or one that is no manifold.
+
+    Example:
+        >>> body = bp.Product(bp.UnitQuaternion, bp.Euclidean(3))
+        >>> body.size, body.dof
+        (7, 6)
+        >>> body.boxplus(body.identity(), [0.0, 0.0, 0.0, 1.0, 2.0, 3.0])
+        array([1., 0., 0., 0., 1., 2., 3.])
     """
 
     def __init__(self, *components: Manifold) -> None:

@@ -150,7 +150,12 @@ def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDAr
 
 @dataclass(frozen=True, repr=False)
 class _UnitQuaternion(KernelManifold):
-    """Rotations stored wxyz (4,), moved by rotation vectors (3,) on the right: q ⊗ Exp_q(w)."""
+    """Rotations stored wxyz (4,), moved by rotation vectors (3,) on the right: q ⊗ Exp_q(w).
+
+    Example:
+        >>> bp.UnitQuaternion.boxplus([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(3)
+        array([0.707, 0.   , 0.   , 0.707])
+    """
 
     name = "UnitQuaternion"
     size = 4

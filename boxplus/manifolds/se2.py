@@ -194,7 +194,12 @@ def left_jacobian_inverse(xi: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, repr=False)
 class _SE2(KernelManifold):
-    """Poses [theta, x, y] (3,) moved by [w, vx, vy] (3,) on the right: T Exp(ξ)."""
+    """Poses [theta, x, y] (3,) moved by [w, vx, vy] (3,) on the right: T Exp(ξ).
+
+    Example:
+        >>> bp.SE2.boxplus([np.pi / 2, 1.0, 0.0], [0.0, 2.0, 0.0]).round(3)  # theta, x, y: two metres ahead
+        array([1.571, 1.   , 2.   ])
+    """
 
     name = "SE2"
     size = 3

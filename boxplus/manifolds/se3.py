@@ -261,7 +261,15 @@ def adjoint(T: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, repr=False)
 class _SE3(KernelManifold):
-    """Poses (7,) moved by [w, v] (6,): T Exp(ξ), or Exp(ξ) T where `is_left`."""
+    """Poses (7,) moved by [w, v] (6,): T Exp(ξ), or Exp(ξ) T where `is_left`.
+
+    Example:
+        >>> T = bp.SE3.boxplus(bp.SE3.identity(), [0.0, 0.0, np.pi / 2, 1.0, 0.0, 0.0])  # turn and go at once, seen in the body
+        >>> T.round(3)
+        array([0.707, 0.   , 0.   , 0.707, 0.637, 0.637, 0.   ])
+        >>> bp.SE3.boxminus(T, bp.SE3.identity()).round(3)
+        array([0.   , 0.   , 1.571, 1.   , 0.   , 0.   ])
+    """
 
     name: str
     is_left: bool

@@ -245,7 +245,15 @@ def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDAr
 
 @dataclass(frozen=True, repr=False)
 class _SO3(KernelManifold):
-    """Rotation matrices stored row by row (9,), moved by rotation vectors (3,) on the right: R Exp(w)."""
+    """Rotation matrices stored row by row (9,), moved by rotation vectors (3,) on the right: R Exp(w).
+
+    Example:
+        >>> R = bp.SO3.boxplus(bp.SO3.identity(), [0.0, 0.0, np.pi / 2])
+        >>> R.reshape(3, 3).round(3)
+        array([[ 0., -1.,  0.],
+               [ 1.,  0.,  0.],
+               [ 0.,  0.,  1.]])
+    """
 
     name = "SO3"
     size = 9

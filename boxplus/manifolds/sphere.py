@@ -108,7 +108,13 @@ def tangent_basis(x: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, repr=False)
 class _S2(KernelManifold):
-    """Unit vectors (3,) moved along great circles by two angles."""
+    """Unit vectors (3,) moved along great circles by two angles.
+
+    Example:
+        >>> up = bp.S2.boxplus([0.0, 0.0, 1.0], [np.pi / 2, 0.0])
+        >>> up.round(3), bp.S2.boxminus(up, [0.0, 0.0, 1.0]).round(3)
+        (array([1., 0., 0.]), array([1.571, 0.   ]))
+    """
 
     name = "S2"
     size = 3

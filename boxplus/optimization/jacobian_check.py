@@ -133,6 +133,13 @@ def check_jacobian(
     Raises:
         InputError: wrong number of variables, shapes, manifolds that do not change into each other, a step that is not
             positive.
+
+    Example:
+        >>> residual = bp.residuals.RelativePose([[1.0, 0, 0, 0, 1.0, 0, 0]])
+        >>> T = bp.SE3.random(np.random.default_rng(0), 2)
+        >>> report = bp.check_jacobian(residual, T[:1], T[1:])
+        >>> report.passed
+        True
     """
     moved = tuple(residual.manifolds if manifolds is None else manifolds)
     if len(moved) != len(residual.manifolds):

@@ -26,7 +26,12 @@ _LEAST_CURVATURE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """A loss by its code and its scale c, in standard deviations of the whitened residual."""
+    """A loss by its code and its scale c, in standard deviations of the whitened residual.
+
+    Example:
+        >>> bp.losses.Huber(1.5).with_scale(3.0)
+        Huber(3)
+    """
 
     code: int
     scale: float
@@ -54,37 +59,72 @@ def _loss(code: int, scale: float, name: str) -> Loss:
 
 
 def Squared() -> Loss:
-    """ρ = s: least squares."""
+    """ρ = s: least squares.
+
+    Example:
+        >>> bp.losses.Squared(), bp.losses.Squared().is_redescending
+        (Squared, False)
+    """
     return Loss(SQUARED, 1.0, "Squared")
 
 
 def Huber(scale: float) -> Loss:
-    """ρ = s up to c², then 2c√s − c²: large residuals count linearly (Huber 1964)."""
+    """ρ = s up to c², then 2c√s − c²: large residuals count linearly (Huber 1964).
+
+    Example:
+        >>> bp.losses.Huber(1.5), bp.losses.Huber(1.5).is_redescending
+        (Huber(1.5), False)
+    """
     return _loss(HUBER, scale, "Huber")
 
 
 def Cauchy(scale: float) -> Loss:
-    """ρ = c² ln(1 + s/c²): large residuals count by their logarithm (Cauchy's or Lorentz' distribution)."""
+    """ρ = c² ln(1 + s/c²): large residuals count by their logarithm (Cauchy's or Lorentz' distribution).
+
+    Example:
+        >>> bp.losses.Cauchy(1.0), bp.losses.Cauchy(1.0).is_redescending
+        (Cauchy(1), True)
+    """
     return _loss(CAUCHY, scale, "Cauchy")
 
 
 def Tukey(scale: float) -> Loss:
-    """ρ = c²/3 (1 − (1 − s/c²)³) up to c², then c²/3: residuals beyond c do not count at all (Beaton and Tukey 1974)."""
+    """ρ = c²/3 (1 − (1 − s/c²)³) up to c², then c²/3: residuals beyond c do not count at all (Beaton and Tukey 1974).
+
+    Example:
+        >>> bp.losses.Tukey(4.7), bp.losses.Tukey(4.7).is_redescending
+        (Tukey(4.7), True)
+    """
     return _loss(TUKEY, scale, "Tukey")
 
 
 def GemanMcClure(scale: float) -> Loss:
-    """ρ = c² s/(c² + s): never costs more than c² (Geman and McClure 1987); `graduate` starts from afar with it."""
+    """ρ = c² s/(c² + s): never costs more than c² (Geman and McClure 1987); `graduate` starts from afar with it.
+
+    Example:
+        >>> bp.losses.GemanMcClure(1.0), bp.losses.GemanMcClure(1.0).is_redescending
+        (GemanMcClure(1), True)
+    """
     return _loss(GEMAN_MCCLURE, scale, "GemanMcClure")
 
 
 def Welsch(scale: float) -> Loss:
-    """ρ = c² (1 − exp(−s/c²)): never costs more than c² (Dennis and Welsch 1978)."""
+    """ρ = c² (1 − exp(−s/c²)): never costs more than c² (Dennis and Welsch 1978).
+
+    Example:
+        >>> bp.losses.Welsch(3.0), bp.losses.Welsch(3.0).is_redescending
+        (Welsch(3), True)
+    """
     return _loss(WELSCH, scale, "Welsch")
 
 
 def Truncated(scale: float) -> Loss:
-    """ρ = s up to c², then c²: least squares over the residuals within c, where the others cost as much as the last of these."""
+    """ρ = s up to c², then c²: least squares over the residuals within c, where the others cost as much as the last of these.
+
+    Example:
+        >>> bp.losses.Truncated(2.0), bp.losses.Truncated(2.0).is_redescending
+        (Truncated(2), True)
+    """
     return _loss(TRUNCATED, scale, "Truncated")
 
 

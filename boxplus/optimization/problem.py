@@ -40,6 +40,13 @@ class Problem:
     The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. Variables and
     residuals may come and go (`extend`, `remove`, `boxplus.marginalize`); what stays keeps its name. One thread at a time may use
     a problem, its solving included; a second one is refused (InputError).
+
+    Example:
+        >>> problem = bp.Problem()
+        >>> x = problem.add_variables(bp.Euclidean(1), [0.0], name="x")
+        >>> measured = problem.add_residuals(bp.residuals.Prior(bp.Euclidean(1), [2.0], sigma=0.1), x, name="measured")
+        >>> problem.solve()[x].round(6)
+        array([[2.]])
     """
 
     def __init__(self) -> None:
@@ -110,16 +117,13 @@ class Problem:
 
     @changes
     def extend(self, block: Variables, values: ArrayLike) -> VariableRows:
-        """Add variables to a block; returns them. The ids of the others stay.
+        """Add variables to a block, `newest = problem.extend(poses, T_world_imu)`; returns them. The ids of the others stay.
 
         Args:
             values: (n, size) where they start; (size,) for a single one.
 
         Raises:
             InputError: a block of another problem; wrong shape, not finite, off the manifold.
-
-        Example:
-            `newest = problem.extend(poses, T_world_imu)`
         """
         self._require_own(block[:])
         self._analysed = None
@@ -131,16 +135,13 @@ class Problem:
 
         What was known about variables through those that go is lost; `boxplus.marginalize` keeps it. Ids and rows of what
         stays do not change. A group without residuals leaves the problem; solutions from before have values, but no
-        covariances any more.
+        covariances any more. `problem.remove(pixels[is_outlier], points[lost])` does both.
 
         Returns:
             For every group that lost some, by name, how many residuals.
 
         Raises:
             InputError: something of another problem; a variable that a marginal prior knows, which cannot forget it.
-
-        Example:
-            `problem.remove(pixels[is_outlier], points[lost])`
         """
         if all(isinstance(part, Group) for part in leaving):
             return self._remove_groups(leaving)

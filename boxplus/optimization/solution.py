@@ -57,6 +57,18 @@ class Solution:
         faded: for every group with a robust loss the share of its residuals whose weight ρ′ is below 0.1 at the end.
         notes: what a user should know (assumptions, fixed gauge, residuals that hardly count).
         timing_s: seconds by stage: analysis, residuals and Jacobians, normal equations, linear solve, total.
+
+    Example:
+        >>> problem = bp.Problem()
+        >>> poses = problem.add_variables(bp.SE2, [[0.0, 0.0, 0.0], [0.1, 0.9, 0.0]], name="poses")
+        >>> odometry = problem.add_residuals(bp.residuals.RelativePose2D([0.0, 1.0, 0.0], sigma=0.1), poses[0], poses[1])
+        >>> problem.fix(poses[0])
+        >>> solution = problem.solve()
+        >>> solution.status, solution.linear_solver
+        ('converged', 'dense Cholesky of 3 degrees of freedom')
+        >>> solution.standard_deviations(poses).round(3)
+        array([[0. , 0. , 0. ],
+               [0.1, 0.1, 0.1]])
     """
 
     status: Literal["converged", "stopped", "stalled"]

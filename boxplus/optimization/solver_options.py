@@ -15,7 +15,12 @@ Elimination = Literal["auto", "dense", "sparse", "schur"]
 
 
 class SolverOptions(BaseModel):
-    """Options of `Problem.solve`."""
+    """Options of `Problem.solve`.
+
+    Example:
+        >>> bp.SolverOptions(method="dogleg", max_iterations=20).threads
+        1
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

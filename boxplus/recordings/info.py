@@ -26,6 +26,11 @@ class Evidence:
         text: one sentence with the numbers, and what to do if it is not fine.
 
     Value and text may quote a file; what would steer a terminal is written out in them (`boxplus.errors.printable`).
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     print([finding.value for finding in recording.info.evidence if finding.key == "point_time_unit"])
+        ['s']
     """
 
     key: str
@@ -40,7 +45,13 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One stream of messages of a recording."""
+    """One stream of messages of a recording.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     print(sorted(topic.type for topic in recording.info.topics))
+        ['sensor_msgs/Imu', 'sensor_msgs/PointCloud2', 'tf2_msgs/TFMessage']
+    """
 
     name: str
     type: str
@@ -57,6 +68,11 @@ class PointTimeReading:
         reference: instant from which they count.
         anchor: what is added to the values: `stamp` (times relative to the message's stamp), `first` or `last` (the first
             or last point of each scan is moved onto the stamp), `clock` (the values are absolute).
+
+    Example:
+        >>> from boxplus.recordings import PointTimeReading
+        >>> PointTimeReading("t", "ns", "scan_start", "stamp").unit  # nanoseconds since the stamp, in a field t
+        'ns'
     """
 
     field: str | None
@@ -75,6 +91,12 @@ class OtherLidarInfo:
         T_lidar_other: (4, 4) float64, its coordinates to those of the first LiDAR; source: where that comes from.
         time_offset_s: added to its times [s].
         messages: that will be read.
+
+    Example:
+        >>> from boxplus.recordings import OtherLidarInfo, PointTimeReading
+        >>> reading = PointTimeReading("t", "ns", "scan_start", "stamp")
+        >>> OtherLidarInfo("/rear", "rear", reading, np.eye(4), "given", 0.0, 120).source
+        'given'
     """
 
     topic: str
@@ -114,6 +136,12 @@ class RecordingInfo:
         evidence: every decision with its reasons; grows while a damaged file is read.
         stamp_delay_s: median time from the stamp of a cloud to its reception, where it is known [s].
         other_lidars: those that are merged with the first one.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     info = recording.info
+        >>> info.lidar_topic, info.imu_topic, info.accel_unit, info.T_imu_lidar.shape
+        ('/lidar/points', '/imu/data', 'm/s2', (4, 4))
     """
 
     path: Path

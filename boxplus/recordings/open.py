@@ -24,6 +24,12 @@ def open_recording(path: str | Path, options: RecordingOptions | None = None) ->
     Raises:
         RecordingError: no such file, unknown format, missing topics or point times, unreadable.
         AmbiguityError: two readings fit; the message names the option that decides.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     scans = sum(isinstance(event, bp.Scan) for event in recording)
+        ...     print(recording.info.format, recording.info.point_time.unit, scans)
+        ROS 1 bag s 19
     """
     options = options or RecordingOptions()
     recording = _open(Path(path), options)

@@ -29,6 +29,12 @@ class OtherLidar(BaseModel):
     """A LiDAR beside the first one, to be merged with it (docs/several_lidars.md). Only its topic has to be given.
 
     A text stands for its topic, or, in braces, for all of it in YAML: `{topic: /rear, time_offset_s: 0.05}`.
+
+    Example:
+        >>> from boxplus.recordings import OtherLidar
+        >>> rear = OtherLidar(topic="/rear", time_offset_s=0.01)
+        >>> bp.RecordingOptions(lidar_topic="/front", other_lidars=(rear,)).other_lidars[0].topic
+        '/rear'
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -76,6 +82,11 @@ class RecordingOptions(BaseModel):
     """How to read a recording. None means: find it from the data, and refuse when two readings fit.
 
     The command line's options are these fields.
+
+    Example:
+        >>> options = bp.RecordingOptions(min_range=1.0, duration_s=60.0)
+        >>> options.min_range, options.lidar_topic
+        (1.0, None)
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -143,6 +143,12 @@ class Recording(EventStream[RecordingInfo, Event]):
 
     Every iteration starts at the beginning and resets the counters. Times are those of the messages' stamps; neither their
     order nor gaps are touched, that is the sequencer's business.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     kinds = {type(event).__name__ for event in recording}  # every iteration begins at the beginning
+        ...     print(sorted(kinds), recording.rejected)
+        ['ImuSamples', 'Scan'] {}
     """
 
     delivers = "scans and IMU samples"

@@ -33,6 +33,13 @@ class AnchoredRelativePose(Residual):
 
     Raises:
         InputError: wrong shapes, quaternions not of unit length, noise that is not positive.
+
+    Example:
+        >>> identity = bp.SE3.identity()
+        >>> edge = bp.residuals.AnchoredRelativePose([[1.0, 0, 0, 0, 1.0, 0, 0]], sigma=0.1)
+        >>> there = bp.SE3.boxplus(identity, [0, 0, 0, 1.0, 0, 0])
+        >>> edge.evaluate(identity, identity, there, identity)  # anchor and pose of each session
+        array([[0., 0., 0., 0., 0., 0.]])
     """
 
     def __init__(

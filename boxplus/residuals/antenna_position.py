@@ -104,6 +104,12 @@ class AntennaPosition(Residual):
         InputError: arrays of another shape, of different length or not finite; noise that `Whitening.of` refuses.
 
     Example: docs/residuals/antenna_position.md
+
+    Example:
+        >>> fixes = bp.residuals.AntennaPosition([[1.0, 2.0, 3.5]], sigma=[0.5, 0.5, 1.0])
+        >>> pose = [1.0, 0, 0, 0, 1.0, 2.0, 3.0]  # of the body; the antenna is half a metre above
+        >>> fixes.evaluate(bp.SE3.identity(), pose, [0.0, 0.0, 0.5], [0.0])
+        array([[0., 0., 0.]])
     """
 
     def __init__(

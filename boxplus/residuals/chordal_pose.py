@@ -44,6 +44,11 @@ def chordal_weights(information: ArrayLike) -> tuple[NDArray[np.float64], NDArra
 
     Raises:
         InputError: another shape, or a block that is singular.
+
+    Example:
+        >>> kappa, tau = bp.residuals.chordal_weights(np.diag([400.0, 400.0, 400.0, 100.0, 100.0, 100.0])[None])
+        >>> kappa.round(3), tau.round(3)
+        (array([200.]), array([100.]))
     """
     Omega = as_floats(information, "information")
     if Omega.ndim != 3 or Omega.shape[1:] not in ((6, 6), (3, 3)):
@@ -181,6 +186,12 @@ class ChordalPose(_Chordal):
 
     Raises:
         InputError: wrong shapes, quaternions not of unit length, weights that are not positive.
+
+    Example:
+        >>> T = bp.SE3.boxplus(bp.SE3.identity(), [0, 0, 0.1, 1.0, 0, 0])
+        >>> edge = bp.residuals.ChordalPose([T], kappa=100.0, tau=10.0)
+        >>> edge.evaluate(bp.SE3.identity(), T).shape, bool(np.allclose(edge.evaluate(bp.SE3.identity(), T), 0.0))
+        ((1, 12), True)
     """
 
     def __init__(self, measured: ArrayLike, *, kappa: ArrayLike = 1.0, tau: ArrayLike = 1.0) -> None:
@@ -203,6 +214,11 @@ class ChordalPose2D(_Chordal):
 
     Raises:
         InputError: wrong shapes, not finite, weights that are not positive.
+
+    Example:
+        >>> edge = bp.residuals.ChordalPose2D([[0.0, 1.0, 0.0]], kappa=100.0, tau=10.0)
+        >>> edge.evaluate([0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+        array([[0., 0., 0., 0., 0., 0.]])
     """
 
     def __init__(self, measured: ArrayLike, *, kappa: ArrayLike = 1.0, tau: ArrayLike = 1.0) -> None:

@@ -36,6 +36,13 @@ class Gicp(PointToPoint):
 
     Raises:
         InputError: arrays of another shape, not finite, or a sum of covariances that is not positive definite.
+
+    Example:
+        >>> points = np.random.default_rng(0).normal(size=(10, 3))
+        >>> flat = bp.residuals.plane_covariances(np.tile([0.0, 0.0, 1.0], (10, 1)))
+        >>> gicp = bp.residuals.Gicp(points, points + [0.0, 0.0, 0.1], flat, flat)
+        >>> gicp.evaluate(bp.SE3.identity())[0].round(6) + 0.0
+        array([ 0. ,  0. , -0.1])
     """
 
     def __init__(
@@ -72,6 +79,12 @@ def plane_covariances(normals: ArrayLike, *, along: float = 1.0, across: float =
 
     Raises:
         InputError: normals that are not of unit length, or variances that are not positive.
+
+    Example:
+        >>> bp.residuals.plane_covariances([[0.0, 0.0, 1.0]]).round(4)
+        array([[[1.   , 0.   , 0.   ],
+                [0.   , 1.   , 0.   ],
+                [0.   , 0.   , 0.001]]])
     """
     if not (np.isfinite([along, across]).all() and min(along, across) > 0.0):
         raise InputError("positive variances", f"along {along}, across {across}", "a plane of no thickness has no covariance")

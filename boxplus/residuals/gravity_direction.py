@@ -36,6 +36,11 @@ class GravityDirection(Residual):
 
     Raises:
         InputError: directions of another shape or length, noise that `Whitening.of` refuses.
+
+    Example:
+        >>> up = bp.residuals.GravityDirection([[0.0, 0.0, 1.0]], sigma=0.01)
+        >>> up.evaluate(bp.SE3.identity())
+        array([[0., 0.]])
     """
 
     def __init__(

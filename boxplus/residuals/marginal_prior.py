@@ -33,6 +33,11 @@ class MarginalPrior(Residual):
 
     Raises:
         InputError: shapes that do not fit each other, points that are not on their manifolds.
+
+    Example:
+        >>> prior = bp.residuals.MarginalPrior([bp.Euclidean(2)], [[1.0, 2.0]], 2.0 * np.eye(2), [0.0, 0.0])
+        >>> prior.evaluate([1.5, 2.0])  # r0 + J (x - x0)
+        array([[1., 0.]])
     """
 
     def __init__(

@@ -73,6 +73,11 @@ class PointToPlane(Residual):
     Raises:
         InputError: arrays of another shape, of different length or not finite; a normal whose length is not 1; noise that
             `Whitening.of` refuses.
+
+    Example:
+        >>> distance = bp.residuals.PointToPlane([[1.0, 2.0, 0.3]], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], sigma=0.02)
+        >>> np.abs(distance.evaluate(bp.SE3.identity()))
+        array([[0.3]])
     """
 
     def __init__(

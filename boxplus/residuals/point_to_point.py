@@ -64,6 +64,10 @@ class PointToPoint(Residual):
 
     Raises:
         InputError: points of another shape, of different number or not finite; noise that `Whitening.of` refuses.
+
+    Example:
+        >>> np.abs(bp.residuals.PointToPoint([[1.0, 2.0, 0.3]], [[1.0, 2.0, 0.0]]).evaluate(bp.SE3.identity()))
+        array([[0. , 0. , 0.3]])
     """
 
     def __init__(

@@ -20,6 +20,10 @@ class Prior(Residual):
 
     Raises:
         InputError: a mean that is not on the manifold, noise that is not positive.
+
+    Example:
+        >>> bp.residuals.Prior(bp.SE2, [0.0, 1.0, 0.0], sigma=[0.01, 0.1, 0.1]).evaluate([0.1, 1.0, 0.0]).round(3)
+        array([[0.1, 0. , 0. ]])
     """
 
     def __init__(

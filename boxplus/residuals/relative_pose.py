@@ -99,6 +99,11 @@ class RelativePose(Residual):
 
     Raises:
         InputError: wrong shapes, quaternions not of unit length, noise that is not positive.
+
+    Example:
+        >>> edge = bp.residuals.RelativePose([[1.0, 0, 0, 0, 1.0, 0, 0]], sigma=[0.01] * 3 + [0.1] * 3)
+        >>> edge.evaluate(bp.SE3.identity(), [1.0, 0, 0, 0, 1.5, 0, 0])
+        array([[0. , 0. , 0. , 0.5, 0. , 0. ]])
     """
 
     def __init__(

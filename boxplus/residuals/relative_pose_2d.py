@@ -89,6 +89,10 @@ class RelativePose2D(Residual):
 
     Raises:
         InputError: wrong shapes, not finite, noise that is not positive.
+
+    Example:
+        >>> bp.residuals.RelativePose2D([[0.0, 1.0, 0.0]], sigma=0.1).evaluate([0.0, 0.0, 0.0], [0.0, 1.5, 0.0])
+        array([[0. , 0.5, 0. ]])
     """
 
     def __init__(

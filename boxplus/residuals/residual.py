@@ -27,6 +27,11 @@ class Linearization:
         residuals: (N, dim).
         jacobians: for every connected variable (N, dim, dof): ∂r(x ⊞ δ)/∂δ at δ = 0.
         valid: (N,) bool; False where the residual is singular (a point behind its camera): its rows are zero.
+
+    Example:
+        >>> found = bp.residuals.Prior(bp.SE2, [0.0, 0.0, 0.0]).linearize([0.0, 1.0, 0.0])
+        >>> found.residuals, found.jacobians[0].shape, found.valid
+        (array([[0., 1., 0.]]), (1, 3, 3), array([ True]))
     """
 
     residuals: NDArray[np.float64]
@@ -48,6 +53,11 @@ class Residual(ABC):
         whitening: square root of the information of the residuals.
         fixes_gauge: whether moving all connected variables together, as one rigid body, changes the residual. One that
             connects a single variable does; a relative measurement does not.
+
+    Example:
+        >>> prior = bp.residuals.Prior(bp.SE2, np.zeros((3, 3)), sigma=0.1)
+        >>> prior.count, prior.dim, prior.roles, prior.manifolds
+        (3, 3, ('x',), (SE2,))
     """
 
     fixes_gauge: bool

@@ -26,7 +26,6 @@ class UserResidual(Residual):
     The function takes the stored numbers of every connected variable, then the entries of every data array, of one residual:
 
         def relative_pose(T_i, T_j, z):               # rows (7,), (7,) and (7,)
-            ...
             return w0, w1, w2, v0, v1, v2             # dim numbers: a tuple, or an array (slower)
 
         UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(measured,), sigma=0.1)
@@ -57,6 +56,14 @@ class UserResidual(Residual):
     Raises:
         InputError: shapes that do not fit; a function that does not compile (with the reason Numba gives) or returns
             another number of values, the latter when it is first called if its type does not tell.
+
+    Example:
+        >>> def distance(beacon, robot, measured):
+        ...     return np.hypot(beacon[0] - robot[0], beacon[1] - robot[1]) - measured
+        >>> plane = bp.Euclidean(2)
+        >>> beacons = bp.residuals.UserResidual(distance, dim=1, manifolds=(plane, plane), data=([5.0],), sigma=0.1)
+        >>> beacons.evaluate([3.0, 4.0], [0.0, 0.5]).round(3)
+        array([[-0.39]])
     """
 
     jacobian_kind: Literal["analytic", "numeric"]

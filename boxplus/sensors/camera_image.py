@@ -30,7 +30,7 @@ class CameraImage:
         InputError: pixels of another shape or type, or a depth unit that is not positive.
 
     Example:
-        >>> image = CameraImage(0, "cam0", 1_403_636_579_763_555_584, np.zeros((480, 752), np.uint8))
+        >>> image = bp.CameraImage(0, "cam0", 1_403_636_579_763_555_584, np.zeros((480, 752), np.uint8))
         >>> image.shape, image.is_depth
         ((480, 752), False)
     """

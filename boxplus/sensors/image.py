@@ -21,6 +21,11 @@ class Image:
 
     Attributes:
         grey: (height, width) float32, finite, in any unit.
+
+    Example:
+        >>> image = bp.Image(np.add.outer(np.arange(4.0), np.arange(6.0)).astype(np.float32))
+        >>> image.grey.shape, float(image.grey[1, 2])
+        ((4, 6), 3.0)
     """
 
     grey: NDArray[np.float32]

@@ -20,6 +20,11 @@ class ImuSamples:
         time_ns: (N,) int64, absolute time in nanoseconds.
         gyro: (N, 3) float64, angular velocity [rad/s].
         accel: (N, 3) float64, specific force [m/s²]; +9.81 upwards at rest (docs/conventions.md).
+
+    Example:
+        >>> samples = bp.ImuSamples.from_arrays([1_000_000_000, 1_005_000_000], np.zeros((2, 3)), [[0.0, 0.0, 9.81]] * 2)
+        >>> len(samples), samples.accel[0].tolist()
+        (2, [0.0, 0.0, 9.81])
     """
 
     time_ns: NDArray[np.int64]

@@ -23,6 +23,11 @@ class Scan:
         start_ns, end_ns: first and last instant of the sweep (of its points, rejected ones included).
         rejected: how many points were dropped on construction, by reason.
         lidar: (N,) uint8, which LiDAR saw each point, where several were merged (docs/several_lidars.md); None: all the same.
+
+    Example:
+        >>> scan = bp.Scan.from_arrays([[4.0, 1.0, 0.2], [0.1, 0.0, 0.0]], [1_000_000_000, 1_000_050_000], min_range=0.5)
+        >>> len(scan), dict(scan.rejected)
+        (1, {'nearer than min_range': 1})
     """
 
     p_lidar: NDArray[np.float32]

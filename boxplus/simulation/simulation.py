@@ -51,6 +51,12 @@ class Simulation:
         T_imu_lidar: (4, 4) float64, LiDAR coordinates to IMU coordinates.
         start_ns, end_ns: span of the data [ns].
         scan_count: number of scans.
+
+    Example:
+        >>> simulation = bp.simulate("spin", duration_s=1.0)
+        >>> truth = simulation.ground_truth([simulation.start_ns])  # exact, at any instant
+        >>> truth.p_world_imu.shape, truth.R_world_imu.shape
+        ((1, 3), (1, 3, 3))
     """
 
     def __init__(self, scenario: Scenario, seed: int = 0, duration_s: float | None = None) -> None:
@@ -158,6 +164,11 @@ def simulate(
 
     Raises:
         InputError: no such scenario, a duration longer than the motion, a transform that is none.
+
+    Example:
+        >>> simulation = bp.simulate("walk", seed=1, duration_s=1.0)  # iterates as a recording does
+        >>> sum(isinstance(event, bp.Scan) for event in simulation), simulation.T_imu_lidar.shape
+        (9, (4, 4))
     """
     from dataclasses import replace
 

@@ -81,6 +81,14 @@ class SparseCholesky:
 
     Raises:
         InputError: an ordering that is no permutation of the variables, or no thread.
+
+    Example:
+        >>> from boxplus.sparse.block_matrix import BlockPattern
+        >>> pattern, _ = BlockPattern.from_pairs([1, 1], [1], [0])  # two variables of one degree of freedom, coupled
+        >>> cholesky = bp.SparseCholesky(pattern)
+        >>> cholesky.factorize([4.0, 2.0, 3.0])  # [[4, 2], [2, 3]]
+        >>> cholesky.solve([8.0, 7.0]).round(6)
+        array([1.25, 1.5 ])
     """
 
     def __init__(

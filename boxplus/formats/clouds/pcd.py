@@ -46,6 +46,11 @@ def write_pcd(path: str | Path, points: ArrayLike, intensity: ArrayLike | None =
     Raises:
         InputError: shapes that do not match.
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_pcd("cloud.pcd", [[1.0, 2.0, 3.0]])
+        >>> bp.formats.read_pcd("cloud.pcd").points.tolist()
+        [[1.0, 2.0, 3.0]]
     """
     with PcdWriter(path) as writer:
         writer.append(points, intensity)
@@ -56,6 +61,11 @@ def read_pcd(path: str | Path) -> PointCloud:
 
     Raises:
         InputError: the file is missing, cut, compressed or malformed; the message names file and line.
+
+    Example:
+        >>> bp.formats.write_pcd("cloud.pcd", [[1.0, 2.0, 3.0]])
+        >>> bp.formats.read_pcd("cloud.pcd").intensity is None
+        True
     """
     source = Path(path)
     with opened(source, "PCD") as file:

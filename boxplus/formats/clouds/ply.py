@@ -62,6 +62,11 @@ def write_ply(path: str | Path, points: ArrayLike, intensity: ArrayLike | None =
     Raises:
         InputError: shapes that do not match.
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_ply("cloud.ply", [[1.0, 2.0, 3.0]], intensity=[0.5])
+        >>> bp.formats.read_ply("cloud.ply").points.tolist()
+        [[1.0, 2.0, 3.0]]
     """
     with PlyWriter(path) as writer:
         writer.append(points, intensity)
@@ -72,6 +77,11 @@ def read_ply(path: str | Path) -> PointCloud:
 
     Raises:
         InputError: the file is missing, cut or malformed; the message names file and line.
+
+    Example:
+        >>> bp.formats.write_ply("cloud.ply", [[1.0, 2.0, 3.0]], intensity=[0.5])
+        >>> bp.formats.read_ply("cloud.ply").intensity.tolist()
+        [0.5]
     """
     source = Path(path)
     with opened(source, "PLY") as file:

@@ -27,6 +27,11 @@ class PointCloud:
     Attributes:
         points: (N, 3) float32, in the file's frame [m].
         intensity: (N,) float32 in the sensor's unit, or None.
+
+    Example:
+        >>> cloud = bp.formats.PointCloud(np.zeros((2, 3), np.float32), None)
+        >>> cloud.points.shape, cloud.intensity
+        ((2, 3), None)
     """
 
     points: NDArray[np.float32]

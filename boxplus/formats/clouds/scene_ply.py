@@ -24,6 +24,11 @@ def write_scene_ply(path: str | Path, points: ArrayLike, colors: ArrayLike, edge
     Raises:
         InputError: shapes that do not match, or an edge to a point that is not there.
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_scene_ply("scene.ply", np.eye(3), np.full((3, 3), 255, np.uint8), edges=[[0, 1]])
+        >>> bp.formats.read_ply("scene.ply").points.shape
+        (3, 3)
     """
     xyz = np.asarray(points, dtype=np.float64)
     rgb = np.asarray(colors, dtype=np.uint8)

@@ -59,6 +59,11 @@ def read_g2o(
     Raises:
         InputError: a malformed line, a pose that is missing or there twice, values that are not finite, an information
             matrix that is not positive semi-definite; the message names file and line.
+
+    Example:
+        >>> graph = bp.formats.read_g2o("loops.g2o")
+        >>> graph.dimension, graph.edges[0].tolist()
+        (3, [0, 1])
     """
     for name, value, known in (
         ("rotation_error", rotation_error, ("rotation_vector", "quaternion")),
@@ -150,6 +155,11 @@ def write_g2o(path: str | Path, graph: PoseGraph, *, rotation_error: RotationErr
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_g2o("copy.g2o", bp.formats.read_g2o("loops.g2o"))
+        >>> len(bp.formats.read_g2o("copy.g2o").edges)
+        35
     """
     spatial = graph.dimension == 3
     back = _POSE_3D_BACK if spatial else _POSE_2D_BACK

@@ -51,6 +51,12 @@ class PoseGraph:
         InputError: on construction, where shapes do not match, a value is not finite, a quaternion is not of unit length,
             an index dangles, a name repeats, or an information matrix is not symmetric and semi-definite. The
             message names the source and the line or index.
+
+    Example:
+        >>> edges, measured = np.array([[0, 1], [1, 2], [2, 0]]), np.tile([2 * np.pi / 3, 1.0, 0.0], (3, 1))
+        >>> graph = bp.PoseGraph(2, np.arange(3), None, edges, measured, np.tile(np.eye(3), (3, 1, 1)), np.array([0]))
+        >>> graph.dimension, len(graph.edges)
+        (2, 3)
     """
 
     dimension: Literal[2, 3]

@@ -45,6 +45,11 @@ def read_pose_graph(
 
     Raises:
         InputError: as `read_g2o`.
+
+    Example:
+        >>> graph = bp.read_pose_graph("loops.g2o")
+        >>> graph.dimension, graph.poses.shape, graph.edges.shape
+        (3, (24, 7), (35, 2))
     """
     if graph_format(path) == "toro":
         return read_toro(path, ignore_unknown=ignore_unknown)
@@ -58,6 +63,11 @@ def write_pose_graph(
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_pose_graph("loops.graph", bp.read_pose_graph("loops.g2o"), "toro")
+        >>> bp.read_pose_graph("loops.graph").edges.shape  # told by the words its lines begin with
+        (35, 2)
     """
     if format == "toro":
         write_toro(path, graph)

@@ -44,6 +44,13 @@ def read_toro(path: str | Path, *, ignore_unknown: bool = False) -> PoseGraph:
 
     Raises:
         InputError: as `read_g2o`.
+
+    Example:
+        >>> edges, measured = np.array([[0, 1], [1, 0]]), np.array([[np.pi / 2, 1.0, 0.0], [-np.pi / 2, 0.0, 1.0]])
+        >>> graph = bp.PoseGraph(2, np.arange(2), None, edges, measured, np.tile(np.eye(3), (2, 1, 1)), np.array([0]))
+        >>> bp.formats.write_toro("loop.graph", graph)
+        >>> bp.formats.read_toro("loop.graph").measurements.round(3).tolist()
+        [[1.571, 1.0, 0.0], [-1.571, 0.0, 1.0]]
     """
     source = Path(path)
     builder = GraphBuilder(source, _TAGS, ignore_unknown)
@@ -110,6 +117,13 @@ def write_toro(path: str | Path, graph: PoseGraph) -> None:
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> edges, measured = np.array([[0, 1], [1, 0]]), np.array([[np.pi / 2, 1.0, 0.0], [-np.pi / 2, 0.0, 1.0]])
+        >>> graph = bp.PoseGraph(2, np.arange(2), None, edges, measured, np.tile(np.eye(3), (2, 1, 1)), np.array([0]))
+        >>> bp.formats.write_toro("loop.graph", graph)
+        >>> bp.formats.read_toro("loop.graph").edges.tolist()
+        [[0, 1], [1, 0]]
     """
     if graph.dimension == 2:
         vertex, edge, convert, entries = _TAGS[_VERTEX_2D], _TAGS[_EDGE_2D], _plane_out, _ENTRIES_2D

@@ -34,6 +34,11 @@ class BalProblem:
 
     Raises:
         InputError: on construction, where shapes do not match, a value is not finite or an index is out of range.
+
+    Example:
+        >>> scene = bp.formats.read_bal("scene.txt.bz2")
+        >>> scene.cameras.shape, scene.pixels.shape, int(scene.camera_of.max())
+        ((6, 9), (240, 2), 5)
     """
 
     cameras: NDArray[np.float64]
@@ -84,6 +89,10 @@ def read_bal(path: str | Path) -> BalProblem:
 
     Raises:
         InputError: as `read_bal_text`.
+
+    Example:
+        >>> bp.formats.read_bal("scene.txt.bz2").points.shape
+        (40, 3)
     """
     _, camera_of, point_of, pixels, cameras, points = read_bal_text(path, CAMERA_SIZE)
     return BalProblem(cameras, points, camera_of, point_of, pixels, str(path))
@@ -94,6 +103,11 @@ def write_bal(path: str | Path, problem: BalProblem) -> None:
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> bp.formats.write_bal("copy.txt.bz2", bp.formats.read_bal("scene.txt.bz2"))
+        >>> bp.formats.read_bal("copy.txt.bz2").points.shape
+        (40, 3)
     """
     with atomic_file(path) as raw:
         if str(path).endswith(".bz2"):

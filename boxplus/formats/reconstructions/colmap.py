@@ -21,6 +21,11 @@ def read_colmap(path: str | Path) -> ColmapModel:
 
     Raises:
         InputError: no model there, a malformed line or record, or files that contradict each other.
+
+    Example:
+        >>> model = bp.formats.read_colmap("colmap")  # a folder with cameras, images and points3D
+        >>> model.format, model.T_camera_world.shape
+        ('text', (6, 7))
     """
     folder = Path(path)
     if folder.is_file():
@@ -47,6 +52,11 @@ def write_colmap(folder: str | Path, model: ColmapModel, format: Literal["text",
     Raises:
         InputError: an unknown format, or an image name that the format cannot hold.
         OutputError: a file cannot be written.
+
+    Example:
+        >>> bp.formats.write_colmap("copy", bp.formats.read_colmap("colmap"), "binary")
+        >>> bp.formats.read_colmap("copy").format
+        'binary'
     """
     kind = model.format if format is None else format
     if kind not in ("text", "binary"):

@@ -61,6 +61,11 @@ class ColmapModel:
     Raises:
         InputError: on construction, where shapes do not match, names repeat, an index is out of range, a value is not
             finite, or a camera has the wrong number of parameters.
+
+    Example:
+        >>> model = bp.formats.read_colmap("colmap")
+        >>> model.camera_models, model.image_names[:2], model.points.shape
+        (('SIMPLE_RADIAL',), ('000.png', '001.png'), (40, 3))
     """
 
     camera_ids: NDArray[np.int64]

@@ -28,6 +28,15 @@ class GbpProblem:
 
     Raises:
         InputError: on construction, where an index is out of range.
+
+    Example:
+        >>> zero = np.zeros(1, int)
+        >>> problem = bp.formats.GbpProblem(
+        ...     intrinsics=np.array([500.0, 500.0, 320.0, 240.0]), T_camera_world=np.array([[1.0, 0, 0, 0, 0, 0, 0]]),
+        ...     points=np.array([[0.0, 0.0, 4.0]]), camera_of=zero, point_of=zero, pixels=np.array([[320.0, 240.0]]),
+        ... )
+        >>> problem.T_camera_world.shape
+        (1, 7)
     """
 
     intrinsics: NDArray[np.float64]
@@ -49,6 +58,16 @@ def read_gbp(path: str | Path) -> GbpProblem:
 
     Raises:
         InputError: as `read_bal_text`.
+
+    Example:
+        >>> zero = np.zeros(1, int)
+        >>> problem = bp.formats.GbpProblem(
+        ...     intrinsics=np.array([500.0, 500.0, 320.0, 240.0]), T_camera_world=np.array([[1.0, 0, 0, 0, 0, 0, 0]]),
+        ...     points=np.array([[0.0, 0.0, 4.0]]), camera_of=zero, point_of=zero, pixels=np.array([[320.0, 240.0]]),
+        ... )
+        >>> bp.formats.write_gbp("scene.gbp", problem)
+        >>> bp.formats.read_gbp("scene.gbp").pixels.tolist()
+        [[320.0, 240.0]]
     """
     header, camera_of, point_of, pixels, cameras, points = read_bal_text(path, 6, "the intrinsics fx fy cx cy", 4)
     poses = np.hstack([_quaternions(cameras[:, 3:]), cameras[:, :3]])
@@ -66,6 +85,16 @@ def write_gbp(path: str | Path, problem: GbpProblem) -> None:
 
     Raises:
         OutputError: the file cannot be written.
+
+    Example:
+        >>> zero = np.zeros(1, int)
+        >>> problem = bp.formats.GbpProblem(
+        ...     intrinsics=np.array([500.0, 500.0, 320.0, 240.0]), T_camera_world=np.array([[1.0, 0, 0, 0, 0, 0, 0]]),
+        ...     points=np.array([[0.0, 0.0, 4.0]]), camera_of=zero, point_of=zero, pixels=np.array([[320.0, 240.0]]),
+        ... )
+        >>> bp.formats.write_gbp("scene.gbp", problem)
+        >>> bp.formats.read_gbp("scene.gbp").points.tolist()
+        [[0.0, 0.0, 4.0]]
     """
     rotation = so3.log(quaternion.to_matrix(np.ascontiguousarray(problem.T_camera_world[:, :4])))
     with atomic_file(path) as file:

@@ -29,6 +29,11 @@ def read_reconstruction(path: str | Path, format: ReconstructionFormat = "auto")
 
     Raises:
         InputError: no such file, or as the reader of the format.
+
+    Example:
+        >>> scene = bp.read_reconstruction("scene.txt.bz2")
+        >>> type(scene).__name__, scene.cameras.shape, scene.points.shape
+        ('BalProblem', (6, 9), (40, 3))
     """
     source = Path(path)
     if not source.exists():
@@ -66,6 +71,11 @@ def write_reconstruction(path: str | Path, reconstruction: Reconstruction) -> No
 
     Raises:
         OutputError: it cannot be written.
+
+    Example:
+        >>> bp.formats.write_reconstruction("copy.txt", bp.read_reconstruction("scene.txt.bz2"))
+        >>> bp.read_reconstruction("copy.txt").points.shape
+        (40, 3)
     """
     if isinstance(reconstruction, ColmapModel):
         write_colmap(path, reconstruction)

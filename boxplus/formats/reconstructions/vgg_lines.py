@@ -36,6 +36,17 @@ class VggLines:
         pixels: (M, 2) [px].
         reflected: the files have the world behind the cameras, a mirror image; it was reflected through the origin, which no
             image shows, so that z is forward.
+
+    Example:
+        >>> K, turned = np.diag([500.0, 500.0, 1.0]), [1.0, 0, 0, 0]
+        >>> views = np.array([[*turned, 0, 0, 4], [*turned, -1, 0, 4], [*turned, 0, -1, 4]])  # T_camera_world
+        >>> ends = np.array([[-1.0, 0.5, 0.0, 1.0, 0.5, 0.5]])  # of one line, in the world
+        >>> p = ends.reshape(2, 3) + views[:, None, 4:]
+        >>> segments = (500.0 * p[..., :2] / p[..., 2:]).reshape(3, 4)
+        >>> view_of, line_of = np.arange(3, dtype=np.uint32), np.zeros(3, np.uint32)
+        >>> lines = bp.formats.VggLines(("a", "b", "c"), np.tile(K, (3, 1, 1)), views, ends, view_of, line_of, segments)
+        >>> lines.segments.round(1)[0]
+        array([-125. ,   62.5,  111.1,   55.6])
     """
 
     names: tuple[str, ...]
@@ -59,6 +70,11 @@ def read_vgg_lines(folder: str | Path) -> VggLines:
 
     Raises:
         InputError: a file is missing or a line of it malformed; the message names file and line number.
+
+    Example:
+        >>> lines = bp.formats.read_vgg_lines("Corridor")  # a folder as the group in Oxford publishes it
+        >>> len(lines.names), len(lines.end_points_world), lines.segments.shape
+        (6, 12, (72, 4))
     """
     root = Path(folder)
     if not root.is_dir():

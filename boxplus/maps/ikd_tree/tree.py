@@ -55,11 +55,11 @@ class IkdTree:
 
     Coordinates are kept in float32 relative to `origin` (float64, whole metres, chosen from the first points); all
     searches are exact for these stored coordinates. What a search returns depends only on the operations that came
-    before, never on the shape of the tree, the kind of rebuild or the number of threads.
+    before, never on the shape of the tree, the kind of rebuild or the number of threads. Searches may run on several
+    threads at once; an update together with anything else is refused (InputError).
 
-    Deleted points can be revived by `reinsert_box` until the points deleted since the last clean-up are more than
-    `delete_ratio` of all: then all deleted points are forgotten and their memory is reclaimed. Points removed by
-    downsampling are gone at once.
+    Deleted points can be revived by `reinsert_box` until those since the last clean-up are more than `delete_ratio` of all:
+    then all are forgotten and their memory is reclaimed. Points removed by downsampling are gone at once.
 
     Args:
         points: (N, 3) first points [m], as for `build`.
@@ -73,7 +73,10 @@ class IkdTree:
     Raises:
         InputError: a parameter is out of range.
 
-    Searches may run on several threads at once; an update together with anything else is refused (InputError).
+    Example:
+        >>> tree = bp.IkdTree([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+        >>> tree.nearest([[1.0, 2.0, 2.5]], k=1).points.tolist()
+        [[[1.0, 2.0, 3.0]]]
     """
 
     def __init__(

@@ -6,7 +6,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class IncrementalOptions(BaseModel):
-    """Options of `IncrementalProblem`."""
+    """Options of `IncrementalProblem`.
+
+    Example:
+        >>> bp.IncrementalProblem(tolerance=0.01).options.max_rounds
+        3
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -47,10 +47,10 @@ class IncrementalProblem:
         options: see `IncrementalOptions`; single settings may be given as keywords instead.
 
     Example:
-        >>> problem = IncrementalProblem()
-        >>> poses = problem.add_variables(SE2, [0.0, 0.0, 0.0], fixed=True, name="poses")
+        >>> problem = bp.IncrementalProblem()
+        >>> poses = problem.add_variables(bp.SE2, [0.0, 0.0, 0.0], fixed=True, name="poses")
         >>> new = problem.extend(poses, [0.0, 1.0, 0.0])
-        >>> problem.add_residuals(RelativePose2D([0.1, 1.0, 0.0], sigma=0.1), poses[0], new)
+        >>> problem.add_residuals(bp.residuals.RelativePose2D([0.1, 1.0, 0.0], sigma=0.1), poses[0], new)
         >>> problem.update().is_settled
         True
         >>> problem.estimate(new)

@@ -92,7 +92,11 @@ def world_gauge(
         InputError: a kind that the manifold of the block cannot be; an axis of no length.
 
     Example:
-        `world_gauge({frames: "world_from_body", velocities: "velocity_first"}, rotation="yaw")`
+        >>> problem = bp.Problem()
+        >>> poses = problem.add_variables(bp.SE3, bp.SE3.random(np.random.default_rng(0), 3), name="poses")
+        >>> gauge = bp.world_gauge({poses: "world_from_body"}, rotation="yaw")  # moves of the world that nothing measures
+        >>> gauge.names
+        ('translation x', 'translation y', 'translation z', 'yaw')
     """
     axis = as_floats(up, "up")
     if axis.shape != (3,) or not 0.0 < float(np.linalg.norm(axis)) < math.inf:

@@ -72,7 +72,15 @@ def marginalize(
         InputError: nothing is selected; variables or values of another problem.
 
     Example:
-        `marginalize(problem, [frames[oldest], points[lost]], at=solution)`
+        >>> problem = bp.Problem()
+        >>> poses = problem.add_variables(bp.SE2, [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], name="poses")
+        >>> known = problem.add_residuals(bp.residuals.Prior(bp.SE2, [0.0, 0.0, 0.0], sigma=0.1), poses[0])
+        >>> edges = problem.add_residuals(bp.residuals.RelativePose2D([0.0, 1.0, 0.0], sigma=0.1), poses[0], poses[1])
+        >>> before = problem.solve()
+        >>> sigma = before.standard_deviations(poses[1])
+        >>> marginal = bp.marginalize(problem, poses[0], at=before)  # the older pose leaves, a prior stays
+        >>> np.allclose(problem.solve().standard_deviations(poses[1]), sigma)
+        True
     """
     chosen = [leaving] if isinstance(leaving, (VariableRows, Variables)) else list(leaving)
     if not any(len(part) for part in chosen):

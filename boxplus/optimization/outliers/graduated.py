@@ -114,7 +114,14 @@ def graduate(
             weights of another length or group; and what `Problem.solve` raises.
 
     Example:
-        `graduate(problem, loops, loss="truncated").inliers["loops"]`
+        >>> rng = np.random.default_rng(0)
+        >>> measured = np.append(rng.normal(2.0, 0.1, 20), [50.0, 60.0])  # the last two are wrong
+        >>> problem = bp.Problem()
+        >>> x = problem.add_variables(bp.Euclidean(1), [0.0], name="x")
+        >>> prior = bp.residuals.Prior(bp.Euclidean(1), measured[:, None], sigma=0.1)
+        >>> group = problem.add_residuals(prior, x[np.zeros(22, int)], name="x")
+        >>> np.flatnonzero(~bp.graduate(problem, group).inliers["x"])
+        array([20, 21])
     """
     chosen = [groups] if isinstance(groups, Group) else list(groups)
     if not chosen or not all(any(group is own for own in problem.groups) for group in chosen):

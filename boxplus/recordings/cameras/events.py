@@ -33,6 +33,14 @@ class CameraRecording(EventStream[CameraRecordingInfo, CameraEvent]):
 
     Before an image come all IMU samples up to its time, and none later; images of one instant come in the order of their
     cameras. One image at a time is decoded. Every iteration starts at the beginning and resets the counters.
+
+    Example:
+        >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+        >>> rig = make_rig("mono", scale=0.25, rate_hz=5.0)
+        >>> recording = as_camera_recording(simulate_cameras("room", duration_s=1.0, rig=rig))
+        >>> images = [event for event in recording if isinstance(event, bp.CameraImage)]
+        >>> len(images), images[0].grey().shape
+        (4, (120, 188))
     """
 
     delivers = "images"

@@ -27,6 +27,12 @@ class CalibratedCamera:
         model: projection of points in the camera frame (z forward, x to the right, y down).
         T_body_camera: (4, 4) float64, camera coordinates to body coordinates.
         width, height: of the images that the model belongs to [px].
+
+    Example:
+        >>> from boxplus.recordings import CalibratedCamera
+        >>> camera = CalibratedCamera(bp.Pinhole(458.7, 457.3, 367.2, 248.4), np.eye(4), 752, 480)
+        >>> camera.width, camera.model.fx
+        (752, 458.7)
     """
 
     model: CameraModel
@@ -56,6 +62,12 @@ class CameraStream:
             nothing is added.
         sources: where `model`, `T_body_camera`, `time_offset_s`, `depth_unit_m` come from.
         missing: what of these is not known, and why.
+
+    Example:
+        >>> from boxplus.recordings import CameraStream
+        >>> stream = CameraStream(0, "cam0", "grey", "mav0/cam0", "cam0", 752, 480, 3682, 20.0)
+        >>> stream.name, stream.model is None  # no calibration: no estimator takes it
+        ('cam0', True)
     """
 
     index: int
@@ -104,6 +116,11 @@ class ImuStream:
         gyro_unit, accel_unit: in the recording; samples are delivered in SI units.
         noise: densities as calibrated, or None when the recording does not say.
         noise_source: where they come from, empty when unknown.
+
+    Example:
+        >>> from boxplus.recordings import ImuStream
+        >>> ImuStream("mav0/imu0", "imu0", 36820, 200.0, "rad/s", "m/s2").rate_hz
+        200.0
     """
 
     source: str
@@ -129,6 +146,12 @@ class CameraRecordingInfo:
         cameras: in the order of their indices.
         imu: or None when there is none.
         evidence: every decision with its reasons; grows while a damaged file is read.
+
+    Example:
+        >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+        >>> recording = as_camera_recording(simulate_cameras("room", duration_s=1.0, rig=make_rig("stereo", scale=0.25)))
+        >>> [camera.name for camera in recording.info.cameras], recording.info.imu.rate_hz
+        (['cam0', 'cam1'], 200.0)
     """
 
     path: Path

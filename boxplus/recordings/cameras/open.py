@@ -47,10 +47,10 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         AmbiguityError: two readings fit; the message names the option that decides.
 
     Example:
-        >>> with open_camera_recording("MH_01_easy") as recording:   # doctest: +SKIP
-        ...     camera = recording.info.cameras[0].calibrated()
-        ...     for event in recording:
-        ...         if isinstance(event, CameraImage): ...
+        >>> with bp.open_camera_recording("room_stereo") as recording:  # a EuRoC folder
+        ...     images = [event for event in recording if isinstance(event, bp.CameraImage)]
+        ...     print(len(recording.info.cameras), len(images), images[0].grey().dtype)
+        2 8 uint8
     """
     options = options or CameraRecordingOptions()
     path = Path(path)

@@ -10,7 +10,12 @@ from boxplus.recordings.options import AccelUnit, GyroUnit
 
 
 class CameraRecordingOptions(BaseModel):
-    """How to read a camera recording. None means: as the recording says, and refuse where it does not say."""
+    """How to read a camera recording. None means: as the recording says, and refuse where it does not say.
+
+    Example:
+        >>> bp.CameraRecordingOptions(start_s=5.0, frame_rate_hz=20.0).frame_rate_hz
+        20.0
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

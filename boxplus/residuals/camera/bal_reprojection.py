@@ -37,7 +37,13 @@ from boxplus.residuals.whitening import Whitening
 
 
 class _BalCamera(Product):
-    """`Product(SE3Left, Euclidean(3))`, and equal to it, with names for f, k1 and k2."""
+    """`Product(SE3Left, Euclidean(3))`, and equal to it, with names for f, k1 and k2.
+
+    Example:
+        >>> camera = bp.residuals.BalCamera
+        >>> camera.size, camera.dof, camera.tangent_names[-3:]
+        (10, 9, ('focal length [px]', 'k1', 'k2'))
+    """
 
     def __init__(self) -> None:
         super().__init__(SE3Left, Euclidean(3))
@@ -135,6 +141,12 @@ class BalReprojection(Residual):
     Raises:
         InputError: `pixels` of another shape or not finite, `z_min` negative or not finite, or noise that `Whitening.of`
             refuses.
+
+    Example:
+        >>> seen = bp.residuals.BalReprojection([[0.0, 50.0]])
+        >>> camera = [1.0, 0, 0, 0, 0, 0, 0, 500.0, 0, 0]  # wxyz, t, f, k1, k2; it looks along -z
+        >>> seen.evaluate(camera, [0.0, 0.4, -4.0])
+        array([[0., 0.]])
     """
 
     def __init__(

@@ -169,6 +169,13 @@ class InverseDepthReprojection(PixelResidual):
 
     Raises:
         InputError: pixels of another shape or not finite, a camera that is not there, or noise that `Whitening.of` refuses.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> seen = bp.residuals.InverseDepthReprojection(camera, [[320.0, 240.0]], sigma=1.0)
+        >>> anchor, observer = bp.SE3Left.identity(), bp.SE3Left.identity()
+        >>> np.abs(seen.evaluate(anchor, observer, [0.01, 0.0, 0.5]))  # a direction, and one over the depth
+        array([[5., 0.]])
     """
 
     no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))

@@ -125,6 +125,12 @@ class InverseDepthIntrinsics(PixelResidual):
     Raises:
         InputError: pixels of another shape or not finite, `z_min` negative or not finite, or noise that `Whitening.of`
             refuses.
+
+    Example:
+        >>> seen = bp.residuals.InverseDepthIntrinsics([[330.0, 240.0]])
+        >>> anchor, observer = bp.SE3Left.identity(), [1.0, 0, 0, 0, 0.04, 0, 0]
+        >>> seen.evaluate(anchor, observer, [320.0, 240.0, 0.5], [500.0, 500.0, 320.0, 240.0])
+        array([[0., 0.]])
     """
 
     no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))

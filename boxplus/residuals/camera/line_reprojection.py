@@ -193,6 +193,14 @@ class LineReprojection(ImageResidual):
     Raises:
         InputError: segments of another shape, not finite or shorter than 1 px; a camera with distortion; a K that is not
             a calibration matrix; or noise that `Whitening.of` refuses.
+
+    Example:
+        >>> from boxplus.manifolds import lines
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> segment = [[195.0, 241.0, 445.0, 241.0]]  # u, v of both ends, a pixel below the line
+        >>> seen = bp.residuals.LineReprojection(camera, segment, sigma=0.5)
+        >>> np.abs(seen.evaluate(bp.SE3Left.identity(), lines.from_points([-1.0, 0.0, 4.0], [1.0, 0.0, 4.0]))).round(6)
+        array([[1., 1.]])
     """
 
     measured_name = "segments"

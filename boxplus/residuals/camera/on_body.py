@@ -103,6 +103,12 @@ class OnBody(Residual):
     Raises:
         InputError: a residual without the pose of a camera; velocities for one that measures no image coordinates, of another
             shape or not finite.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> seen = bp.residuals.OnBody(bp.residuals.Reprojection(camera, [[320.0, 240.0]]))
+        >>> seen.evaluate(bp.BodyPose.identity(), bp.BodyPose.identity(), [0.0, 0.0, 4.0])  # body, mounting, point
+        array([[0., 0.]])
     """
 
     def __init__(

@@ -67,6 +67,13 @@ class Photometric(Residual):
     Raises:
         InputError: wrong shapes or values that are not finite; a pixel of a patch outside of image 1; a depth that is not
             positive; intrinsics as variables of a camera with distortion; a camera that is no pinhole.
+
+    Example:
+        >>> camera = bp.Pinhole(100.0, 100.0, 15.5, 15.5)
+        >>> image = np.add.outer(np.arange(32.0), 2.0 * np.arange(32.0))  # brighter by 2 a pixel to the right
+        >>> pixels = bp.residuals.Photometric(camera, image, image, [[10.0, 10.0]], [2.0])
+        >>> pixels.evaluate(bp.SE3Left.boxplus(bp.SE3Left.identity(), [0, 0, 0, 0.02, 0, 0])).round(3)  # a pixel to the side
+        array([[-2.]])
     """
 
     def __init__(

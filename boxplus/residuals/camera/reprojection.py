@@ -139,6 +139,12 @@ class Reprojection(PixelResidual):
 
     Raises:
         InputError: `pixels` of another shape or not finite, or noise that `Whitening.of` refuses.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> seen = bp.residuals.Reprojection(camera, [[320.0, 241.0]], sigma=1.0)
+        >>> np.abs(seen.evaluate(bp.SE3Left.identity(), [0.0, 0.0, 4.0]))
+        array([[0., 1.]])
     """
 
     no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)))

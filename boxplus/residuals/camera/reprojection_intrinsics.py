@@ -100,6 +100,12 @@ class ReprojectionIntrinsics(PixelResidual):
 
     Raises:
         InputError: `pixels` of another shape or not finite, or noise that `Whitening.of` refuses.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> seen = bp.residuals.ReprojectionIntrinsics(camera, [[320.0, 240.0]])
+        >>> np.abs(seen.evaluate(bp.SE3Left.identity(), [0.0, 0.0, 4.0], [500.0, 500.0, 322.0, 240.0]))
+        array([[2., 0.]])
     """
 
     no_jacobians = (np.zeros((0, 2, 6)), np.zeros((0, 2, 3)), np.zeros((0, 2, 4)))

@@ -40,6 +40,13 @@ class ReprojectionTiedIntrinsics(ImageResidual):
 
     Raises:
         InputError: shapes that do not match, a basis that is not of full rank, or as `ReprojectionIntrinsics`.
+
+    Example:
+        >>> camera = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
+        >>> basis = [[1.0], [1.0], [0.0], [0.0]]  # one focal length for both axes
+        >>> seen = bp.residuals.ReprojectionTiedIntrinsics(camera, [[320.0, 240.0]], [0.0, 0.0, 320.0, 240.0], basis)
+        >>> np.abs(seen.evaluate(bp.SE3Left.identity(), [0.4, 0.0, 4.0], [500.0])).round(6)
+        array([[50.,  0.]])
     """
 
     def __init__(

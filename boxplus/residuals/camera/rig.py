@@ -48,6 +48,13 @@ def on_rig(
 
     Raises:
         InputError: shapes that do not match, a camera that is not in the rig, or what `kind` and `OnBody` refuse.
+
+    Example:
+        >>> rig = [bp.Pinhole(500.0, 500.0, 320.0, 240.0), bp.Pinhole(480.0, 480.0, 320.0, 240.0)]
+        >>> pixels = [[320.0, 240.0], [310.0, 240.0], [300.0, 240.0]]
+        >>> groups = bp.residuals.on_rig(bp.residuals.Reprojection, rig, camera_of=[0, 1, 0], measured=pixels)
+        >>> [rows.tolist() for seen, rows in groups]  # a group for each camera
+        [[0, 2], [1]]
     """
     every = as_floats(measured, "measured")
     of = as_numbers(camera_of, "camera_of")

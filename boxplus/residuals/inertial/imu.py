@@ -232,6 +232,16 @@ class ImuPreintegration(Residual):
     Raises:
         InputError: gravity of another shape, or zero where its direction is a variable; an unknown `rotation`; an interval of
             a single step, whose covariance is singular; a time offset that is not finite.
+
+    Example:
+        >>> noise = bp.residuals.ImuNoise(gyro=1.7e-4, accel=2e-3, gyro_walk=1.9e-5, accel_walk=3e-3)
+        >>> time_ns = np.arange(0, 1_000_000_001, 5_000_000)  # a second at rest, 200 Hz
+        >>> at_rest = np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1))
+        >>> between = bp.residuals.Preintegration.integrate(time_ns, *at_rest, noise=noise)
+        >>> imu = bp.residuals.ImuPreintegration(between)
+        >>> pose, state = bp.BodyPose.identity(), np.zeros(9)  # velocity and biases
+        >>> bool(np.abs(imu.evaluate(pose, state, pose, state)).max() < 1e-9)  # gravity takes back what it gave
+        True
     """
 
     def __init__(

@@ -23,6 +23,11 @@ class ImuNoise:
 
     Raises:
         InputError: a density that is not positive and finite: the covariance would be singular.
+
+    Example:
+        >>> noise = bp.residuals.ImuNoise(gyro=1.7e-4, accel=2e-3, gyro_walk=1.9e-5, accel_walk=3e-3)
+        >>> noise.gyro
+        0.00017
     """
 
     gyro: float

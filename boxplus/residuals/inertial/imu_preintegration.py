@@ -55,6 +55,14 @@ class Preintegration:
         steps: (N,) int64, steps of the recursion.
         longest_gap_s: (N,) longest time between two samples used [s].
         time_ns, gyro, accel: (S,), (S, 3), (S, 3) the samples, for integrating anew.
+
+    Example:
+        >>> noise = bp.residuals.ImuNoise(gyro=1.7e-4, accel=2e-3, gyro_walk=1.9e-5, accel_walk=3e-3)
+        >>> time_ns = np.arange(0, 1_000_000_001, 5_000_000)  # a second at rest, 200 Hz
+        >>> at_rest = np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1))
+        >>> between = bp.residuals.Preintegration.integrate(time_ns, *at_rest, noise=noise)
+        >>> between.duration_s, between.beta.round(3) + 0.0  # the specific force, summed up
+        (array([1.]), array([[0.  , 0.  , 9.81]]))
     """
 
     intervals_ns: NDArray[np.int64]

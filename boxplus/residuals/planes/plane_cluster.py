@@ -122,7 +122,12 @@ class PlaneCluster(Residual):
             `Whitening.of` refuses.
 
     Example:
-        `problem.add_residuals(PlaneCluster(clusters, centres, sigma=0.02), imu[pose_of], mounting, planes[plane_of])`
+        >>> points = np.column_stack([np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2)), np.full(50, 2.0)])  # on z = 2
+        >>> ones = np.column_stack([points, np.ones(50)])
+        >>> cluster = bp.residuals.PlaneCluster([ones.T @ ones])
+        >>> still = bp.BodyPose.identity()
+        >>> bool(np.abs(cluster.evaluate(still, still, [0.0, 0.0, 1.0, -2.0])).max() < 1e-9)
+        True
     """
 
     def __init__(

@@ -39,6 +39,14 @@ class PoseQuadratic(Residual):
 
     Raises:
         InputError: arrays of another shape or not finite.
+
+    Example:
+        >>> form = np.zeros((13, 13))
+        >>> origin = np.diag([0.0, 0.0, 0.0, 1.0])  # a point there, 0.1 m above the plane
+        >>> bp.residuals.add_plane_forms([origin], [[0.0, 0.0, 1.0]], [0.1], form)
+        >>> held = bp.residuals.PoseQuadratic(form[None], [[0.0, 0.0, 0.0]])
+        >>> float(np.linalg.norm(held.evaluate(bp.BodyPose.identity())).round(6))
+        0.1
     """
 
     def __init__(self, forms: ArrayLike, origins_world: ArrayLike) -> None:
@@ -88,6 +96,12 @@ def add_plane_forms(clusters: ArrayLike, planes: ArrayLike, offsets: ArrayLike, 
         clusters: (k, 4, 4) Σ [x; 1][x; 1]ᵀ in the body's frame, divided by the variance of a distance [m²].
         planes: (k, 3) unit normals n in the world; offsets: (k,) nᵀ(p₀ − c) + d of each plane nᵀ(x − c) + d = 0 [m].
         form: Q, which is added to.
+
+    Example:
+        >>> form = np.zeros((13, 13))
+        >>> bp.residuals.add_plane_forms([np.diag([0.0, 0.0, 0.0, 1.0])], [[0.0, 0.0, 1.0]], [0.1], form)
+        >>> float(form[12, 12].round(6))  # 0.1 squared
+        0.01
     """
     _add_plane_forms(as_floats(clusters, "clusters"), as_floats(planes, "planes"), as_floats(offsets, "offsets"), form)
 

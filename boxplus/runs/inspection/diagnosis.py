@@ -52,6 +52,11 @@ class Diagnosis:
         evidence: the findings, in the order of the examination.
         R_imu_lidar: (3, 3) estimated rotation from LiDAR to IMU coordinates, None where the motion does not show it.
         time_offset_s: estimated offset to add to the LiDAR's times as they are read [s], or None.
+
+    Example:
+        >>> diagnosis = bp.diagnose("flight.bag", bp.RecordingOptions(duration_s=0.5))
+        >>> [finding.value for finding in diagnosis.evidence if finding.key == "point_time_unit"]
+        ['s']
     """
 
     path: Path
@@ -103,6 +108,11 @@ def diagnose(
         T_imu_lidar: (4, 4) a mounting to check, LiDAR coordinates to IMU coordinates; the recording's own when None.
         camchain: Kalibr camchain of a recording of cameras.
         frame_rate_hz: of a recording of cameras without times of its images [Hz].
+
+    Example:
+        >>> diagnosis = bp.diagnose("flight.bag", bp.RecordingOptions(duration_s=1.0))
+        >>> sorted({finding.verdict for finding in diagnosis.evidence})
+        ['ok']
     """
     path = Path(path)
     diagnosis = Diagnosis(path)

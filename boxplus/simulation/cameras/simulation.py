@@ -265,6 +265,7 @@ def simulate_cameras(
         InputError: no such scenario, a duration longer than the motion.
 
     Example:
+        >>> from boxplus.simulation.cameras import make_rig, simulate_cameras
         >>> simulation = simulate_cameras("room", seed=3, rig=make_rig("mono", scale=0.25), duration_s=1.0)
         >>> simulation.image(0, 5).shape, simulation.depth(0, 5).shape
         ((120, 188), (120, 188))

@@ -43,6 +43,11 @@ class BundleAdjustmentResult:
         solution: with history, covariance, and why it stopped.
         cameras, points: the variables of `solution`.
         time_s: seconds, set-up included.
+
+    Example:
+        >>> result = bp.adjust_bundle(bp.read_reconstruction("scene.txt.bz2"))
+        >>> result.errors.shape == result.errors_start.shape, result.doubt
+        (True, None)
     """
 
     reconstruction: Reconstruction
@@ -76,6 +81,11 @@ def adjust_bundle(
     Raises:
         InputError: a camera model without a counterpart here; a focal length that is not positive; no observation; more than
             half of the observations of points behind their cameras, beyond repair; a method without damping.
+
+    Example:
+        >>> result = bp.adjust_bundle(bp.read_reconstruction("scene.txt.bz2"), bp.BundleAdjustmentConfig(intrinsics="refined"))
+        >>> result.solution.status, bool(np.median(result.errors) < np.median(result.errors_start))
+        ('converged', True)
     """
     config = config if config is not None else BundleAdjustmentConfig()
     if config.solver.method == "gauss_newton":

@@ -43,6 +43,11 @@ class Cheirality:
         behind: observations whose point lies behind their camera at the end, those left out not counted.
         behind_points: numbers of these points.
         count: observations in all.
+
+    Example:
+        >>> result = bp.adjust_bundle(bp.read_reconstruction("scene.txt.bz2"))
+        >>> result.cheirality.behind_start, result.cheirality.behind  # observations behind their cameras
+        (0, 0)
     """
 
     behind_start: int

@@ -13,7 +13,12 @@ _COST_TOLERANCE = 1e-8
 
 
 class BundleAdjustmentConfig(BaseModel):
-    """Options of `adjust_bundle`."""
+    """Options of `adjust_bundle`.
+
+    Example:
+        >>> bp.BundleAdjustmentConfig(sigma_px=0.5, intrinsics="refined").principal_point
+        'held'
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -44,6 +44,14 @@ class LineTriangulation:
         states: (L,) `found`, or why not.
         angle, angle_std: (L,) between the planes: root mean square of their normals off the best plane of normals through the
             line, and its standard deviation by the noise of the end points [rad].
+
+    Example:
+        >>> from boxplus.systems.bundle_adjustment import triangulate_lines
+        >>> data = bp.formats.read_vgg_lines("Corridor")
+        >>> count = len(data.end_points_world)
+        >>> found = triangulate_lines(data.K, data.T_camera_world, data.segments, data.view_of, data.line_of, count)
+        >>> sorted(set(found.states)), found.lines.shape == (count, 5)
+        (['found'], True)
     """
 
     lines: Floats
@@ -92,6 +100,7 @@ def triangulate_lines(
         InputError: arrays that do not match, or indices beyond them.
 
     Example:
+        >>> from boxplus.systems.bundle_adjustment import triangulate_lines
         >>> K = np.tile([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], (2, 1, 1))
         >>> T = [[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, -1.0, 0, 0]]           # the second camera stands 1 m to the right
         >>> upright = [[320.0, 115.0, 320.0, 365.0], [195.0, 115.0, 195.0, 365.0]]

@@ -48,6 +48,18 @@ class CameraCalibration:
         images, on_target: patterns in the residuals.
         pairs: how the cameras keep their places to each other.
         imu: mounting on the IMU, or None without one.
+
+    Example:
+        >>> from boxplus.simulation.cameras.target_session import simulate_target_session
+        >>> target = bp.AprilGrid(rows=4, columns=4, tag_size=0.1, spacing=0.3)
+        >>> lens = bp.Pinhole(460.0, 460.0, 370.0, 240.0, bp.RadialTangential(-0.28, 0.07, 0.0, 0.0))
+        >>> mounting = [[1.0, 0, 0, 0, 0, 0, 0]]
+        >>> session = simulate_target_session([lens], mounting, (752, 480), target, frames=16, rate_hz=2.0, seed=1)
+        >>> found = bp.calibrate_cameras(session.corners, target, bp.CameraCalibrationConfig(lens="pinhole-radtan"))
+        >>> adjustment, number = found.of_camera(0)
+        >>> sigma = np.sqrt(np.diag(adjustment.covariance)[adjustment.intrinsics(number)])
+        >>> bool(sigma[:2].max() < 3.0)  # of fx and fy, in pixels
+        True
     """
 
     target: AprilGrid
@@ -99,6 +111,16 @@ def calibrate_cameras(
             target together, an IMU without noise or without motion.
 
     Source: docs/camera_calibration.md; Zhang, PAMI 2000; Furgale, Rehder and Siegwart, IROS 2013.
+
+    Example:
+        >>> from boxplus.simulation.cameras.target_session import simulate_target_session
+        >>> target = bp.AprilGrid(rows=4, columns=4, tag_size=0.1, spacing=0.3)
+        >>> lens = bp.Pinhole(460.0, 460.0, 370.0, 240.0, bp.RadialTangential(-0.28, 0.07, 0.0, 0.0))
+        >>> mounting = [[1.0, 0, 0, 0, 0, 0, 0]]
+        >>> session = simulate_target_session([lens], mounting, (752, 480), target, frames=16, rate_hz=2.0, seed=1)
+        >>> found = bp.calibrate_cameras(session.corners, target, bp.CameraCalibrationConfig(lens="pinhole-radtan"))
+        >>> bool(abs(found.singles[0].rig.models[0].fx - 460.0) < 3.0)
+        True
     """
     config = config if config is not None else CameraCalibrationConfig()  # type: ignore[call-arg]
     report = on_progress or (lambda _: None)

@@ -10,7 +10,12 @@ from boxplus.systems.camera_calibration.lens import LensKind
 
 
 class CameraCalibrationConfig(BaseModel):
-    """Settings of `calibrate_cameras`."""
+    """Settings of `calibrate_cameras`.
+
+    Example:
+        >>> bp.CameraCalibrationConfig(lens="pinhole-equi").max_views
+        80
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -27,6 +27,15 @@ class TargetCorners:
 
     Raises:
         InputError: arrays that do not match, pixels that are not finite or not in the image, a corner twice in an image.
+
+    Example:
+        >>> from boxplus.simulation.cameras.target_session import simulate_target_session
+        >>> target = bp.AprilGrid(rows=4, columns=4, tag_size=0.1, spacing=0.3)
+        >>> lens = bp.Pinhole(460.0, 460.0, 370.0, 240.0, bp.RadialTangential(-0.28, 0.07, 0.0, 0.0))
+        >>> mounting = [[1.0, 0, 0, 0, 0, 0, 0]]
+        >>> session = simulate_target_session([lens], mounting, (752, 480), target, frames=16, rate_hz=2.0, seed=1)
+        >>> session.corners.pixels.shape[1], session.corners.sizes
+        (2, ((752, 480),))
     """
 
     names: tuple[str, ...]

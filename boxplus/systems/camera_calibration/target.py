@@ -28,7 +28,7 @@ class AprilGrid:
         InputError: fewer than one row or column, a length that is not positive.
 
     Example:
-        >>> AprilGrid(rows=6, columns=6, tag_size=0.088, spacing=0.3).corners.shape
+        >>> bp.AprilGrid(rows=6, columns=6, tag_size=0.088, spacing=0.3).corners.shape
         (144, 3)
     """
 

@@ -40,6 +40,13 @@ def align_rgbd(
 
     Raises:
         InputError: images or depth of another shape or not finite, too many levels, fewer than 100 pixels with depth.
+
+    Example:
+        >>> camera, v = bp.Pinhole(100.0, 100.0, 63.5, 47.5), np.linspace(0.0, 20.0, 129)
+        >>> wall = 100.0 + 40.0 * np.sin(v[None, :]) + 40.0 * np.cos(v[:96, None])
+        >>> found = bp.align_rgbd(wall[:, :-1], np.full((96, 128), 2.0), wall[:, 1:], camera)
+        >>> found.status, found.T_21[4:].round(2) + 0.0  # 2 m / 100 px to the left
+        ('converged', array([-0.02,  0.  ,  0.  ]))
     """
     keyframe = Keyframe.prepare(image_1, depth_1, camera, levels=levels, points=None)
     robust = Huber(1.345) if loss is None else loss

@@ -71,10 +71,9 @@ class Keyframe:
         contrast: range of the grey values.
 
     Example:
-        >>> import numpy as np
         >>> v, u = np.mgrid[:120, :160]
         >>> image = 100.0 + 40.0 * np.sin(0.2 * u) * np.cos(0.15 * v)
-        >>> keyframe = Keyframe.prepare(image, np.full((120, 160), 2.0), Pinhole(150.0, 150.0, 79.5, 59.5), levels=3)
+        >>> keyframe = bp.Keyframe.prepare(image, np.full((120, 160), 2.0), bp.Pinhole(150.0, 150.0, 79.5, 59.5), levels=3)
         >>> [level.octave for level in keyframe.levels]
         [2, 1, 0]
     """

@@ -76,6 +76,13 @@ class Alignment:
             this is another place or a wrong pose; `unobservable`, a direction of motion about which grey values say
             no more than their noise.
         reason: why the pose must not be believed, in a sentence with figures; empty when `converged`.
+
+    Example:
+        >>> camera, v = bp.Pinhole(100.0, 100.0, 63.5, 47.5), np.linspace(0.0, 20.0, 128)
+        >>> image = 100.0 + 40.0 * np.sin(v[None, :]) + 40.0 * np.cos(v[:96, None])
+        >>> found = bp.align_rgbd(image, np.full(image.shape, 2.0), image, camera)
+        >>> found.status, np.allclose(found.T_21, bp.SE3.identity(), atol=1e-3), found.covariance.shape
+        ('converged', True, (6, 6))
     """
 
     T_21: Matrix
@@ -128,9 +135,8 @@ def track(
     Example:
         >>> v, u = np.mgrid[:120, :160]
         >>> grey = 100.0 + 40.0 * np.sin(0.2 * u) * np.cos(0.15 * v)
-        >>> from boxplus.cameras.pinhole import Pinhole
-        >>> keyframe = Keyframe.prepare(grey, np.full((120, 160), 2.0), Pinhole(150.0, 150.0, 79.5, 59.5), levels=3)
-        >>> found = track(keyframe, 0.8 * grey + 5.0)
+        >>> keyframe = bp.Keyframe.prepare(grey, np.full((120, 160), 2.0), bp.Pinhole(150.0, 150.0, 79.5, 59.5), levels=3)
+        >>> found = bp.track(keyframe, 0.8 * grey + 5.0)
         >>> found.status, round(float(np.exp(found.brightness[0])), 3)
         ('converged', 1.25)
     """

@@ -6,7 +6,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class DirectOdometryConfig(BaseModel):
-    """Settings of `DirectOdometry`; every one has a default that served indoor RGB-D and outdoor stereo alike."""
+    """Settings of `DirectOdometry`; every one has a default that served indoor RGB-D and outdoor stereo alike.
+
+    Example:
+        >>> bp.DirectOdometryConfig(window=5).keyframe_flow > 0.0
+        True
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -67,10 +67,12 @@ class DirectOdometry:
         InputError: a camera that is no pinhole, a pose that is none.
 
     Example:
-        >>> odometry = DirectOdometry(Pinhole(525.0, 525.0, 319.5, 239.5))       # doctest: +SKIP
-        >>> for time_ns, grey, depth in frames:                                  # doctest: +SKIP
-        ...     estimate = odometry.push_rgbd(time_ns, grey, depth)
-        ...     print(estimate.status, estimate.T_world_camera)
+        >>> odometry, v = bp.DirectOdometry(bp.Pinhole(100.0, 100.0, 63.5, 47.5)), np.linspace(0.0, 20.0, 140)
+        >>> wall = 100.0 + 40.0 * np.sin(v[None, :]) + 40.0 * np.cos(v[:96, None])
+        >>> for k in range(4):  # a wall 2 m ahead that passes by, a pixel a frame
+        ...     estimate = odometry.push_rgbd(k * 33_000_000, wall[:, k : k + 128], np.full((96, 128), 2.0))
+        >>> estimate.status, estimate.p_world_camera.round(2) + 0.0
+        ('ok', array([0.06, 0.  , 0.  ]))
     """
 
     def __init__(
@@ -85,8 +87,7 @@ class DirectOdometry:
         self.config = config or DirectOdometryConfig()
         self.stereo = stereo
         self.window = Window(self.camera, self.config.window)
-        self.gaps = 0
-        """How often the view was lost for so long that the poses since are a guess."""
+        self.gaps = 0  # how often the view was lost for so long that the poses since are a guess
         self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
         self._covariance: Matrix = _WORLD
         self._velocity, self._velocity_s = _STANDSTILL, 0.0

@@ -34,6 +34,14 @@ class Estimate:
         finished_points: (n, 3) float32, of the map, in the world [m]: those of a keyframe that left the window with this frame,
             and that will not be adjusted any more.
         timing_s: seconds, by stage.
+
+    Example:
+        >>> camera, v = bp.Pinhole(100.0, 100.0, 63.5, 47.5), np.linspace(0.0, 20.0, 140)
+        >>> wall = 100.0 + 40.0 * np.sin(v[None, :]) + 40.0 * np.cos(v[:96, None])
+        >>> odometry = bp.DirectOdometry(camera)
+        >>> estimate = odometry.push_rgbd(0, wall[:, :128], np.full((96, 128), 2.0))
+        >>> estimate.status, estimate.is_keyframe, estimate.T_world_camera.shape, estimate.pose_covariance.shape
+        ('ok', True, (7,), (6, 6))
     """
 
     time_ns: int

@@ -14,7 +14,13 @@ from boxplus.maps.registration_config import RegistrationConfig
 
 
 class LioConfig(RegistrationConfig):
-    """Settings of `LidarInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz)."""
+    """Settings of `LidarInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz).
+
+    Example:
+        >>> config = bp.LioConfig(scan_voxel=0.3, max_points=1000)
+        >>> config.map_cell, bp.LioConfig.model_validate({"scan_voxel": 0.3}).scan_voxel
+        (0.25, 0.3)
+    """
 
     T_imu_lidar: tuple[tuple[float, ...], ...] | None = Field(
         None, description="pose of the LiDAR in the IMU frame, 4×4 row-major: p_imu = T_imu_lidar p_lidar; None is the identity"

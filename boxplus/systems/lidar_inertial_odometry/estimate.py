@@ -26,6 +26,11 @@ class WeakDirection:
         rotation_imu: (3,) part of the unit direction that turns, about the IMU's axes (scaled by `lever_arm`).
         translation_world: (3,) part that moves, along the world's axes.
         information_ratio: information along it over what noise of the planes' normals alone would give; 1 is noise.
+
+    Example:
+        >>> from boxplus.systems.lidar_inertial_odometry import WeakDirection
+        >>> str(WeakDirection(np.zeros(3), np.array([1.0, 0.0, 0.0]), 1.1))
+        'position along (+1.00, +0.00, +0.00) in the world frame'
     """
 
     rotation_imu: NDArray[np.float64]
@@ -73,6 +78,18 @@ class Estimate:
         p_lidar: (N, 3) float32, all points of the scan in the LiDAR frame at `time_ns`, corrected for motion.
         intensity: (N,) float32 or None.
         lidar: (N,) uint8, which LiDAR saw each point, where several were merged; else None.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     odometry = bp.LidarInertialOdometry(bp.LioConfig(T_imu_lidar=recording.info.T_imu_lidar.tolist()))
+        ...     estimates = []
+        ...     for event in recording:
+        ...         estimates += odometry.push_scan(event) if isinstance(event, bp.Scan) else odometry.push_imu(event)
+        >>> last = estimates[-1]
+        >>> last.status, last.T_world_imu.shape, last.pose_covariance.shape, last.weak_directions
+        ('ok', (4, 4), (6, 6), ())
+        >>> last.lidar_share.shape  # of each axis: 1 is measured, 0 predicted only
+        (6,)
     """
 
     time_ns: int
@@ -116,6 +133,15 @@ class Prediction:
         time_ns: the newest IMU sample, absolute [ns].
         state: pose, velocity, biases, gravity and extrinsic at `time_ns`.
         covariance: (24, 24), as in `Estimate`.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     odometry = bp.LidarInertialOdometry(bp.LioConfig(T_imu_lidar=recording.info.T_imu_lidar.tolist()))
+        ...     for event in recording:
+        ...         estimates = odometry.push_scan(event) if isinstance(event, bp.Scan) else odometry.push_imu(event)
+        >>> now = odometry.predict()  # at the newest sample of the IMU
+        >>> now.state.p_world_imu.shape, now.covariance.shape
+        ((3,), (24, 24))
     """
 
     time_ns: int

@@ -54,6 +54,16 @@ class LidarInertialOdometry(Snapshots):
 
     Args:
         config: the settings; every one has a default.
+
+    Example:
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     odometry = bp.LidarInertialOdometry(bp.LioConfig(T_imu_lidar=recording.info.T_imu_lidar.tolist()))
+        ...     estimates = []
+        ...     for event in recording:
+        ...         estimates += odometry.push_scan(event) if isinstance(event, bp.Scan) else odometry.push_imu(event)
+        >>> estimates += odometry.flush()
+        >>> estimates[-1].status, odometry.contradiction
+        ('ok', None)
     """
 
     def __init__(self, config: LioConfig | None = None) -> None:

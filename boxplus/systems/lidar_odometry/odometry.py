@@ -69,6 +69,13 @@ class LidarOdometry(Snapshots):
 
     Raises:
         InputError: a setting of the IMU or of its mounting is given.
+
+    Example:
+        >>> odometry = bp.LidarOdometry()
+        >>> with bp.open_recording("flight.bag") as recording:
+        ...     estimates = [e for event in recording if isinstance(event, bp.Scan) for e in odometry.push_scan(event)]
+        >>> estimates[-1].status
+        'ok'
     """
 
     def __init__(self, config: LioConfig | None = None) -> None:

@@ -43,7 +43,12 @@ _COUNTS = 0.5  # weight from which on an edge is expected to fit its information
 
 
 class PoseGraphConfig(BaseModel):
-    """Options of `optimize_pose_graph`."""
+    """Options of `optimize_pose_graph`.
+
+    Example:
+        >>> bp.PoseGraphConfig(robust="gnc").start
+        'auto'
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -86,6 +91,11 @@ class PoseGraphResult:
             asked for, or odometry and the loops that were kept contradict each other; None otherwise.
         solution: with history, covariance, and why it stopped.
         timing_s: seconds of checking and building the problem, of the initialisation, and of the optimisation.
+
+    Example:
+        >>> result = bp.optimize_pose_graph(bp.read_pose_graph("loops.g2o"))
+        >>> result.start, bool(result.chi2 < result.chi2_start), result.errors.shape
+        ('chordal', True, (35,))
     """
 
     graph: PoseGraph
@@ -121,6 +131,11 @@ def optimize_pose_graph(
         InputError: no edge with information; the start asked for is not in the file; a robust loss together with `robust`, the
             chordal objective with `robust`, another one with `certify`.
         SingularProblemError: see `Problem.solve`.
+
+    Example:
+        >>> result = bp.optimize_pose_graph(bp.read_pose_graph("loops.g2o"))
+        >>> result.solution.status, result.graph.poses.shape
+        ('converged', (24, 7))
     """
     config = config if config is not None else PoseGraphConfig()
     _check(graph, config, loss)

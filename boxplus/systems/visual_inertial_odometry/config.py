@@ -14,7 +14,7 @@ class VioConfig(BaseModel):
         pydantic.ValidationError: a setting is unknown or out of range.
 
     Example:
-        >>> VioConfig(keyframes=8).keyframes
+        >>> bp.VioConfig(keyframes=8).keyframes
         8
     """
 

@@ -40,6 +40,19 @@ class VioEstimate:
         T_imu_camera: (c, 4, 4) as refined, or as given.
         time_offset_s: added to the times of the images, beside what the recording knows [s].
         timing_s: seconds spent, by stage.
+
+    Example:
+        >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+        >>> simulation = simulate_cameras("room", duration_s=2.0, rig=make_rig("stereo", scale=0.25, rate_hz=8.0))
+        >>> recording = as_camera_recording(simulation)
+        >>> cams = [stream.calibrated() for stream in recording.info.cameras]
+        >>> rig = bp.Rig.of([c.model for c in cams], [c.T_body_camera for c in cams], [(c.width, c.height) for c in cams])
+        >>> odometry, estimates = bp.VisualInertialOdometry(None, rig), []
+        >>> for event in recording:
+        ...     estimates += odometry.push_image(event) if isinstance(event, bp.CameraImage) else odometry.push_imu(event)
+        >>> last = estimates[-1]
+        >>> last.status, last.T_world_imu.shape, last.landmarks.shape[1]
+        ('ok', (4, 4), 3)
     """
 
     time_ns: int

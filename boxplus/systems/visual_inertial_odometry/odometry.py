@@ -57,6 +57,18 @@ class VisualInertialOdometry:
 
     Raises:
         InputError: OpenCV, the extra `vision`, is not installed.
+
+    Example:
+        >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+        >>> simulation = simulate_cameras("room", duration_s=2.0, rig=make_rig("stereo", scale=0.25, rate_hz=8.0))
+        >>> recording = as_camera_recording(simulation)
+        >>> cams = [stream.calibrated() for stream in recording.info.cameras]
+        >>> rig = bp.Rig.of([c.model for c in cams], [c.T_body_camera for c in cams], [(c.width, c.height) for c in cams])
+        >>> odometry, estimates = bp.VisualInertialOdometry(None, rig), []
+        >>> for event in recording:
+        ...     estimates += odometry.push_image(event) if isinstance(event, bp.CameraImage) else odometry.push_imu(event)
+        >>> estimates[-1].status, odometry.start.kind
+        ('ok', 'at rest')
     """
 
     def __init__(

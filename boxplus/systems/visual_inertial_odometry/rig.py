@@ -44,6 +44,14 @@ class Rig:
         cameras: in the order of `CameraImage.camera`.
         noise: of the IMU, as the calibration states it.
         mountings: (c, 7) T_imu_camera, wxyz and xyz.
+
+    Example:
+        >>> camera = bp.Pinhole(458.7, 457.3, 367.2, 248.4)
+        >>> left, right = np.eye(4), np.eye(4)
+        >>> right[0, 3] = 0.11
+        >>> rig = bp.Rig.of([camera, camera], [left, right], [(752, 480)] * 2)
+        >>> rig.mountings[1]
+        array([1.  , 0.  , 0.  , 0.  , 0.11, 0.  , 0.  ])
     """
 
     cameras: tuple[RigCamera, ...]

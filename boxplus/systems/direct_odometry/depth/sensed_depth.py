@@ -81,7 +81,7 @@ class StereoPair:
         InputError: a camera that is no pinhole, no pose, cameras in one place.
 
     Example:
-        >>> pair = StereoPair(Pinhole(700.0, 700.0, 600.0, 180.0), (1, 0, 0, 0, -0.54, 0, 0))
+        >>> pair = bp.StereoPair(bp.Pinhole(700.0, 700.0, 600.0, 180.0), (1, 0, 0, 0, -0.54, 0, 0))
         >>> round(pair.baseline_m, 2)
         0.54
     """

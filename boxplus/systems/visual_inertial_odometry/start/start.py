@@ -72,6 +72,18 @@ class Start:
         bias_before: (6,) the biases `[b_ω, b_a]` that `covariance` is about: at rest what was found, in motion zero.
         last_covariance: (15, 15) of the last state after all that was measured, relative to position and yaw of the first.
         facts: the numbers of the tests it passed, by name and unit, for the report.
+
+    Example:
+        >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+        >>> simulation = simulate_cameras("room", duration_s=2.0, rig=make_rig("stereo", scale=0.25, rate_hz=8.0))
+        >>> recording = as_camera_recording(simulation)
+        >>> cams = [stream.calibrated() for stream in recording.info.cameras]
+        >>> rig = bp.Rig.of([c.model for c in cams], [c.T_body_camera for c in cams], [(c.width, c.height) for c in cams])
+        >>> odometry, estimates = bp.VisualInertialOdometry(None, rig), []
+        >>> for event in recording:
+        ...     estimates += odometry.push_image(event) if isinstance(event, bp.CameraImage) else odometry.push_imu(event)
+        >>> odometry.start.kind, odometry.start.gyro_bias.shape
+        ('at rest', (3,))
     """
 
     kind: Literal["at rest", "moving stereo", "moving mono"]
