@@ -200,7 +200,9 @@ class Day:
 
     def drive(self, drive: DriftingDrive, forward: bool) -> Start:
         """Push a drive until 3 s after it was found. A second one is a kidnapping: the odometry goes on from where it was."""
-        errors, took, verdicts, found_s = [], {True: [], False: []}, [], np.nan
+        found_s, verdicts = np.nan, list[str]()
+        errors: list[list[float]] = []
+        took: dict[bool, list[float]] = {True: [], False: []}
         T_drive = se3.compose(self._T_own, se3.inverse(drive.T_odo_body[0]))
         begin_ns = self._now_ns + (100_000_000 if self._now_ns else 0)
         was_lost = self._now_ns == 0
