@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def localize(
     recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
     saved: Annotated[
-        Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio' or 'boxplus slam', map folder, PLY or PCD file.")
+        Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio' or 'boxplus slam', map folder, or point cloud file.")
     ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_localized here.")

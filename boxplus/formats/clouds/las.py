@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
 _EXACT = "intensity_exact"
 _SCALE = 1e-4  # m: LAS keeps coordinates as whole multiples of it
 _FARTHEST = _SCALE * (2**31 - 1)
+_NEAR, _ROUND = 4000.0, 1000.0  # m: what is farther than that from the origin is counted from a multiple of this
 _LARGEST = 65_535  # of LAS' own intensity
 
 
@@ -98,10 +100,51 @@ def read_las(path: str | Path) -> PointCloud:
     """Read the points of a LAS or LAZ file; intensities where they are not all zero.
 
     Raises:
-        InputError: laspy is not installed; the file is missing, cut or malformed; coordinates that float32 cannot hold.
+        InputError: laspy is not installed; the file is missing, cut or malformed; coordinates that float32 cannot hold, for which
+            there is `read_survey`.
     """
-    laspy, source = _import(), Path(path)
-    with opened(source, "LAS") as file:
+    columns, intensity, _ = _columns(Path(path))
+    return PointCloud(as_points(columns, Path(path)), intensity)
+
+
+def read_survey(path: str | Path) -> tuple[PointCloud, NDArray[np.float64]]:
+    """Read a LAS or LAZ file in coordinates of the Earth: points counted from an origin nearby, and that origin (3,) [m].
+
+    The origin is zero along an axis whose coordinates lie within 4 km, and else the multiple of 1 km next to the middle of them;
+    a position in the file is `origin + points`.
+
+    Raises:
+        InputError: as `read_las`; coordinates in degrees, where the file says so; an extent that float32 cannot hold.
+
+    Example:
+        `cloud, origin = read_survey("survey.laz"); (origin + cloud.points).mean(axis=0)`
+    """
+    source = Path(path)
+    columns, intensity, header = _columns(source)
+    if importlib.util.find_spec("pyproj"):
+        faults: tuple[type[BaseException], ...] = (*_faults(), RuntimeError)
+        try:
+            crs = header.parse_crs()
+        except faults:  # what pyproj raises; the file names none that is known, and is taken as it is
+            crs = None
+        if crs is not None and crs.is_geographic:
+            raise InputError("coordinates in metres", f"{crs.name}, in degrees ({path})", "convert the file to UTM")
+    origin = np.array([_nearby(values) for values in columns])
+    local = [values - offset for values, offset in zip(columns, origin, strict=True)]
+    return PointCloud(as_points(local, source), intensity), origin
+
+
+def _nearby(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    if not len(known) or np.abs(known).max() <= _NEAR:
+        return 0.0
+    return float(np.round(0.5 * (known.min() + known.max()) / _ROUND) * _ROUND)
+
+
+def _columns(path: Path) -> tuple[list[NDArray[np.float64]], NDArray[np.float32] | None, Any]:
+    """x, y and z, intensity where there is any, and the header."""
+    laspy = _import()
+    with opened(path, "LAS") as file:
         try:
             cloud = laspy.read(file, closefd=False)
             found = len(cloud.points)
@@ -112,7 +155,7 @@ def read_las(path: str | Path) -> PointCloud:
             raise InputError("a whole LAS or LAZ file", f"{path}: {error}", "give another file, or write it again") from error
     if found != cloud.header.point_count:
         raise InputError(f"{cloud.header.point_count} points, as the header says", f"{found} ({path})", "the file was cut")
-    return PointCloud(as_points(columns, source), intensity if exact or intensity.any() else None)
+    return columns, intensity if exact or intensity.any() else None, cloud.header
 
 
 def _import() -> Any:

@@ -171,6 +171,7 @@ def _summary(
         map=printable(str(saved.path.resolve())),
         map_kind=saved.kind,
         map_report=[printable(text) for text in saved.report],
+        map_origin=saved.origin.tolist(),
         places=len(saved.local_maps),
         contradiction=odometry.contradiction,
         scans=odometry.scans,

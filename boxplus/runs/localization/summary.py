@@ -24,6 +24,10 @@ class LocalizationSummary(Part):
     map: str = Field(description="path of the map")
     map_kind: str = Field(description="what wrote it")
     map_report: list[str] = Field(default=[], description="what of it is torn, left out or was computed")
+    map_origin: list[float] = Field(
+        default=[0.0, 0.0, 0.0],
+        description="what positions in the map are counted from, in the coordinates of a LAS or LAZ file [m]",
+    )
     places: int = Field(0, description="local maps of the map")
     contradiction: str | None = Field(None, description="why the odometry is not to be trusted; see odometry/run.json")
     scans: int = 0

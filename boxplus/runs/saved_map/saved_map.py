@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
-from boxplus.formats.clouds.pcd import read_pcd
-from boxplus.formats.clouds.ply import read_ply
+from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
+from boxplus.formats.clouds.las import read_survey
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
@@ -24,7 +24,7 @@ from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file
-_WHAT = "a folder of 'boxplus lio' or 'boxplus slam', a map folder with tiles, or a PLY or PCD file"
+_WHAT = "a folder of 'boxplus lio' or 'boxplus slam', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +38,8 @@ class SavedMap:
             be seen from there. Covariances are those of the trajectory, zero for a map without one.
         trajectory: the poses it was made on, in the map's frame; None for a bare map.
         voxel: one point per voxel of this edge is given [m].
+        origin: (3,) what is counted from, in the coordinates of the file it is from [m]; zero for most, a multiple of 1 km where
+            a LAS or LAZ file has coordinates of the Earth.
         report: sentences on what is torn, left out, or had to be computed. It grows where a tile turns out damaged later.
     """
 
@@ -48,6 +50,7 @@ class SavedMap:
     voxel: float
     report: list[str]
     _points: TiledPoints
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def points_near(self, centre: ArrayLike, radius: float) -> NDArray[np.float32]:
         """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
@@ -55,7 +58,7 @@ class SavedMap:
 
 
 def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> SavedMap:
-    """Open a run's folder, a folder with map tiles, or a PLY or PCD file, as a map.
+    """Open a run's folder, a folder with map tiles, or a PLY, PCD, LAS, LAZ or E57 file, as a map.
 
     Of a run, the (corrected) trajectory says where its local maps are. Without one they stand on a grid over the ground, which is
     said in `report`. z is taken to be up.
@@ -74,9 +77,11 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     if not base.exists():
         raise InputError(_WHAT, f"nothing at {base}", "check the path")
     report: list[str] = []
-    kind, trajectory = "point cloud", None
+    kind, trajectory, origin = "point cloud", None, np.zeros(3)
     if base.is_file():
-        points = _of_file(base, config.voxel)
+        points, origin = _of_file(base, config.voxel)
+        if origin.any():
+            report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
         tiles, kind, trajectory = _what_is_in(base, report)
         points = _of_tiles(tiles, config.voxel, report)
@@ -93,7 +98,7 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         )
     if not local_maps:
         raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
-    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points)
+    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin)
 
 
 def _what_is_in(base: Path, report: list[str]) -> tuple[Path, str, Trajectory | None]:
@@ -140,12 +145,15 @@ def _of_tiles(folder: Path, voxel: float, report: list[str]) -> TiledPoints:
     return TiledPoints(store.counts, store.manifest.tile_size_m, read)
 
 
-def _of_file(path: Path, voxel: float) -> TiledPoints:
-    """A cloud is kept in memory as a whole, thinned."""
-    readers = {".ply": read_ply, ".pcd": read_pcd}
-    if path.suffix.lower() not in readers:
-        raise InputError(_WHAT, f"a file {path.name}", "convert it to PLY or PCD")
-    points = readers[path.suffix.lower()](path).points
-    points = points[np.isfinite(points).all(axis=1)]
+def _of_file(path: Path, voxel: float) -> tuple[TiledPoints, NDArray[np.float64]]:
+    """A cloud is kept in memory as a whole, thinned; and the origin (3,) that it is counted from."""
+    origin, ending = np.zeros(3), path.suffix.lower()
+    if ending not in CLOUD_ENDINGS:
+        raise InputError(_WHAT, f"a file {path.name}", "convert it to one of these")
+    if ending in (".las", ".laz"):
+        cloud, origin = read_survey(path)
+    else:
+        cloud = read_cloud(path)
+    points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
     tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
-    return TiledPoints(tiles, _TILE, lambda index: tiles[index])
+    return TiledPoints(tiles, _TILE, lambda index: tiles[index]), origin

@@ -17,6 +17,7 @@ from hypothesis.extra.numpy import arrays
 
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, cloud_writer, read_cloud
+from boxplus.formats.clouds.las import read_survey
 from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.clouds.point_cloud import FARTHEST_M
 
@@ -124,6 +125,30 @@ def test_las_files_of_other_programs(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="within 215 km of the origin"), cloud_writer(tmp_path / "far.las") as writer:
         writer.append([[300_000.0, 0.0, 0.0]])
     assert not (tmp_path / "far.las").exists()
+
+
+def test_surveys_keep_their_millimetres_about_an_origin_nearby(tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    xyz = random.uniform((691_200.0, 5_334_100.0, 480.0), (691_700.0, 5_334_900.0, 560.0), (2000, 3))
+
+    def write(name: str, points: np.ndarray, epsg: int | None = None) -> Path:
+        header = laspy.LasHeader(version="1.4", point_format=6)
+        header.scales, header.offsets = [1e-3] * 3, np.floor(points.min(axis=0))
+        if epsg is not None:
+            header.add_crs(pytest.importorskip("pyproj").CRS.from_epsg(epsg))
+        cloud = laspy.LasData(header)
+        cloud.x, cloud.y, cloud.z = points.T
+        cloud.write(str(tmp_path / name))
+        return tmp_path / name
+
+    found, origin = read_survey(write("survey.laz", xyz))
+    assert (np.abs(origin[:2] - xyz.mean(axis=0)[:2]) <= 500.0).all() and (origin % 1000.0 == 0.0).all() and origin[2] == 0.0
+    np.testing.assert_allclose(origin + found.points, xyz, atol=0.5e-3 + np.spacing(np.float32(1000.0)))
+    found, origin = read_survey(write("near.las", xyz - (691_000.0, 5_334_000.0, 0.0)))
+    np.testing.assert_array_equal(origin, np.zeros(3))
+    np.testing.assert_array_equal(found.points, read_cloud(tmp_path / "near.las").points)
+    with pytest.raises(InputError, match="in degrees"):
+        read_survey(write("degrees.las", np.array([[11.5, 48.1, 500.0]]), epsg=4326))
 
 
 def test_ply_files_in_a_map_projection_are_not_read_to_half_a_metre(tmp_path: Path) -> None:

@@ -90,6 +90,23 @@ def test_points_near_are_all_of_the_map_within_the_radius(run: Path) -> None:
     assert len(saved.points_near([500.0, 0.0, 0.0], 3.0)) == 0
 
 
+def test_a_survey_in_coordinates_of_the_earth_is_counted_from_a_near_origin(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    at = np.array([691_234.5, 5_334_321.25, 512.0])
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 1e-3), np.floor(at)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = (two_rooms() + at).T
+    cloud.write(str(tmp_path / "survey.laz"))
+    saved = open_saved_map(tmp_path / "survey.laz", CONFIG)
+    np.testing.assert_array_equal(saved.origin, [691_000.0, 5_334_000.0, 0.0])
+    assert any("counted from 691000, 5334000, 0 m" in text for text in saved.report)
+    near = saved.points_near(at - saved.origin + (6.0, 4.0, 0.0), 50.0) + saved.origin - at
+    gap = np.linalg.norm(two_rooms()[::50, None] - near[None], axis=2).min(axis=1)
+    assert gap.max() <= np.sqrt(3.0) * saved.voxel
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 def test_a_bare_cloud_has_places_over_its_ground(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cloud{suffix}"
@@ -126,7 +143,7 @@ def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="without map tiles"):
         open_saved_map(tmp_path / "empty")
     (tmp_path / "text.txt").write_text("no points")
-    with pytest.raises(InputError, match="convert it to PLY or PCD"):
+    with pytest.raises(InputError, match="LAZ or E57 file"):
         open_saved_map(tmp_path / "text.txt")
     with TileWriter(tmp_path / "none"):
         pass
