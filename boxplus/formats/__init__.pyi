@@ -1,4 +1,3 @@
-from .clouds.las import read_survey as read_survey
 from .clouds.pcd import read_pcd as read_pcd
 from .clouds.pcd import write_pcd as write_pcd
 from .clouds.ply import read_ply as read_ply
