@@ -102,7 +102,7 @@ class BlockPattern:
                 f"variables from 0 to {n - 1}", f"{min(i.min(), j.min())} to {max(i.max(), j.max())}", "check the indices"
             )
         diagonal = np.arange(n) * (n + 1)
-        keys, block = _unique(np.concatenate([diagonal, np.minimum(i, j) * n + np.maximum(i, j)]), n * n)
+        keys, block = unique_keys(np.concatenate([diagonal, np.minimum(i, j) * n + np.maximum(i, j)]), n * n)
         col_start = np.zeros(n + 1, np.int64)
         np.cumsum(np.bincount(keys // max(n, 1), minlength=n), out=col_start[1:])
         return cls(sizes, col_start, keys % max(n, 1)), PairIndex(block[n:].astype(np.int64), i < j)
@@ -167,7 +167,7 @@ class BlockPattern:
         return coo_matrix((entries, (rows, columns)), shape=(self.start[-1], self.start[-1])).tocsc()
 
 
-def _unique(keys: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def unique_keys(keys: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The different keys in ascending order, and the position of each key among them; keys are below `size`."""
     if size > 4 * len(keys) + 65536:
         different, position = np.unique(keys, return_inverse=True)

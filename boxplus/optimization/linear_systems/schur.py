@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from boxplus._jit import run_chunks
 from boxplus.optimization.linear_systems.linear_system import LinearSystem
 from boxplus.optimization.linear_systems.normal_equations import Gather, NormalEquations, add_gradient, add_products, piece
+from boxplus.optimization.linear_systems.schur_inverse import inverse_blocks
 from boxplus.optimization.linear_systems.schur_kernels import (
     factorize_eliminated,
     reduce_entries,
@@ -166,40 +167,10 @@ class SchurSystem(LinearSystem):
         run_chunks(lambda _, first, last: run(first, last, *arguments), items, piece(items, self._threads), self._threads)
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """See `LinearSystem.inverse_blocks`.
-
-        With M = L⁻ᵀ Zᵀ, the inverse is S⁻¹ between kept variables, −M S⁻¹ between an eliminated and the kept ones, and
-        (C + D)⁻¹ + M S⁻¹ Mᵀ between eliminated ones.
-        """
-        reached = {int(n): self._reached(int(n)) for n in np.unique(np.concatenate([first, second]))}
-        wanted = sorted({(a, b) for i, j in zip(first, second, strict=True) for a, _ in reached[i] for b, _ in reached[j]})
-        pairs = np.array(wanted, dtype=np.int64).reshape(-1, 2)
-        inverse = dict(zip(wanted, self._cholesky.inverse_blocks(pairs[:, 0], pairs[:, 1]), strict=True))
-        blocks = []
-        for i, j in zip(first, second, strict=True):
-            sizes = self._layout.sizes
-            block = np.zeros((sizes[i], sizes[j]))
-            for a, left in reached[int(i)]:
-                for b, right in reached[int(j)]:
-                    block += left @ inverse[a, b] @ right.T
-            own = int(i) - self._first
-            if i == j and 0 <= own < len(self._L):
-                root = np.linalg.inv(np.tril(self._L[own]))
-                block += root.T @ root
-            blocks.append(block)
-        return blocks
-
-    def _reached(self, number: int) -> list[tuple[int, NDArray[np.float64]]]:
-        """The kept variables through which a variable is correlated, with the factor for each: 1, or −M of its entry."""
-        own = number - self._first
-        if not 0 <= own < len(self._L):
-            return [(number if own < 0 else number - len(self._L), np.eye(int(self._layout.sizes[number])))]
-        root = np.linalg.inv(np.tril(self._L[own])).T
-        reached = []
-        for k in self._entries:
-            for n in k.order[k.of_eliminated[own] : k.of_eliminated[own + 1]]:
-                reached.append((int(k.kept[n]), -root @ k.Z[n]))
-        return reached
+        """See `LinearSystem.inverse_blocks`."""
+        return inverse_blocks(
+            first, second, self._layout.sizes, self._first, self._L, self._entries, self._cholesky.inverse_blocks, self._threads
+        )
 
 
 def _gathers_of(

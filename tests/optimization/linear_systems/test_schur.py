@@ -86,6 +86,20 @@ def test_steps_and_inverse_blocks(seed, solver):
             np.testing.assert_allclose(block, inverse[start[i] : start[i + 1], start[j] : start[j + 1]], atol=1e-9)
 
 
+def test_blocks_of_the_inverse_are_symmetric_and_the_same_bits_on_several_threads():
+    found = []
+    for threads in (1, 3):
+        model = make(1).solve(linear_solver="schur", threads=threads, max_iterations=2, initial_damping=1e-9)._problem
+        model.solve(None)
+        every = np.arange(len(model.layout.sizes))
+        found.append([*model.system.inverse_blocks(every, every), *model.system.inverse_blocks(every[:-1], every[1:])])
+        assert model.system.inverse_blocks(every[:0], every[:0]) == []
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for block in found[0][: len(every)]:
+        np.testing.assert_array_equal(block, block.T)
+
+
 @pytest.mark.parametrize("method", ["levenberg_marquardt", "dogleg"])
 def test_rejected_steps_leave_no_trace(method):
     """A rejected step overwrites the Jacobians, which the elimination reads again for the next damping."""
