@@ -64,28 +64,30 @@ def mean_error(camera: Pinhole, first: Image, depth: NDArray[np.float32], second
     return float(np.abs(e[e != 0.0]).mean())
 
 
+@pytest.mark.parametrize("points", [None, 5000], ids=["all", "chosen"])
 @pytest.mark.parametrize("loss", [None, Squared()], ids=["Huber", "Squared"])
-def test_synthetic_motion_is_found(loss: object) -> None:
+def test_synthetic_motion_is_found(loss: object, points: int | None) -> None:
     T_21 = se3.exp(np.array([0.03, -0.04, 0.05, 0.08, -0.05, 0.1]))
     first, depth, second = textured_plane(1, T_21)
-    found = align_rgbd(first, depth, second, CAMERA, levels=4, loss=loss)  # type: ignore[arg-type]
+    found = align_rgbd(first, depth, second, CAMERA, levels=4, points=points, loss=loss)  # type: ignore[arg-type]
     degrees, metres = degrees_and_metres(found.T_21, T_21)
     assert found.status == "converged" and degrees < 0.01 and metres < 5e-4
     assert len(found.iterations) == 4 and found.overlap > 0.8 and found.mean_error < 2.0  # of a texture of 60
-    assert found.pixels == round(found.overlap * 120 * 160)
+    assert found.pixels == round(found.overlap * 120 * 160) if points is None else found.pixels <= points
     # The errors are within a few times what the covariance says: interpolation is not white noise.
     error = se3.log(se3.compose(found.T_21, se3.inverse(T_21)))
     assert (np.abs(error) < 20.0 * np.sqrt(np.diag(found.covariance))).all()
 
 
-def test_covariance_is_that_of_white_noise() -> None:
+@pytest.mark.parametrize("points", [None, 5000], ids=["all", "chosen"])
+def test_covariance_is_that_of_white_noise(points: int | None) -> None:
     """Over noisy copies of a pair, errors have the covariance stated; noise in image 1, as interpolation would smooth it."""
     T_21 = se3.exp(np.array([0.01, 0.005, -0.01, 0.02, 0.01, -0.02]))
     first, depth, second = textured_plane(2, T_21)
     rng, errors, variances = np.random.default_rng(5), [], []
     for _ in range(30):
         noisy = first + rng.normal(size=first.shape).astype(np.float32) * 4.0
-        found = align_rgbd(noisy, depth, second, CAMERA, levels=2)
+        found = align_rgbd(noisy, depth, second, CAMERA, levels=2, points=points)
         errors.append(se3.log(se3.compose(found.T_21, se3.inverse(T_21))))
         variances.append(np.diag(found.covariance))
     ratio = np.var(errors, axis=0) / np.mean(variances, axis=0)
@@ -191,7 +193,7 @@ def test_slambook_pairs_agree_with_each_other(shared_data: Path) -> None:
     depths = {i: read_png(folder / "depth" / f"{i}.png") / 5000.0 for i in (1, 2, 4)}
     found = {}
     for i, j in ((1, 2), (2, 1), (1, 4), (4, 1)):
-        found[i, j] = align_rgbd(images[i], depths[i], images[j], camera, search_deg=50.0)
+        found[i, j] = align_rgbd(images[i], depths[i], images[j], camera, points=None, search_deg=50.0)
         assert found[i, j].status == "converged" and found[i, j].mean_error < 1.5
         T_file = np.concatenate([quaternion.from_matrix(R[j - 1].T @ R[i - 1]), R[j - 1].T @ (p[i - 1] - p[j - 1])])
         degrees, metres = degrees_and_metres(found[i, j].T_21, T_file)
