@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import kernel
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
@@ -170,9 +171,40 @@ class BlockPattern:
 def unique_keys(keys: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The different keys in ascending order, and the position of each key among them; keys are below `size`."""
     if size > 4 * len(keys) + 65536:
-        different, position = np.unique(keys, return_inverse=True)
-        return different, position.astype(np.int64)
+        different, position = np.empty_like(keys), np.empty_like(keys)
+        bits = (int(size - 1).bit_length() + 1) // 2
+        return different[: _number(keys, bits, different, position)], position
     # Few variables and many pairs: a table is quicker than a sort.
     found = np.zeros(size, dtype=np.bool_)
     found[keys] = True
     return np.flatnonzero(found), (np.cumsum(found) - 1)[keys]
+
+
+@kernel
+def _number(keys: NDArray[np.int64], bits: int, different: NDArray[np.int64], position: NDArray[np.int64]) -> int:
+    """Sort keys below 2²ᵇ by two digits of b bits each, count the different ones, and say which one each is."""
+    count, base = np.uint64(len(keys)), 1 << bits
+    order, second = np.empty(count, np.int64), np.empty(count, np.int64)
+    low, high = np.zeros(base + 1, np.int64), np.zeros(base + 1, np.int64)
+    for k in range(count):
+        low[(keys[k] & (base - 1)) + 1] += 1
+        high[(keys[k] >> bits) + 1] += 1
+    for digit in range(base):
+        low[digit + 1] += low[digit]
+        high[digit + 1] += high[digit]
+    for k in range(count):
+        digit = keys[k] & (base - 1)
+        order[low[digit]] = np.int64(k)
+        low[digit] += 1
+    for k in range(count):
+        digit = keys[order[k]] >> bits
+        second[high[digit]] = order[k]
+        high[digit] += 1
+    found = 0
+    for k in range(count):
+        key = keys[second[k]]
+        if found == 0 or different[found - 1] != key:
+            different[found] = key
+            found += 1
+        position[second[k]] = found - 1
+    return found

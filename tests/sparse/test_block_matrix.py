@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse import random_array
 
 from boxplus.errors import InputError
-from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.block_matrix import BlockPattern, unique_keys
 
 
 @given(seed=st.integers(0, 10**6), sizes=st.lists(st.integers(1, 4), min_size=1, max_size=8), pairs=st.integers(0, 20))
@@ -26,6 +26,21 @@ def test_pairs_become_the_blocks_of_a_matrix(seed: int, sizes: list[int], pairs:
             dense[start[b] : start[b + 1], start[a] : start[a + 1]] += added.T
         values[pattern.value_start[block] : pattern.value_start[block + 1]] += (added.T if transposed else added).ravel()
     np.testing.assert_allclose(pattern.to_scipy(values).toarray(), dense, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1, 2, 70_000, 2**20, 10**9, 2**41 + 1])
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_keys_are_numbered_in_their_order(size: int, count: int) -> None:
+    """By a table where they are dense, by two digits where not."""
+    rng = np.random.default_rng(0)
+    keys = rng.integers(0, size, count)
+    keys[: count // 2] = rng.permutation(keys)[: count // 2]
+    if count:
+        keys[-1], keys[0] = size - 1, 0
+    different, position = unique_keys(keys, size)
+    expected, positions = np.unique(keys, return_inverse=True)
+    np.testing.assert_array_equal(different, expected)
+    np.testing.assert_array_equal(position, positions)
 
 
 @pytest.mark.parametrize("sizes", [None, [2, 3, 1, 4]])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.errors import InputError, NotFiniteError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.linear_systems.linear_system import LinearSystem
@@ -22,6 +24,18 @@ Values = Sequence[NDArray[np.float64]]
 def inner(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """aᵀb, summed pairwise: BLAS would wake its threads for it, and let the bits depend on their number."""
     return float((a * b).sum())
+
+
+@kernel
+def _steepest(gradient: NDArray[np.float64], diagonal: NDArray[np.float64], length: float) -> float:
+    """Largest |gᵢ| / (‖r‖ √Hᵢᵢ)."""
+    steepest = 0.0
+    for k in range(np.uint64(len(gradient))):
+        # Roots before products: sigmas far from 1 overflow the product, and everything would seem to be at a right angle.
+        reach = length * math.sqrt(diagonal[k]) if diagonal[k] > 0.0 else 0.0
+        if reach > 0.0:
+            steepest = max(steepest, abs(gradient[k]) / reach)
+    return steepest
 
 
 class LeastSquares:
@@ -141,10 +155,7 @@ class LeastSquares:
 
     def slope(self) -> float:
         """Largest |cos| of the angle between the residuals and a column of the Jacobian: zero at a minimum, free of units."""
-        # Roots before products: sigmas far from 1 overflow the product, and everything would seem to be at a right angle.
-        reach = np.sqrt(2.0 * self.cost.cost) * np.sqrt(np.maximum(self.system.diagonal, 0.0))
-        steep = np.abs(self.system.gradient)
-        return float(np.divide(steep, reach, out=np.zeros_like(steep), where=reach > 0.0).max(initial=0.0))
+        return float(_steepest(self.system.gradient, self.system.diagonal, float(np.sqrt(2.0 * self.cost.cost))))
 
     def moved(self, delta: NDArray[np.float64]) -> Values:
         """The accepted point moved by δ."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout, connected_numbers
+from boxplus.sparse.components import connected_components
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +33,6 @@ class Components:
     @classmethod
     def of(cls, layout: Layout, groups: Sequence[Group]) -> Components:
         """From the structure alone, whatever the values."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
         count = len(layout.sizes)
         touched, anchored = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         none = np.zeros(0, dtype=np.int64)
@@ -54,8 +52,7 @@ class Components:
                 columns.append(number[both])
                 last = np.where(number >= 0, number, last)
         i, j = np.concatenate(rows), np.concatenate(columns)
-        graph = coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
-        found, label = connected_components(graph, directed=False) if count else (0, none)
+        found, label = connected_components(count, i, j)
         holds = np.zeros(found, dtype=np.bool_)
         np.logical_or.at(holds, label, anchored)
-        return cls(int(found), label.astype(np.int64), touched, holds)
+        return cls(found, label, touched, holds)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
@@ -98,14 +99,16 @@ class Layout:
             if not len(free):
                 moved.append(x)
                 continue
-            begin = int(self.start[number[free[0]]])
+            first, last = int(free[0]), int(free[-1]) + 1
+            begin = int(self.start[number[first]])
             step = delta[begin : begin + len(free) * tangent.dof].reshape(len(free), tangent.dof)
             if len(free) == len(x):
                 moved.append(tangent.boxplus(x, step))
-            else:
-                y = x.copy()
-                y[free] = tangent.boxplus(x[free], step)
-                moved.append(y)
+                continue
+            y = x.copy()
+            own = slice(first, last) if last - first == len(free) else free
+            y[own] = tangent.boxplus(x[own], step)
+            moved.append(y)
         return moved
 
     def largest_of_kind(self, diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,8 +124,7 @@ class Layout:
             free = number[number >= 0]
             if len(free):
                 own = slice(int(self.start[free[0]]), int(self.start[free[-1] + 1]))
-                kinds = diagonal[own].reshape(len(free), tangent.dof)
-                largest[own].reshape(kinds.shape)[:] = kinds.max() if tangent in _POINTS else kinds.max(axis=0)
+                _spread_largest(diagonal[own].reshape(len(free), tangent.dof), tangent in _POINTS, largest[own])
         return largest
 
     def describe(self, number: int) -> str:
@@ -141,3 +143,18 @@ def connected_numbers(layout: Layout, group: Group) -> list[NDArray[np.int64]]:
     if absent is not None:
         numbers = [np.where(absent, -1, number) for number in numbers]
     return numbers
+
+
+@kernel
+def _spread_largest(kinds: NDArray[np.float64], is_one_kind: bool, largest: NDArray[np.float64]) -> None:
+    """Every entry of kinds (n, dof) becomes the largest of its column, or of all, in largest (n dof,)."""
+    dof = np.uint64(kinds.shape[1])
+    most = kinds[0].copy()
+    for n in range(np.uint64(kinds.shape[0])):
+        for c in range(dof):
+            most[c] = max(most[c], kinds[n, c])
+    if is_one_kind:
+        most[:] = most.max()
+    for n in range(np.uint64(kinds.shape[0])):
+        for c in range(dof):
+            largest[n * dof + c] = most[c]

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.optimization.losses import SQUARED, triggs
 
+_SIX = np.uint64(6)
+
 
 @kernel
 def whiten_residuals(begin: int, end: int, W: NDArray[np.float64], is_diagonal: bool, r: NDArray[np.float64]) -> None:
@@ -33,6 +35,48 @@ def whiten_residuals(begin: int, end: int, W: NDArray[np.float64], is_diagonal: 
 
 
 @kernel
+def _whiten_six(begin: int, end: int, W: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    """J ← W J of 6×6 matrices; a row of the product at a time stays in registers."""
+    flat, factors, step = J.reshape(-1), W.reshape(-1), np.uint64(0 if W.shape[0] == 1 else _SIX * _SIX)
+    product = np.empty(_SIX * _SIX)
+    for n in range(np.uint64(begin), np.uint64(end)):
+        at, w = n * _SIX * _SIX, n * step
+        for i in range(_SIX):
+            p0, p1, p2, p3, p4, p5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            row = i * _SIX
+            for j in range(_SIX):
+                factor, k = factors[w + row + j], at + j * _SIX
+                if factor != 0.0:  # half of a root is
+                    p0 += factor * flat[k]
+                    p1 += factor * flat[k + np.uint64(1)]
+                    p2 += factor * flat[k + np.uint64(2)]
+                    p3 += factor * flat[k + np.uint64(3)]
+                    p4 += factor * flat[k + np.uint64(4)]
+                    p5 += factor * flat[k + np.uint64(5)]
+            product[row], product[row + np.uint64(1)], product[row + np.uint64(2)] = p0, p1, p2
+            product[row + np.uint64(3)], product[row + np.uint64(4)], product[row + np.uint64(5)] = p3, p4, p5
+        for q in range(_SIX * _SIX):
+            flat[at + q] = product[q]
+
+
+@kernel
+def _whiten_three(begin: int, end: int, W: NDArray[np.float64], J: NDArray[np.float64]) -> None:
+    """J ← W J of 3×3 matrices."""
+    step = np.uint64(0 if W.shape[0] == 1 else 1)
+    for n in range(np.uint64(begin), np.uint64(end)):
+        w, j = W[n * step], J[n]
+        w00, w01, w02, w10, w11, w12 = w[0, 0], w[0, 1], w[0, 2], w[1, 0], w[1, 1], w[1, 2]
+        w20, w21, w22 = w[2, 0], w[2, 1], w[2, 2]
+        for c in range(np.uint64(3)):
+            a, b, d = j[0, c], j[1, c], j[2, c]
+            j[0, c], j[1, c], j[2, c] = (
+                (w00 * a + w01 * b) + w02 * d,
+                (w10 * a + w11 * b) + w12 * d,
+                (w20 * a + w21 * b) + w22 * d,
+            )
+
+
+@kernel
 def whiten_jacobian(begin: int, end: int, W: NDArray[np.float64], is_diagonal: bool, J: NDArray[np.float64]) -> None:
     """J ← W J for the rows [begin, end); J is (N, d, k)."""
     dim, width = J.shape[1], J.shape[2]
@@ -46,6 +90,12 @@ def whiten_jacobian(begin: int, end: int, W: NDArray[np.float64], is_diagonal: b
             for k in range(np.uint64(begin * dim * width), np.uint64(end * dim * width)):
                 flat[k] *= w00
             return
+    if dim == 6 and width == 6 and not is_diagonal:  # poses in space and in the plane, written out
+        _whiten_six(begin, end, W, J)
+        return
+    if dim == 3 and width == 3 and not is_diagonal:
+        _whiten_three(begin, end, W, J)
+        return
     product = np.empty((dim, width))
     for n in range(begin, end):
         w = W[0] if shared else W[n]

@@ -18,6 +18,7 @@ from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import compose_into, inverse_into
 from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.cholesky import SparseCholesky
+from boxplus.sparse.components import connected_components
 
 _POLAR_ITERATIONS = 30
 
@@ -32,11 +33,7 @@ def held_poses(graph: PoseGraph) -> NDArray[np.int64]:
 
 def components(graph: PoseGraph) -> NDArray[np.int64]:
     """(n,) number of the connected component of every pose."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    n, (i, j) = len(graph.ids), graph.edges.T
-    return np.asarray(connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1], dtype=np.int64)
+    return connected_components(len(graph.ids), *graph.edges.T)[1]
 
 
 def spanning_tree_start(graph: PoseGraph) -> NDArray[np.float64]:
@@ -84,11 +81,12 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
     roots = held_poses(graph)
     start = _at_held(graph, roots)
     kappa, tau = _weights(graph)
+    relaxation = _Relaxation(len(graph.ids), i, j, roots)
     if graph.dimension == 3:
         Z = quaternion.to_matrix(graph.measurements[:, :4])
         # A row of R, as a column u: u_j = Zᵀ u_i. The three rows are three right-hand sides.
         known = np.swapaxes(quaternion.to_matrix(start[roots, :4]), 1, 2)
-        rows = _relaxed(len(graph.ids), i, j, np.swapaxes(Z, 1, 2), None, kappa, roots, known)
+        rows = relaxation.minimum(np.swapaxes(Z, 1, 2), None, kappa, known)
         R = _nearest_rotations(np.swapaxes(rows, 1, 2))
         start[:, :4] = quaternion.from_matrix(R)
         measured, at = graph.measurements[:, 4:], slice(4, 7)
@@ -96,14 +94,14 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
         c, s = np.cos(graph.measurements[:, 0]), np.sin(graph.measurements[:, 0])
         Z = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
         known = np.stack([np.cos(start[roots, 0]), np.sin(start[roots, 0])], -1)[:, :, None]
-        u = _relaxed(len(graph.ids), i, j, Z, None, kappa, roots, known)[:, :, 0]
+        u = relaxation.minimum(Z, None, kappa, known)[:, :, 0]
         start[:, 0] = np.arctan2(u[:, 1], u[:, 0])
         c, s = np.cos(start[:, 0]), np.sin(start[:, 0])
         R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
         measured, at = graph.measurements[:, 1:], slice(1, 3)
     steps = np.einsum("nab,nb->na", R[i], measured)
     same = np.ones((len(steps), 1, 1))  # t_j − t_i is the step, on every axis alike
-    start[:, at] = _relaxed(len(graph.ids), i, j, same, steps[:, None], tau, roots, start[roots, None, at])[:, 0]
+    start[:, at] = relaxation.minimum(same, steps[:, None], tau, start[roots, None, at])[:, 0]
     start[roots] = _at_held(graph, roots)[roots]  # to the last bit
     return start
 
@@ -127,49 +125,67 @@ def _weights(graph: PoseGraph) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return np.maximum(kappa, 1e-9 * (kappa.max() or 1e9)), np.maximum(tau, 1e-9 * (tau.max() or 1e9))
 
 
-def _relaxed(
-    n: int,
-    i: NDArray[np.int64],
-    j: NDArray[np.int64],
-    M: NDArray[np.float64],
-    step: NDArray[np.float64] | None,
-    weight: NDArray[np.float64],
-    roots: NDArray[np.int64],
-    known: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """(n, d, k) minimising Σ weight ‖u_j − M u_i − step‖² with u[roots] = known (roots, d, k).
+class _Relaxation:
+    """Σ weight ‖u_j − M u_i − step‖² over the edges of a graph, with u known at some poses; ordered once for all that is sought.
 
-    M is (m, d, d) and orthogonal, `step` (m, d, k), or None where all are zero.
+    Args:
+        n: poses.
+        i, j: (m,) ends of the edges.
+        roots: (k,) poses where u is known.
     """
-    d, k = known.shape[1:]
-    u = np.zeros((n, d, k))
-    u[roots] = known
-    free = np.ones(n, dtype=np.bool_)
-    free[roots] = False
-    number = np.cumsum(free) - 1
-    size = int(free.sum())
-    if size == 0:
+
+    def __init__(self, n: int, i: NDArray[np.int64], j: NDArray[np.int64], roots: NDArray[np.int64]) -> None:
+        self._i, self._j, self._roots = i, j, roots
+        self._free = np.ones(n, dtype=np.bool_)
+        self._free[roots] = False
+        self._between = self._free[i] & self._free[j]
+        self._inner = np.flatnonzero(self._between)
+        number = np.cumsum(self._free) - 1
+        self._pattern, self._pairs = BlockPattern.from_pairs(
+            np.ones(int(self._free.sum()), dtype=np.int64), number[j[self._inner]], number[i[self._inner]]
+        )
+        self._order: NDArray[np.int64] | None = None
+
+    def minimum(
+        self,
+        M: NDArray[np.float64],
+        step: NDArray[np.float64] | None,
+        weight: NDArray[np.float64],
+        known: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """u (n, d, c), with u[roots] = known (k, d, c).
+
+        Args:
+            M: (m, d, d), orthogonal.
+            step: (m, d, c); None where all are zero.
+            weight: (m,).
+        """
+        i, j, n, size = self._i, self._j, len(self._free), len(self._pattern.sizes)
+        d, c = known.shape[1:]
+        u = np.zeros((n, d, c))
+        u[self._roots] = known
+        if size == 0:
+            return u
+        told = np.flatnonzero(~self._between) if step is None else np.arange(len(i))
+        pull = M[told] @ u[i[told]] - u[j[told]]  # the free ones are still zero
+        if step is not None:
+            pull += step
+        pull *= weight[told, None, None]
+        right = np.zeros((n, d, c))
+        np.add.at(right, j[told], pull)
+        np.add.at(right, i[told], -np.swapaxes(M[told], 1, 2) @ pull)
+        pattern = BlockPattern(np.full(size, d), self._pattern.col_start, self._pattern.row)
+        values = np.zeros(len(pattern.row) * d * d).reshape(-1, d, d)
+        coupling = -weight[self._inner, None, None] * M[self._inner]
+        turned = np.where(self._pairs.transposed[:, None, None], np.swapaxes(coupling, 1, 2), coupling)
+        np.add.at(values, self._pairs.block, turned)
+        degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
+        values[pattern.col_start[:-1]] += degree[self._free, None, None] * np.eye(d)
+        cholesky = SparseCholesky(pattern, ordering="auto" if self._order is None else self._order)
+        self._order = cholesky.permutation
+        cholesky.factorize(values.reshape(-1))
+        u[self._free] = cholesky.solve(right[self._free].reshape(size * d, c)).reshape(size, d, c)
         return u
-    between = free[i] & free[j]
-    told = np.flatnonzero(~between) if step is None else np.arange(len(i))
-    pull = M[told] @ u[i[told]] - u[j[told]]  # the free ones are still zero
-    if step is not None:
-        pull += step
-    pull *= weight[told, None, None]
-    right = np.zeros((n, d, k))
-    np.add.at(right, j[told], pull)
-    np.add.at(right, i[told], -np.swapaxes(M[told], 1, 2) @ pull)
-    inner = np.flatnonzero(between)
-    pattern, pairs = BlockPattern.from_pairs(np.full(size, d), number[j[inner]], number[i[inner]])
-    values = np.zeros(len(pattern.row) * d * d).reshape(-1, d, d)
-    coupling = -weight[inner, None, None] * M[inner]
-    np.add.at(values, pairs.block, np.where(pairs.transposed[:, None, None], np.swapaxes(coupling, 1, 2), coupling))
-    degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
-    values[pattern.col_start[:-1]] += degree[free, None, None] * np.eye(d)
-    cholesky = SparseCholesky(pattern)
-    cholesky.factorize(values.reshape(-1))
-    u[free] = cholesky.solve(right[free].reshape(size * d, k)).reshape(size, d, k)
-    return u
 
 
 def _nearest_rotations(M: NDArray[np.float64]) -> NDArray[np.float64]:
