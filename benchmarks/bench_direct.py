@@ -4,10 +4,11 @@
 
 Every sixth of 60 recorded frames (7-Scenes) is a keyframe, to which the one `gap` later is aligned, without a start value. Ours
 is timed from grey values to the pose, with the pyramid of the image and without what is prepared once a keyframe, which is
-reported apart; so is the alignment of two images that are both new, by chosen pixels and by all. OpenCV's `Odometry` (RGB and depth, fast) gets frames prepared beforehand, and
-the depth of the second frame too; timed is `compute`, and apart, with the preparation of the second frame. One thread, processor
-time; the two take turns; each one's fastest round of a pair counts, and medians over pairs are compared. Errors are against the
-poses given, which are those of KinectFusion. OpenCV is left out, with a message, where it has no odometry.
+reported apart; so is the alignment of two images that are both new, by chosen pixels and by all. OpenCV's `Odometry` (RGB and
+depth, fast) gets frames prepared beforehand, and the depth of the second frame too; timed is `compute`, and apart, with the
+preparation of the second frame. One thread, processor time; the two take turns; each one's fastest round of a pair counts, and
+medians over pairs are compared. Errors are against the poses given, which are those of KinectFusion. OpenCV is left out, with a
+message, where it has no odometry.
 """
 
 from __future__ import annotations
