@@ -14,7 +14,7 @@ from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout, connected_numbers
 from boxplus.optimization.terms.variables import Variables
 from boxplus.sparse.block_matrix import BlockPattern
-from boxplus.sparse.counting_sort import order_by
+from boxplus.sparse.counting_sort import gather_by, order_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,17 +152,18 @@ def build_products(
     within = np.arange(int(kept_pattern.value_start[-1])) - np.repeat(kept_pattern.value_start[:-1], length)
     places = np.repeat(pattern.value_start[own], length) + within
     products = []
-    kind_a, kind_b = np.searchsorted(first, a, side="right") - 1, np.searchsorted(first, b, side="right") - 1
+    every = np.arange(len(a))
     for i, rows in enumerate(entries):
         for j, columns in enumerate(entries):
-            chosen = np.flatnonzero((kind_a == i) & (kind_b == j))
+            chosen = every if len(entries) == 1 else np.flatnonzero(_within(a, first, i) & _within(b, first, j))
             if not len(chosen):
                 continue
-            by_block, start = order_by(pair_block[chosen], len(pattern.row))
-            blocks = np.flatnonzero(np.diff(start))
-            chosen = chosen[by_block]
-            entry_a = (a[chosen] - first[i]).astype(np.uint32)
-            entry_b = (b[chosen] - first[j]).astype(np.uint32)
-            target = pattern.value_start[blocks]
-            products.append(Products(rows, columns, target, np.append(start[blocks], len(chosen)), entry_a, entry_b))
+            blocks, start, ordered = gather_by(pair_block[chosen], len(pattern.row), chosen)
+            entry_a, entry_b = a[ordered] - np.uint32(first[i]), b[ordered] - np.uint32(first[j])
+            products.append(Products(rows, columns, pattern.value_start[blocks], start, entry_a, entry_b))
     return pattern, places, products
+
+
+def _within(entry: NDArray[np.uint32], first: NDArray[np.int64], kind: int) -> NDArray[np.bool_]:
+    """Which entries, counted over all kinds, are of one."""
+    return np.asarray((entry >= first[kind]) & (entry < first[kind + 1]))

@@ -34,8 +34,9 @@ def best_tangents(layout: Layout, groups: Sequence[Group], values: Sequence[NDAr
         others = [manifold for manifold in _alternatives(current) if manifold != current]
         if not others or layout.blocks[number].is_held is not None:  # components are held in the block's own tangent
             continue
-        own = _log_diagonal(layout, groups, values, number, current)
-        gains = [own - _log_diagonal(layout, groups, values, number, other) for other in others]
+        samples = _samples(layout, groups, number)
+        own = _log_diagonal(layout, values[number], number, current, samples)
+        gains = [own - _log_diagonal(layout, values[number], number, other, samples) for other in others]
         if max(gains) > _GAIN:
             best[number] = others[int(np.argmax(gains))]
     return tuple(best)
@@ -61,23 +62,36 @@ def _alternatives(manifold: Manifold) -> list[Manifold]:
     return []
 
 
-def _log_diagonal(
-    layout: Layout, groups: Sequence[Group], values: Sequence[NDArray[np.float64]], number: int, tangent: Manifold
-) -> float:
-    """Mean over the variables of Σ log Hᵢᵢ of their own blocks, were they moved by the ⊞ of `tangent`."""
+def _samples(
+    layout: Layout, groups: Sequence[Group], number: int
+) -> list[tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.uint32]]]:
+    """Jacobians for a block, some of the residuals that count, and the variables that these are connected to."""
     block = layout.blocks[number]
-    diagonal = np.zeros((len(block), tangent.dof))
-    change = tangent_change(layout.tangents[number], tangent)
+    samples = []
     for group in groups:
         for connection, jacobian in zip(group.connections, group.jacobians, strict=True):
-            if connection.block is not block:
-                continue
-            rows = np.flatnonzero(group.valid & (layout.numbers(connection) >= 0))
-            rows = rows[:: max(1, len(rows) // _SAMPLE)]
-            J, at = jacobian[rows], connection.rows[rows]
-            if change is not None:
-                change(0, len(rows), values[number], at, J)
-            _add_squares(J, at, diagonal)
+            if connection.block is block:
+                rows = np.flatnonzero(group.valid & (layout.numbers(connection) >= 0))
+                rows = rows[:: max(1, len(rows) // _SAMPLE)]
+                samples.append((jacobian, rows, connection.rows[rows]))
+    return samples
+
+
+def _log_diagonal(
+    layout: Layout,
+    x: NDArray[np.float64],
+    number: int,
+    tangent: Manifold,
+    samples: Sequence[tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.uint32]]],
+) -> float:
+    """Mean over the variables of Σ log Hᵢᵢ of their own blocks, were they moved by the ⊞ of `tangent`."""
+    diagonal = np.zeros((len(x), tangent.dof))
+    change = tangent_change(layout.tangents[number], tangent)
+    for jacobian, rows, at in samples:
+        J = jacobian[rows]
+        if change is not None:
+            change(0, len(rows), x, at, J)
+        _add_squares(J, at, diagonal)
     able = (diagonal > 0.0).all(axis=1)
     return float(np.log(diagonal[able]).sum(axis=1).mean()) if able.any() else 0.0
 
