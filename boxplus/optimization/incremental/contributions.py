@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.manifolds.se2 import between_scalars, log_scalars
 from boxplus.optimization.losses import SQUARED
 from boxplus.optimization.terms.weighting import weigh_jacobian, weigh_residuals, whiten_jacobian, whiten_residuals
 from boxplus.residuals.relative_pose import evaluate_rows, linearize_rows
@@ -17,6 +18,8 @@ from boxplus.residuals.relative_pose_2d import linearize_rows as linearize_rows_
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+_ONE, _TWO = np.uint64(1), np.uint64(2)
 
 
 @kernel
@@ -164,3 +167,48 @@ def check_relative_poses(rows: Indices, is_spatial: bool, is_exact: bool, T_i: A
     _whitened(rows, is_spatial, is_exact, False, T_i, T_j, index, measured, factors, code, scale, truth, none, none)
     places = starts(rows, index, (ids_i, ids_j), start)
     errors(rows, np.arange(len(rows)), truth, r, (J_i, J_j), places, delta, tolerance, is_off)
+
+
+@kernel
+def turned_factors(begin: int, end: int, measured: Array, factors: Array, turned: Array) -> None:
+    """Whitening factors of planar poses Z with the turn that Log(Z⁻¹ M) begins with: W diag(1, R_Zᵀ), rows [begin, end)."""
+    for n in range(begin, end):
+        c, s = math.cos(measured[n, 0]), math.sin(measured[n, 0])
+        for a in range(3):
+            turned[n, a, 0] = factors[n, a, 0]
+            turned[n, a, 1] = c * factors[n, a, 1] - s * factors[n, a, 2]
+            turned[n, a, 2] = s * factors[n, a, 1] + c * factors[n, a, 2]
+
+
+@kernel(inline=True)
+def _product(A: Array, n: int, row: int, a: float, b: float, c: float) -> float:
+    return A[n, row, 0] * a + A[n, row, 1] * b + A[n, row, 2] * c  # type: ignore[no-any-return]
+
+
+@kernel
+def check_planar_poses(rows: Indices, T_i: Array, T_j: Array, index: NDArray[np.uint32], measured: Array, turned: Array,
+                       ids_i: Indices, ids_j: Indices, start: Indices, delta: Array, tolerance: float, r: Array, J_i: Array,
+                       J_j: Array, is_off: NDArray[np.bool_]) -> None:  # fmt: skip
+    """As `check_relative_poses`, for least squares in the plane, where nearly all of an update's residuals are looked at in vain.
+
+    V⁻¹ of Log commutes with the turn of Z in the plane, which `turned` has taken in; one sine and cosine are left of two.
+    """
+    for k in range(np.uint64(len(rows))):
+        n = np.uint64(rows[k])
+        i, j = np.uint64(index[n, 0]), np.uint64(index[n, 1])
+        theta, x, y = between_scalars(T_i[i, 0], T_i[i, 1], T_i[i, 2], T_j[j, 0], T_j[j, 1], T_j[j, 2])
+        w, v0, v1 = log_scalars(theta - measured[n, 0], x - measured[n, 1], y - measured[n, 2])
+        e0 = _product(turned, n, 0, w, v0, v1) - r[n, 0]
+        e1 = _product(turned, n, 1, w, v0, v1) - r[n, 1]
+        e2 = _product(turned, n, 2, w, v0, v1) - r[n, 2]
+        if ids_i[i] >= 0:
+            at = np.uint64(start[ids_i[i]])
+            e0 -= _product(J_i, n, 0, delta[at], delta[at + _ONE], delta[at + _TWO])
+            e1 -= _product(J_i, n, 1, delta[at], delta[at + _ONE], delta[at + _TWO])
+            e2 -= _product(J_i, n, 2, delta[at], delta[at + _ONE], delta[at + _TWO])
+        if ids_j[j] >= 0:
+            at = np.uint64(start[ids_j[j]])
+            e0 -= _product(J_j, n, 0, delta[at], delta[at + _ONE], delta[at + _TWO])
+            e1 -= _product(J_j, n, 1, delta[at], delta[at + _ONE], delta[at + _TWO])
+            e2 -= _product(J_j, n, 2, delta[at], delta[at + _ONE], delta[at + _TWO])
+        is_off[k] = not e0 * e0 + e1 * e1 + e2 * e2 <= tolerance * tolerance

@@ -15,6 +15,7 @@ from boxplus.optimization.incremental.arena import block_size, give_back, take
 from boxplus.optimization.incremental.records import NONE, ROOT
 from boxplus.sparse.dense_kernels import Buffer, factor_panel
 from boxplus.sparse.multifrontal import SINGULAR
+from boxplus.sparse.prefetch import prefetch
 from boxplus.sparse.triangular_solve import backward_one
 from boxplus.sparse.vector_tiles import add
 
@@ -22,6 +23,7 @@ Indices = NDArray[np.int64]
 Table = NDArray[np.void]
 
 _ZERO = np.uint64(0)
+_FETCHED = 256  # elements of a panel that are asked for ahead; what follows the processor fetches by itself
 
 
 @kernel
@@ -111,6 +113,14 @@ def remove_cliques(cliques: Indices, table: Table, tops: Indices, free_cliques: 
         record["parent"] = NONE
         free_cliques[tops[3]] = c
         tops[3] += 1
+
+
+@kernel
+def _clear(numbers: Buffer, at: int, ld: int, columns: int, rows: int) -> None:
+    """Zeros from the diagonal on: what lies above is never read."""
+    for j in range(columns):
+        for k in range(np.uint64(at + j * ld + j), np.uint64(at + j * ld + rows)):
+            numbers[k] = 0.0
 
 
 @kernel(inline=True)
@@ -216,8 +226,8 @@ def eliminate(placed: Indices, owned_start: Indices, owned: Indices, child_head:
         for k in range(clique["variables_at"], clique["variables_at"] + clique["frontals"] + clique["separators"]):
             offset[integers[k]] = row
             row += dof[integers[k]]
-        for k in range(at, clique["update_at"] + (below + 1) * clique["update_ld"]):
-            numbers[k] = 0.0
+        _clear(numbers, at, ld, width, width + below + 1)
+        _clear(numbers, clique["update_at"], clique["update_ld"], below + 1, below + 1)
         for k in range(owned_start[g], owned_start[g + 1]):
             _add_factor(owned[k], clique, factor_start, factor_variables, dof, offset, contribution_at, contributions, numbers)
         child = child_head[g]
@@ -316,5 +326,9 @@ def substitute_back(table: Table, mark: int, wildfire: float, integers: Indices,
             if goes_on:
                 waiting[depth] = c
                 depth += 1
+                # A panel is read once an update, from far away: it is fetched while others are worked on.
+                here = child["memory_at"]
+                for ahead in range(here, min(here + _FETCHED, child["panel_at"] + child["width"] * child["panel_ld"]), 8):
+                    prefetch(numbers, np.uint64(ahead))
             c = child["next_sibling"]
     counts[0], counts[1] = count, solved

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.incremental.contributions import (
+    check_planar_poses,
     check_relative_poses,
     errors,
     linearize_relative_poses,
     products,
     starts,
+    turned_factors,
 )
 from boxplus.optimization.incremental.growing import grown
 from boxplus.optimization.incremental.variables import GrowingVariables
-from boxplus.optimization.losses import Loss
+from boxplus.optimization.losses import SQUARED, Loss
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.relative_pose import RelativePose
@@ -65,6 +67,8 @@ class RelativePoseStore:
         self._index, self._free = np.zeros((0, 2), np.uint32), np.zeros((0, 2), np.bool_)
         self._r, self._at = np.zeros((0, example.dim)), np.zeros(0, np.int64)
         self._J_i, self._J_j = np.zeros((0, example.dim, example.dim)), np.zeros((0, example.dim, example.dim))
+        self._is_plain = not self._is_spatial and loss.code == SQUARED
+        self._turned = np.zeros((0, 3, 3))  # where it is plain
 
     def append(self, residual: RelativePose | RelativePose2D, rows: NDArray[np.uint32], free: NDArray[np.bool_]) -> int:
         """Row of the first of more residuals that connect `rows` (N, 2)."""
@@ -74,6 +78,9 @@ class RelativePoseStore:
         self._r, self._J_i, self._J_j = (grown(a, end) for a in (self._r, self._J_i, self._J_j))
         self._measured[begin:end], self._factors[begin:end] = residual.measured, residual.whitening.factors
         self._index[begin:end], self._free[begin:end] = rows, free
+        if self._is_plain:
+            self._turned = grown(self._turned, end)
+            turned_factors(begin, end, self._measured, self._factors, self._turned)
         self._count = end
         return begin
 
@@ -92,6 +99,12 @@ class RelativePoseStore:
     ) -> NDArray[np.bool_]:
         first, second = (blocks[number] for number in self._blocks)
         is_off = np.empty(len(rows), np.bool_)
+        if self._is_plain:
+            check_planar_poses(
+                rows, first.estimates, second.estimates, self._index, self._measured, self._turned, first.numbers,
+                second.numbers, start, delta, tolerance, self._r, self._J_i, self._J_j, is_off,
+            )  # fmt: skip
+            return is_off
         check_relative_poses(
             rows, self._is_spatial, self._is_exact, first.estimates, second.estimates, self._index, self._measured, self._factors,
             self._loss.code, self._loss.scale, first.numbers, second.numbers, start, delta, tolerance,
