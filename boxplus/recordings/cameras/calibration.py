@@ -2,7 +2,8 @@
 
 Kalibr (Furgale et al., IROS 2013; github.com/ethz-asl/kalibr/wiki/yaml-formats): `T_cam_imu` maps IMU coordinates to camera
 coordinates, `T_cn_cnm1` those of the camera before, `timeshift_cam_imu` is t_imu − t_camera. `T_imu_cam`, which other tools write
-into the same form, is the inverse of the first.
+into the same form, is the inverse of the first. `line_delay` is the time from row to row of a rolling shutter; the middle row is
+taken at the stamp.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from boxplus.residuals.inertial.imu_noise import ImuNoise
 _ROTATION_ERROR = 1e-3
 _SAME_TRANSFORM = 1e-4
 
+LONGEST_READOUT_S = 0.2
+"""No rolling shutter takes longer from the first row to the last; a line delay that says so has another unit."""
+
 THIS_IS_THE_BODY = "the body is this camera, as there is no IMU"
 """Source of the mounting of the first camera of a recording without IMU."""
 
@@ -39,6 +43,7 @@ class StatedCamera:
         topic: the topic the calibration was made on.
         mounting_source: where `T_body_camera` comes from, if not from `source`.
         missing: why something is None.
+        line_delay_s: time from row to row of a rolling shutter [s].
     """
 
     source: str
@@ -49,6 +54,7 @@ class StatedCamera:
     topic: str = ""
     mounting_source: str = ""
     missing: Mapping[str, str] = field(default_factory=dict)
+    line_delay_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,11 +206,24 @@ def read_camchain(file: Path) -> StatedRig:
             size=(int(size[0]), int(size[1])) if len(size) == 2 else None,
             T_body_camera=T_body_camera,
             time_offset_s=None if offset is None else numbers([offset], f"timeshift_cam_imu in {file.name}")[0],
+            line_delay_s=_line_delay(block, size, f"{file.name}, {name}"),
             topic=str(block.get("rostopic", "")),
             missing=missing,
         )
     imu = content.get("imu0")
     return StatedRig(cameras, on_imu, imu_noise(imu) if isinstance(imu, Mapping) else None)
+
+
+def _line_delay(block: Mapping[str, Any], size: Sequence[float], what: str) -> float | None:
+    """Kalibr's `line_delay` [s]. Raises RecordingError: no number, or a shutter that takes longer than any."""
+    if block.get("line_delay") is None:
+        return None
+    (delay,) = numbers([block["line_delay"]], f"line_delay in {what}")
+    rows = size[1] if len(size) == 2 else 1.0
+    if not abs(delay) * rows <= LONGEST_READOUT_S:
+        got = f"{delay:g} s a row, {delay * rows:g} s for {rows:g} rows, in {what}"
+        raise RecordingError(f"a line_delay in seconds, {LONGEST_READOUT_S} s for all rows at most", got, "check its unit")
+    return delay
 
 
 def usable_mountings(rig: StatedRig, has_imu: bool, first: StatedCamera | None, source: str) -> dict[str, StatedCamera]:

@@ -27,6 +27,7 @@ class CalibratedCamera:
         model: projection of points in the camera frame (z forward, x to the right, y down).
         T_body_camera: (4, 4) float64, camera coordinates to body coordinates.
         width, height: of the images that the model belongs to [px].
+        line_delay_s: time from row to row of a rolling shutter [s]; the middle row is taken at the stamp. 0 where none is stated.
 
     Example:
         >>> from boxplus.recordings import CalibratedCamera
@@ -39,6 +40,7 @@ class CalibratedCamera:
     T_body_camera: NDArray[np.float64]
     width: int
     height: int
+    line_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +62,9 @@ class CameraStream:
             else the first camera.
         time_offset_s: t_imu − t_camera as calibrated [s]; it is already added to the images' times. None: not known, and
             nothing is added.
-        sources: where `model`, `T_body_camera`, `time_offset_s`, `depth_unit_m` come from.
+        sources: where `model`, `T_body_camera`, `time_offset_s`, `line_delay_s`, `depth_unit_m` come from.
         missing: what of these is not known, and why.
+        line_delay_s: time from row to row of a rolling shutter as stated [s]; None: nothing is said of the shutter.
 
     Example:
         >>> from boxplus.recordings import CameraStream
@@ -85,6 +88,7 @@ class CameraStream:
     time_offset_s: float | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     missing: Mapping[str, str] = field(default_factory=dict)
+    line_delay_s: float | None = None
 
     def calibrated(self) -> CalibratedCamera:
         """The calibration, complete.
@@ -101,7 +105,12 @@ class CameraStream:
                 "no " + " and no ".join(text for text, there in zip(unknown, known, strict=True) if not there),
                 "give a Kalibr camchain with CameraRecordingOptions(calibration=…)",
             )
-        return CalibratedCamera(model, T_body_camera, self.width, self.height)
+        return CalibratedCamera(model, T_body_camera, self.width, self.height, self.line_delay_s or 0.0)
+
+    @property
+    def readout_s(self) -> float:
+        """Time from the first row to the last as stated [s]; 0 where nothing is."""
+        return (self.line_delay_s or 0.0) * (self.height - 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,7 +69,7 @@ def _resolved(index: int, camera: FoundCamera) -> tuple[CameraStream, list[Evide
     sources: dict[str, str] = {}
     missing: dict[str, str] = {}
     evidence: list[Evidence] = []
-    model = T_body_camera = time_offset_s = None
+    model = T_body_camera = time_offset_s = line_delay_s = None
     for stated in camera.stated:
         for what, why in stated.missing.items():
             missing.setdefault(what, why)
@@ -96,6 +96,8 @@ def _resolved(index: int, camera: FoundCamera) -> tuple[CameraStream, list[Evide
                 evidence.append(Evidence(f"{camera.name}_mounting", "contradicted", "warning", text))
         if stated.time_offset_s is not None and time_offset_s is None:
             time_offset_s, sources["time_offset_s"] = stated.time_offset_s, stated.source
+        if stated.line_delay_s is not None and line_delay_s is None:
+            line_delay_s, sources["line_delay_s"] = stated.line_delay_s, stated.source
     if camera.depth_unit_m is not None:
         sources["depth_unit_m"] = camera.depth_unit_source
     for what, value in (("model", model), ("T_body_camera", T_body_camera), ("time_offset_s", time_offset_s)):
@@ -117,6 +119,7 @@ def _resolved(index: int, camera: FoundCamera) -> tuple[CameraStream, list[Evide
         model=model,
         T_body_camera=T_body_camera,
         time_offset_s=time_offset_s,
+        line_delay_s=line_delay_s,
         sources=sources,
         missing=missing,
     )
@@ -155,6 +158,12 @@ def _calibration_evidence(stream: CameraStream) -> list[Evidence]:
         if stream.time_offset_s is not None and what == "time_offset_s":
             value = f"{stream.time_offset_s * 1e3:+.3f} ms"
         evidence.append(Evidence(name, value, "ok", f"from {stream.sources[what]}"))
+    if stream.readout_s:
+        value = f"{stream.readout_s * 1e3:+.1f} ms"
+        text = (
+            f"a rolling shutter, first row to last, from {stream.sources['line_delay_s']}; 'boxplus vio' knows what to do with it"
+        )
+        evidence.append(Evidence(f"{stream.name}_line_delay", value, "ok", text))
     if stream.depth_unit_m is not None:
         text = f"metres of one count, from {stream.sources['depth_unit_m']}"
         evidence.append(Evidence(f"{stream.name}_depth_unit", f"{stream.depth_unit_m:g} m", "ok", text))

@@ -31,6 +31,9 @@ _NO_SCALE = (
     "one camera alone does not tell the scale: all lengths are in units of about the median depth of the first view, and the "
     "scale may drift along the way; compare with 'boxplus eval --align sim3'"
 )
+_ROLLS = (
+    "line_delay states a rolling shutter, which direct odometry takes for taken at once: where the camera moves fast, it errs"
+)
 _MOST_LOST, _MOST_DOUBTED = 0.1, 0.5  # shares of the frames from which on the whole run is not to be trusted
 
 
@@ -177,6 +180,9 @@ class _Run(CameraRun[Estimate, DirectSummary]):
     def summarize(self, state: State, error: str | None) -> DirectSummary:
         """See `RunLoop.summarize`."""
         facts = self.shared_facts(state, error, with_imu=False)
+        rolls = [c.name for c in (self._cameras.first, self._cameras.second) if c is not None and c.readout_s]
+        if rolls:
+            facts["warnings"].insert(0, WarningFacts(text=f"{' and '.join(rolls)}: {_ROLLS}", count=1))
         if self._cameras.kind == "mono":
             facts["warnings"].insert(0, WarningFacts(text=_NO_SCALE, count=1))
         return DirectSummary(

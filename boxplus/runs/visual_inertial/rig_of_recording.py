@@ -49,4 +49,5 @@ def rig_of_recording(info: CameraRecordingInfo, config: VioConfig) -> Rig:
         [camera.T_body_camera for camera in known],
         [(camera.width, camera.height) for camera in known],
         info.imu.noise,
+        [camera.line_delay_s for camera in known],
     )

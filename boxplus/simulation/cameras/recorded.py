@@ -124,6 +124,7 @@ def _stream(recorded: Recorded, index: int) -> CameraStream:
         model=camera.sensor.lens.model(),
         T_body_camera=camera.mounting,
         time_offset_s=0.0,
-        sources=dict.fromkeys(("model", "T_body_camera", "time_offset_s"), _SOURCE),
+        line_delay_s=camera.sensor.line_delay_s,
+        sources=dict.fromkeys(("model", "T_body_camera", "time_offset_s", "line_delay_s"), _SOURCE),
     )
     return replace(stream, depth_unit_m=1.0) if name == DEPTH else stream

@@ -56,7 +56,7 @@ class VisualInertialOdometry:
         line_tracker: what follows lines; if left out `LineTracker`, where the settings ask for lines.
 
     Raises:
-        InputError: OpenCV, the extra `vision`, is not installed.
+        InputError: OpenCV, the extra `vision`, is not installed; lines and a rolling shutter.
 
     Example:
         >>> from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
@@ -79,6 +79,8 @@ class VisualInertialOdometry:
         self.start: Start | None = None
         self.start_problem: str | None = None
         self.window = Window(self.config, self.rig)
+        if self.config.lines and any(camera.line_delay_s for camera in self.rig.cameras):
+            raise InputError("cameras that take all rows at once, for lines", "a rolling shutter", "leave lines out")
         self._tracker = FeatureTracker(self.config, self.rig) if tracker is None else tracker
         self._to_8_bits = EightBits()  # for lines; corners have their own
         self._line_tracker = line_tracker
@@ -193,7 +195,7 @@ class VisualInertialOdometry:
         before = self.window.bodies.values[-1]
         R = quaternion.to_matrix(before[:4]).T
         R_before_now, p_before_now = R @ quaternion.to_matrix(pose[:4]), R @ (pose[4:] - before[4:])
-        tracks = self._tracker.track(time_ns, images, R_before_now, p_before_now)
+        tracks = self._tracker.track(time_ns, images, R_before_now, p_before_now, self._rate(time_ns) - state[6:])
         is_keyframe = self.window.wants_keyframe(tracks, pose)
         if is_keyframe:
             tracks = self._tracker.detect(tracks)
@@ -214,6 +216,14 @@ class VisualInertialOdometry:
         self._forget_imu(self.window.frames[0].time_ns)
         return estimate
 
+    def _rate(self, time_ns: int) -> NDArray[np.float64]:
+        """Angular velocity (3,) that the gyroscope measured at a time of the cameras' clock [rad/s]."""
+        at = time_ns + self.window.cut_ns
+        first = int(np.clip(np.searchsorted(self._imu.time_ns, at) - 1, 0, max(len(self._imu) - 2, 0)))
+        near = slice(first, first + 2)
+        after_s = 1e-9 * (self._imu.time_ns[near] - at)
+        return np.array([np.interp(0.0, after_s, self._imu.gyro[near, k]) for k in range(3)])
+
     def _forget_imu(self, oldest_ns: int) -> None:
         """Samples from before the oldest frame that is still needed are not; some are kept for an offset of the clocks."""
         oldest = int(np.searchsorted(self._imu.time_ns, oldest_ns + self.window.cut_ns - 2 * SPARE_NS)) - 2
@@ -227,7 +237,7 @@ class VisualInertialOdometry:
             attitude = GyroAttitude(self._imu.time_ns[chosen], self._imu.gyro[chosen])
             before, now = attitude.at(np.array([self._time_ns, time_ns]))
             turn = before.T @ now
-        tracks = self._tracker.detect(self._tracker.track(time_ns, images, turn))
+        tracks = self._tracker.detect(self._tracker.track(time_ns, images, turn, None, self._rate(time_ns)))
         self._waiting.append(tracks)
         while time_ns - self._waiting[0].time_ns > _LONGEST_START * self.config.start_duration * 1e9:
             self._waiting.popleft()

@@ -38,6 +38,20 @@ def test_the_planar_look_takes_nan_for_off() -> None:
     is_off = np.zeros(1, np.bool_)
     none = np.zeros((1, 3))
     check_planar_poses(
-        np.array([0]), T, T, index, none, one, np.arange(2), np.arange(2), 3 * np.arange(2), np.zeros(6), 1e9, none, one, one, is_off
+        np.array([0]),
+        T,
+        T,
+        index,
+        none,
+        one,
+        np.arange(2),
+        np.arange(2),
+        3 * np.arange(2),
+        np.zeros(6),
+        1e9,
+        none,
+        one,
+        one,
+        is_off,
     )
     assert is_off.all()

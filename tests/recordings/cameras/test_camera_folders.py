@@ -96,13 +96,19 @@ def test_images_named_by_their_time_with_a_camchain(tmp_path: Path) -> None:
     base = "camera_model: pinhole, intrinsics: [10, 10, 5, 4], distortion_model: none, distortion_coeffs: [], resolution: [12, 8]"
     T_c1_c0 = np.linalg.inv(mounting(1)) @ mounting(0)
     camchain.write_text(
-        f"cam0: {{{base}, T_cam_imu: {np.linalg.inv(mounting(0)).tolist()}, timeshift_cam_imu: -0.001}}\n"
+        f"cam0: {{{base}, T_cam_imu: {np.linalg.inv(mounting(0)).tolist()}, timeshift_cam_imu: -0.001, line_delay: 0.002}}\n"
         f"cam1: {{{base}, T_cn_cnm1: {T_c1_c0.tolist()}}}\n"
     )
     with open_camera_recording(tmp_path, CameraRecordingOptions(calibration=camchain)) as recording:
         for camera in (0, 1):
             np.testing.assert_allclose(recording.info.cameras[camera].calibrated().T_body_camera, mounting(camera), atol=1e-12)
         assert [image.time_ns for image in images_of(recording)][:2] == [START_NS - 1_000_000, START_NS]
+        assert [camera.calibrated().line_delay_s for camera in recording.info.cameras] == [0.002, 0.0]
+        (said,) = (one for one in recording.info.evidence if one.key.endswith("line_delay"))
+        assert said.value == "+14.0 ms" and "camchain.yaml, cam0" in said.text
+    camchain.write_text(camchain.read_text().replace("0.002", "2000.0"))  # µs
+    with pytest.raises(RecordingError, match=r"line_delay in seconds.*16000 s for 8 rows, in camchain.yaml, cam0"):
+        open_camera_recording(tmp_path, CameraRecordingOptions(calibration=camchain))
 
 
 def test_a_camchain_without_an_imu_does_not_say_how_cameras_sit_on_one(tmp_path: Path) -> None:

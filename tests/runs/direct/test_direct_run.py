@@ -106,7 +106,9 @@ def test_a_run_writes_what_it_found(recorded: Path, tmp_path: Path) -> None:
 def test_the_sparse_map_lies_on_the_walls(recorded: Path, tmp_path: Path) -> None:
     with open_camera_recording(recorded) as recording:
         config = DirectRunConfig.model_validate({"odometry": {"window": 2, "keyframe_flow": 0.004}})
+        recording.info.cameras[0] = replace(recording.info.cameras[0], line_delay_s=1e-4)
         summary = run_direct_odometry(recording, tmp_path / "out", config)
+    assert "line_delay states a rolling shutter" in summary.warnings[0].text
     points, room = read_ply(tmp_path / "out" / "landmarks.ply").points, Room(60)
     assert summary.keyframes > 4  # most of them have left the window
     assert len(points) == summary.landmarks > 100 * summary.keyframes

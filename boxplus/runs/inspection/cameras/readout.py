@@ -150,8 +150,10 @@ def check_readout(camera: CameraStream, turns: Turns, imu: ImuSamples, aligned: 
         return [Evidence(key, "unchecked", "ok", "the camera turns too little, or too few corners agree: rows are not compared")]
     text = "time from the first to the last row by which corners agree best with the gyroscope, "
     text += f"standard deviation {found.std_s * 1e3:.1f} ms"
-    value = f"{found.time_s * 1e3:+.1f} ms"
-    if abs(found.time_s) > max(_SMALL_S, _SURE * found.std_s):
-        text += ": a rolling shutter is suspected; what takes images for taken at once errs by what moves meanwhile"
+    value, stated = f"{found.time_s * 1e3:+.1f} ms", f"; {camera.readout_s * 1e3:+.1f} ms as stated" if camera.readout_s else ""
+    text += stated
+    if abs(found.time_s - camera.readout_s) > max(_SMALL_S, _SURE * found.std_s):
+        text += ": check line_delay" if stated else ": a rolling shutter is suspected; state it as line_delay in the camchain"
+        text += ", what takes rows for taken at other times than they were errs by what moves meanwhile"
         return [Evidence(key, value, "warning", text)]
     return [Evidence(key, value, "ok", text)]

@@ -21,6 +21,7 @@ from boxplus._opencv import opencv
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.centres import centred
+from boxplus.systems.visual_inertial_odometry.corners.shutter import BodyMotion, at_once
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import inverse_depths
 from boxplus.systems.visual_inertial_odometry.rig import Rig
@@ -46,7 +47,12 @@ class Tracker(Protocol):
     opencv_s: float
 
     def track(
-        self, time_ns: int, images: Mapping[int, NDArray[Any]], R_before_now: Floats, p_before_now: Floats | None = None
+        self,
+        time_ns: int,
+        images: Mapping[int, NDArray[Any]],
+        R_before_now: Floats,
+        p_before_now: Floats | None = None,
+        rate: Floats | None = None,
     ) -> Tracks: ...
 
     def detect(self, tracks: Tracks) -> Tracks: ...
@@ -81,6 +87,9 @@ class FeatureTracker:
         self._ids = np.zeros(0, np.int64)
         self._pixels = np.zeros((0, len(rig.cameras), 2))
         self._rays = np.zeros((0, len(rig.cameras), 3))
+        self._old_pixels, self._old_rays = self._pixels, self._rays  # in the image before, NaN for corners it did not show
+        self._motion: BodyMotion | None = None
+        self._time_ns: int | None = None
         self._rho = np.zeros(0)
         self._next_id = 0
         self.opencv_s = 0.0
@@ -90,7 +99,12 @@ class FeatureTracker:
         self._others = [np.linalg.inv(t) @ T[0] for t in T[1:]]  # first camera to each other one
 
     def track(
-        self, time_ns: int, images: Mapping[int, NDArray[Any]], R_before_now: Floats, p_before_now: Floats | None = None
+        self,
+        time_ns: int,
+        images: Mapping[int, NDArray[Any]],
+        R_before_now: Floats,
+        p_before_now: Floats | None = None,
+        rate: Floats | None = None,
     ) -> Tracks:
         """Follow the corners into the images of the next instant.
 
@@ -98,8 +112,13 @@ class FeatureTracker:
             images: grey images (H, W) by the number of their camera; without that of the first camera all corners are lost.
             R_before_now: (3, 3) attitude of the IMU now in its frame at the instant before.
             p_before_now: (3,) its position there [m], where known.
+            rate: (3,) its angular velocity now [rad/s], where known; for rolling shutters.
         """
         self.opencv_s = 0.0
+        p = np.zeros(3) if p_before_now is None else p_before_now
+        if self._time_ns is not None:
+            self._motion = BodyMotion(1e-9 * (time_ns - self._time_ns), R_before_now, p, rate)
+        self._time_ns, self._old_pixels, self._old_rays = time_ns, self._pixels.copy(), self._rays.copy()
         greys = self._in_8_bits(images)
         rejected: Counter[str] = Counter()
         motion = float("nan")
@@ -109,7 +128,7 @@ class FeatureTracker:
             self._keep(np.zeros(len(self._ids), dtype=np.bool_))
         elif len(self._ids) and now is not None and before is not None:
             old = self._pixels[:, 0].copy()
-            guess, rho = self._predicted(R_before_now, np.zeros(3) if p_before_now is None else p_before_now)
+            guess, rho = self._predicted(R_before_now, p)
             there, kept = self._flow(before, now, old, guess, rejected)
             inside = self._inside(there, 0)
             rejected["left the image"] += int((kept & ~inside).sum())
@@ -149,6 +168,8 @@ class FeatureTracker:
         self._next_id += count
         self._pixels = np.concatenate([self._pixels, np.full((count, cameras, 2), np.nan)])
         self._rays = np.concatenate([self._rays, np.full((count, cameras, 3), np.nan)])
+        self._old_pixels = np.concatenate([self._old_pixels, np.full((count, cameras, 2), np.nan)])
+        self._old_rays = np.concatenate([self._old_rays, np.full((count, cameras, 3), np.nan)])
         self._pixels[fresh, 0], self._rays[fresh, 0] = pixels, rays
         typical = float(np.median(self._rho[self._rho > _FAR])) if (self._rho > _FAR).any() else 0.0
         self._rho = np.append(self._rho, np.full(count, typical))
@@ -175,9 +196,12 @@ class FeatureTracker:
                 some = image[::8, ::8]
                 brightness[k], contrast[k] = some.mean(), some.std()
         counts = {reason: count for reason, count in rejected.items() if count}
-        return Tracks(
-            time_ns, self._ids.copy(), self._pixels.copy(), self._rays.copy(), fresh, counts, motion_px, brightness, contrast
-        )
+        pixels, rays = self._pixels.copy(), self._rays.copy()
+        for c, camera in enumerate(self._rig.cameras):
+            if camera.line_delay_s and self._motion is not None:
+                seen = self._pixels[:, c], self._rays[:, c], self._old_pixels[:, c], self._old_rays[:, c]
+                pixels[:, c], rays[:, c] = at_once(camera, *seen, self._rho, self._motion)
+        return Tracks(time_ns, self._ids.copy(), pixels, rays, fresh, counts, motion_px, brightness, contrast)
 
     def _in_8_bits(self, images: Mapping[int, NDArray[Any]]) -> list[Grey | None]:
         """The image of each camera; where one shows that the range is larger, those of the instant before follow."""
@@ -191,6 +215,7 @@ class FeatureTracker:
     def _keep(self, kept: NDArray[np.bool_]) -> None:
         self._ids, self._rho = self._ids[kept], self._rho[kept]
         self._pixels, self._rays = self._pixels[kept], self._rays[kept]
+        self._old_pixels, self._old_rays = self._old_pixels[kept], self._old_rays[kept]
 
     def _predicted(self, R: Floats, p: Floats) -> tuple[Floats, Floats]:
         """Where the corners should be in the first image now (n, 2), and their inverse depths there (n,)."""
