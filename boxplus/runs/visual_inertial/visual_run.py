@@ -230,6 +230,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         """See `RunLoop.summarize`."""
         counts, start = self.counts, self._odometry.start
         shared = self.shared_facts(state, error, with_imu=True)
+        shared["warnings"] += self._gap_warnings()
         shared["warnings"] += [WarningFacts(text=f"{_MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
             **shared,
@@ -252,6 +253,18 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             landmarks=len(self._landmarks),
             lines=len(self._lines),
         )
+
+    def _gap_warnings(self) -> list[WarningFacts]:
+        """Times on the way at which the IMU was silent, and enough was seen to go on."""
+        ends_s = self.counts.duration_s
+        on_the_way = [gap for gap in self.counts.imu_gaps() if gap.begin_s + gap.duration_s > 0.0 and gap.begin_s < ends_s]
+        silent = [gap for gap in on_the_way if gap.duration_s > self._longest_gap_s]
+        if not silent or self._odometry.contradiction is not None:
+            return []
+        longest = max(gap.duration_s for gap in silent)
+        text = f"a gap of {longest:.2f} s in the samples of the IMU: images alone tell the way across it, and the poses before "
+        text += "and after it are less certain of each other than their covariance says"
+        return [WarningFacts(text=text, count=len(silent), first_s=silent[0].begin_s)]
 
     def _cameras(self) -> list[CameraFacts]:
         facts = []

@@ -107,6 +107,23 @@ def test_the_report_says_what_the_run_was(finished: tuple[VioFolder, VioSummary]
     assert {path.name for path in folder.plots.iterdir()} == {"trajectory.png", "tracked.png", "biases.png"}
 
 
+def test_a_gap_of_the_imu_that_images_bridge_is_a_warning(
+    recorded: Path, tmp_path: Path, finished: tuple[VioFolder, VioSummary]
+) -> None:
+    path = shutil.copytree(recorded, tmp_path / "room")
+    (samples,) = path.glob("mav0/imu0/data.csv")
+    head, *rows = samples.read_text().splitlines()
+    first_ns = int(rows[0].split(",")[0])
+    kept = [row for row in rows if not 2.5e9 < int(row.split(",")[0]) - first_ns < 2.75e9]
+    samples.write_text("\n".join([head, *kept]) + "\n")
+    with open_camera_recording(path) as recording:
+        summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
+    (warning,) = (one for one in summary.warnings if one.text.startswith("a gap of 0.2"))
+    assert summary.contradiction is None and warning.count == 1
+    assert warning.first_s == pytest.approx(2.5 - summary.frames_before_start / 15.0, abs=0.1)
+    assert not any("a gap" in one.text for one in finished[1].warnings)
+
+
 def test_a_run_with_lines_says_so_and_is_as_good(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["vio", str(recorded), "-o", str(out), "--lines", "--no-report", "--set", "cell_size=12"])

@@ -91,7 +91,7 @@ def test_the_time_from_row_to_row_comes_back(seed: int, readout_s: float) -> Non
     assert (said.verdict == "warning") == (readout_s != 0.0) and ("rolling shutter" in said.text) == (readout_s != 0.0)
     declared = dataclasses.replace(camera, line_delay_s=readout_s / (camera.height - 1))
     assert check_readout(declared, turns, imu, aligned)[0].verdict == "ok"
-    (said,) = check_readout(dataclasses.replace(camera, line_delay_s=(readout_s + 0.02) / camera.height), turns, imu, aligned)
+    (said,) = check_readout(dataclasses.replace(camera, line_delay_s=(readout_s + 0.03) / camera.height), turns, imu, aligned)
     assert said.verdict == "warning" and "check line_delay" in said.text
     few = dataclasses.replace(camera, model=None)
     assert check_readout(few, turns, imu, aligned)[0].value == "unchecked"
