@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli.options import takes_options
+from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.runs.visual_inertial.summary import VioSummary
-    from boxplus.runs.visual_inertial.visual_run import View
 
 
 @takes_options(CameraRecordingOptions)
@@ -36,7 +36,7 @@ def vio(
     ground_truth: Annotated[
         Path | None, typer.Option("--gt", help="Ground truth to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
+    view: ViewOption = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
@@ -60,24 +60,20 @@ def vio(
         "odometry": ({"cameras": "first"} if mono else {}) | ({"lines": True} if lines else {}),
     }
     run_config = load_settings(VioRunConfig, config, settings or (), overrides)
-    shown: View | None = None
-    if view:
-        from boxplus.report.live_view import LiveCameraView
-
-        shown = LiveCameraView(recording.name)
     folder = VioFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
-    summary = run_cameras(
-        recording,
-        run_config.recording,
-        folder,
-        partial(run_visual_odometry, folder=folder, config=run_config, view=shown),
-        _rows,
-        lambda _: "yaw",  # position and yaw are what an estimator with gravity leaves open
-        overwrite=overwrite,
-        resume=resume,
-        ground_truth=ground_truth,
-        report=not no_report,
-    )
+    with viewing("LiveCameraView", recording.name, view) as shown:
+        summary = run_cameras(
+            recording,
+            run_config.recording,
+            folder,
+            partial(run_visual_odometry, folder=folder, config=run_config, view=shown),
+            _rows,
+            lambda _: "yaw",  # position and yaw are what an estimator with gravity leaves open
+            overwrite=overwrite,
+            resume=resume,
+            ground_truth=ground_truth,
+            report=not no_report,
+        )
     exit_for(summary)
 
 

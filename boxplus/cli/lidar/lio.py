@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli.options import takes_recording_options, with_default_threads
+from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.runs.lidar_inertial.config import RunConfig
-    from boxplus.runs.lidar_inertial.odometry_run import View
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
 
@@ -39,7 +39,7 @@ def lio(
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
+    view: ViewOption = None,
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
@@ -82,7 +82,7 @@ def run(
     *,
     overwrite: bool = False,
     resume: bool = False,
-    view: bool = False,
+    view: str | None = None,
     report: bool = True,
 ) -> RunSummary:
     """Run the odometry with everything a terminal shows: evidence, progress, results.
@@ -98,12 +98,8 @@ def run(
     from boxplus.runs.run_folder import claim_run_folder
 
     terminal = RunTerminal()
-    shown: View | None = None
-    if view:
-        from boxplus.report.live_view import LiveView
-
-        shown = LiveView(recording.name)
     with (
+        viewing("LiveView", recording.name, view) as shown,
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_recording(recording, config.recording) as opened,
         claim_run_folder(folder, overwrite=overwrite, resume=resume) as claimed,

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli.options import takes_recording_options, with_default_threads
+from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.report.live_view import LiveView
     from boxplus.runs.slam.result import SlamResult
     from boxplus.runs.slam.summary import GnssFacts
 
@@ -45,7 +45,7 @@ def slam(
     utm: Annotated[bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).")] = False,
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
     no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    view: Annotated[bool, typer.Option("--view", help="Show the run live in 3D (needs: pip install 'boxplus[view]').")] = False,
+    view: ViewOption = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
     *,
@@ -83,13 +83,9 @@ def slam(
     from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
 
-    shown: LiveView | None = None
-    if view:
-        from boxplus.report.live_view import LiveView
-
-        shown = LiveView(recording.name)
     terminal = RunTerminal()
     with (
+        viewing("LiveView", recording.name, view) as shown,
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_recording(recording, run_config.recording) as opened,
         claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,

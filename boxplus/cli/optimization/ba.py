@@ -22,6 +22,7 @@ from boxplus.cli.optimization.terminal import (
     ThreadsOption,
     TimeLimitOption,
 )
+from boxplus.cli.viewing import ViewOption, viewing
 
 if TYPE_CHECKING:
     from boxplus.formats.reconstructions.reconstruction import Reconstruction, ReconstructionFormat
@@ -78,6 +79,7 @@ def ba(
     time_limit: TimeLimitOption = None,
     threads: ThreadsOption = None,
     format: Annotated[FormatChoice, typer.Option("--format", help="Of the file; auto looks into it.")] = FormatChoice.auto,
+    view: ViewOption = None,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -92,6 +94,7 @@ def ba(
     from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.errors import InputError
     from boxplus.formats.reconstructions.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
+    from boxplus.report.optimization.bundle_scene import camera_centers
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
     from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
@@ -100,6 +103,8 @@ def ba(
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
     if format is FormatChoice.lines or (format is FormatChoice.auto and is_line_set(file)):
+        if view is not None:
+            raise InputError("--view with cameras and points", "a line set", "leave it out; scene.ply shows the result")
         if refine_intrinsics or refine_principal_point:
             raise InputError("--refine-intrinsics with points", "a line set", "the intrinsics of line sets are held")
         line_config = LineAdjustmentConfig(use_points=points, triangulate=triangulate)
@@ -129,9 +134,14 @@ def ba(
     ctx.with_resource(held)  # to the end of the command
     name = reconstruction_file_name(start, file, "adjusted")
     terminal.facts(file.name, {"input": _describe(start), "loss": "none" if robust is None else repr(robust)})
+    shown = ctx.with_resource(viewing("ProblemView", file.name, view))
+    if shown is not None:
+        shown.show_scene(False, start.points, camera_centers(start))
     with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
         result = adjust_bundle(start, config, loss=robust, callback=show)
         stopped = should_stop()
+    if shown is not None:
+        shown.show_scene(True, result.reconstruction.points, camera_centers(result.reconstruction))
     summary = _summary(file, name, started, start, result, config, robust, stopped)
     write_reconstruction(folder / name, result.reconstruction)
     _write_scene(folder / "scene.ply", result.reconstruction)

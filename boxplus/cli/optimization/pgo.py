@@ -22,6 +22,7 @@ from boxplus.cli.optimization.terminal import (
     ThreadsOption,
     TimeLimitOption,
 )
+from boxplus.cli.viewing import ViewOption, viewing
 
 if TYPE_CHECKING:
     from boxplus.formats.graphs.pose_graph import PoseGraph
@@ -106,6 +107,7 @@ def pgo(
     max_iterations: MaxIterationsOption = 100,
     time_limit: TimeLimitOption = None,
     threads: ThreadsOption = None,
+    view: ViewOption = None,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -120,6 +122,7 @@ def pgo(
     from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
+    from boxplus.systems.pose_graph.problem import positions
 
     started, terminal = datetime.now(UTC), OptimizationTerminal()
     robust = parse_loss(loss)
@@ -147,10 +150,15 @@ def pgo(
     terminal.facts(file.name, {"input": described, "loss": "none" if robust is None else repr(robust)})
     for warning in graph.warnings:
         terminal.warn(warning)
+    shown = ctx.with_resource(viewing("ProblemView", file.name, view))
+    if shown is not None and graph.poses is not None:
+        shown.show_graph(False, positions(graph, graph.poses), graph.edges)
     with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
         result = optimize_pose_graph(graph, config, loss=robust, callback=show)
         stopped = should_stop()
     reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
+    if shown is not None and result.graph.poses is not None:
+        shown.show_graph(True, positions(graph, result.graph.poses), graph.edges)
     summary = _summary(file, name, started, graph, result, config, robust, reading, stopped)
     write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
     _write_graph_ply(folder / "graph.ply", result.graph)
