@@ -28,6 +28,11 @@ _WIDE_DEG, _WIDE_M = 10.0, 0.3
 _LEVER_EXPLAINED = 0.8
 _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
 _UNIT_ADVICE = "give --gyro-unit"
+_UNKNOWN = (
+    "nobody gave T_imu_lidar, and the motion did not show it: {assumed}, and the path and its covariance are wrong by as much as "
+    "the mounting is; give --T-imu-lidar (for axes that are parallel: --T-imu-lidar 'xyz_rpy_deg: 0 0 0 0 0 0'), or turn the "
+    "platform about all axes"
+)
 _MOST_POINTS = 20_000
 """Of a scan that is kept for the estimate; 12 s of scans stay below 50 MB."""
 
@@ -45,6 +50,8 @@ class Extrinsic:
         warning: what the user should do about it; empty when it is given and nothing contradicts it.
         sigma: standard deviations of rotation [deg] and translation [m]; None leaves those of the configuration.
         contradiction: what the sensors contradict over the first seconds of rotation, whatever the mounting; sentences.
+        unknown: what makes a result of it not to be trusted unless the motion bears the mounting out later: a sentence; empty
+            where it is given, recorded, or was estimated about all axes.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -54,6 +61,7 @@ class Extrinsic:
     warning: str
     sigma: tuple[float, float] | None = None
     contradiction: str = ""
+    unknown: str = ""
 
     def applied_to(self, config: LioConfig) -> LioConfig:
         """The configuration with this extrinsic; a guess is refined online unless the configuration decides."""
@@ -117,7 +125,13 @@ def _estimated(agreement: Agreement | None) -> Extrinsic:
     if agreement is None or rotation is None or not judges_rotation(agreement):
         why = "the platform does not turn enough at the beginning to estimate it, or the LiDAR sees too little"
         return Extrinsic(
-            T, "identity", f"identity assumed: {unknown}; {why}", True, f"{unknown}: identity assumed; {why}; {remedy}", wide
+            T,
+            "identity",
+            f"identity assumed: {unknown}; {why}",
+            True,
+            f"{unknown}: identity assumed; {why}; {remedy}",
+            wide,
+            unknown=_UNKNOWN.format(assumed="the identity was assumed"),
         )
     T[:3, :3] = rotation.R_imu_lidar
     std_deg = np.degrees(rotation.rotation_std[0])
@@ -134,10 +148,12 @@ def _estimated(agreement: Agreement | None) -> Extrinsic:
         f"{', '.join(f'{value:.1f}' for value in std_deg)} deg about its principal axes), translation ({numbers}) m (std "
         f"{', '.join(f'{value:.2f}' for value in std_m)} m)"
     )
+    open_axes = ""
     if std_deg[-1] > _WIDE_DEG:
         text += "; the motion turns about too few axes to determine the rest"
+        open_axes = _UNKNOWN.format(assumed="it was estimated about some axes only")
     sigma = (float(np.clip(std_deg[-1], 0.3, _WIDE_DEG)), float(std_m.max()))
-    return Extrinsic(T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma)
+    return Extrinsic(T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma, unknown=open_axes)
 
 
 def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) -> tuple[list[Scan], ImuSamples] | None:

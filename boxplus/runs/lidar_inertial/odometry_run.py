@@ -311,8 +311,14 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
     def _contradiction(self) -> str | None:
         """Of the LiDARs among each other first: what else is contradicted may follow from it."""
         of_lidars = None if self._watch is None else self._watch.contradiction
-        rest = self._odometry.contradiction or self._extrinsic.contradiction or None
+        rest = self._odometry.contradiction or self._extrinsic.contradiction or self._unknown_mounting
         return of_lidars if rest is None else rest if of_lidars is None else f"{of_lidars}; {rest}"
+
+    @property
+    def _unknown_mounting(self) -> str | None:
+        if not self._extrinsic.unknown or not isinstance(self._odometry, LidarInertialOdometry):
+            return None
+        return None if self._odometry.mounting_borne_out else self._extrinsic.unknown
 
     def _timing(self) -> TimingFacts:
         return TimingFacts(

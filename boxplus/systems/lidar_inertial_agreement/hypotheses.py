@@ -87,9 +87,29 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     if translation is not None:
         findings.append(_of_lengths(agreement, translation))
         findings.append(_of_turn(rotation, translation, T_declared))
-    if findings[0] is None and not _mounting_seen(agreement):
+    if findings[0] is None and not shows_mounting(agreement):
         findings.append(_of_planes(agreement))
     return [finding for finding in findings if finding is not None]
+
+
+def mounting_in_use(agreement: Agreement, T_in_use: NDArray[np.float64]) -> Finding | None:
+    """What the rotations contradict of a mounting that nobody declared, but that an estimator goes on with.
+
+    Args:
+        agreement: from `compare_sensors`.
+        T_in_use: (4, 4) T_imu_lidar, assumed or estimated.
+    """
+    rotation = agreement.rotation
+    if rotation is None or not judges_rotation(agreement):
+        return None
+    angle, seen = apart(rotation, T_in_use[:3, :3])
+    if not seen.any() or angle < apart_allowed(rotation):
+        return None
+    return Finding(
+        "extrinsic",
+        f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the mounting in use, which nobody gave: it "
+        f"began too far from the right one; give --T-imu-lidar (found: R_imu_lidar = {matrix_text(rotation.R_imu_lidar)})",
+    )
 
 
 def _path_counts(agreement: Agreement) -> bool:
@@ -141,11 +161,11 @@ def judges(cause: Cause, agreement: Agreement) -> bool:
     if cause in ("force_sign", "length_scale"):
         return judges_lengths(agreement)
     if cause in ("extrinsic", "mirrored"):
-        return _mounting_seen(agreement)
+        return shows_mounting(agreement)
     return judges_rotation(agreement)
 
 
-def _mounting_seen(agreement: Agreement) -> bool:
+def shows_mounting(agreement: Agreement) -> bool:
     """Whether rotations show the mounting about all axes."""
     rotation = agreement.rotation
     return rotation is not None and judges_rotation(agreement) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).all())

@@ -27,6 +27,8 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges_rotation,
     lengths_known,
     lengths_of_many,
+    mounting_in_use,
+    shows_mounting,
     slope_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
@@ -52,10 +54,12 @@ class Watch:
 
     Attributes:
         contradiction: what the newest comparison that could decide found wrong; None while the sensors agree.
+        mounting_borne_out: whether rotations have shown the mounting about all axes, and it was the one in use.
     """
 
     def __init__(self, config: RegistrationConfig, T_declared: NDArray[np.float64] | None) -> None:
         self.contradiction: Finding | None = None
+        self.mounting_borne_out = False
         self._config = config.model_copy(update={"threads": 1})
         self._T_declared = T_declared
         self._scans: deque[Scan] = deque()
@@ -71,6 +75,7 @@ class Watch:
         self._doubted = False
         self._blind_scans = 0
         self._T_last: NDArray[np.float64] | None = None
+        self._T_compared: NDArray[np.float64] = np.eye(4)
         self._first_with_clocks: Agreement | None = None
         self._slopes: list[tuple[float, float]] = []
         self._slopes_until_ns = 0
@@ -140,11 +145,15 @@ class Watch:
         scans, expected, config = list(self._scans), list(self._expected), self._config
         imu = ImuSamples.joined(self._imu)
         T_declared = self._T_declared
-        T_expected = T_imu_lidar.copy()
+        T_expected = self._T_compared = T_imu_lidar.copy()
         return lambda: compare_sensors(scans, imu, config, T_expected=T_expected, T_declared=T_declared, expected=expected)
 
     def _take_up(self, agreement: Agreement) -> str | None:
         findings = contradictions(agreement, self._T_declared)
+        if self._T_declared is None and not findings:
+            findings = [finding for finding in [mounting_in_use(agreement, self._T_compared)] if finding is not None]
+        if shows_mounting(agreement) and not findings:
+            self.mounting_borne_out = True
         # Registrations that went astray turn like nothing else either: once is not enough to part two sensors.
         doubted, self._doubted = self._doubted, bool(findings) and findings[0].cause == "not_together"
         if self._doubted and not doubted:

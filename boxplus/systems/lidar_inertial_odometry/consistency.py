@@ -81,6 +81,11 @@ class Consistency:
         return found.text if found is not None else self._innovation_text
 
     @property
+    def mounting_borne_out(self) -> bool:
+        """Whether the motion has shown the mounting about all axes, and it was the one in use."""
+        return self._watch.mounting_borne_out
+
+    @property
     def lost(self) -> bool:
         """Whether the last scans no longer lie on the map."""
         return self._unmatched >= _LOST_STREAK

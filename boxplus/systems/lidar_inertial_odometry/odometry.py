@@ -103,6 +103,11 @@ class LidarInertialOdometry(Snapshots):
         return self._consistency.contradiction or self._gap
 
     @property
+    def mounting_borne_out(self) -> bool:
+        """Whether the motion since the start has shown T_imu_lidar about all axes, and it was the one in use."""
+        return self._consistency.mounting_borne_out
+
+    @property
     def time_steps(self) -> list[str]:
         """Where the times of a sensor stepped back for good, and how much of it was left out: one sentence each."""
         return self._sequencer.time_steps

@@ -323,6 +323,22 @@ def test_extrinsic_without_any_turn_is_identity_with_the_reason() -> None:
     assert extrinsic.source == "identity"
     np.testing.assert_array_equal(extrinsic.T_imu_lidar, np.eye(4))
     assert "identity assumed" in extrinsic.warning
+    assert "nobody gave T_imu_lidar, and the motion did not show it" in extrinsic.unknown
+
+
+def test_a_mounting_that_was_assumed_is_not_trusted_unless_the_motion_bears_it_out(tmp_path: Path) -> None:
+    def without_mounting(scenario: str, duration_s: float) -> Recording:
+        simulation = simulate(scenario, duration_s=duration_s, lidar=SpinningLidar(azimuth_steps=300))
+        recording = as_recording(simulation)
+        recording.info.T_imu_lidar = None
+        return recording
+
+    still = run_odometry(without_mounting("at_rest", 3.0), tmp_path / "still")
+    assert still.extrinsic.source == "identity"
+    assert still.contradiction is not None and "nobody gave T_imu_lidar" in still.contradiction
+    moving = run_odometry(without_mounting("walk", 8.0), tmp_path / "moving")
+    assert moving.extrinsic.source == "estimated"
+    assert moving.contradiction is None
 
 
 def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:

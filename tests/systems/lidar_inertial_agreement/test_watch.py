@@ -14,7 +14,7 @@ from boxplus.systems.lidar_inertial_agreement import watch
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, turned
 
 
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
@@ -45,3 +45,23 @@ def test_lengths_are_named_by_several_comparisons(monkeypatch: pytest.MonkeyPatc
         text for text in said if text is not None
     ]
     assert (following.contradiction is not None) == named == any(said)
+
+
+@pytest.mark.parametrize("degrees", [0.5, 20.0, 120.0])
+def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float) -> None:
+    simulation = handheld(5)
+    scans, imu = data(simulation)
+    in_use = turned(simulation.T_imu_lidar, degrees, seed=3)
+    following = watch.Watch(CONFIG, None)
+    still = np.zeros(3), np.zeros(3)
+    for k, scan in enumerate(scans):
+        samples = imu.time_ns // 100_000_000 == scan.start_ns // 100_000_000
+        block = replace(imu, time_ns=imu.time_ns[samples], gyro=imu.gyro[samples], accel=imu.accel[samples])
+        following.add(scan, imu if k == 0 else block, in_use, still)
+    following.finish()
+    assert following.mounting_borne_out == (degrees < 1.0)
+    if degrees < 1.0:
+        assert following.contradiction is None
+    else:
+        assert following.contradiction is not None and following.contradiction.cause == "extrinsic"
+        assert "under the mounting in use, which nobody gave" in following.contradiction.text
