@@ -153,7 +153,9 @@ def _estimated(agreement: Agreement | None) -> Extrinsic:
         text += "; the motion turns about too few axes to determine the rest"
         open_axes = _UNKNOWN.format(assumed="it was estimated about some axes only")
     sigma = (float(np.clip(std_deg[-1], 0.3, _WIDE_DEG)), float(std_m.max()))
-    return Extrinsic(T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma, unknown=open_axes)
+    return Extrinsic(
+        T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma, unknown=open_axes
+    )
 
 
 def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) -> tuple[list[Scan], ImuSamples] | None:

@@ -236,7 +236,9 @@ class _Kabsch:
             self.bias: NDArray[np.float64] = mean_imu - self.scale * self.R @ mean_lidar
             self.residual: NDArray[np.float64] = a - self.scale * rotated
             norm = np.linalg.norm(self.residual, axis=1)
-            sigma = max(float(np.median(norm)), 1e-6)
+            # Of a platform that mostly turns steadily the median is far below what registration knows of its few fast turns:
+            # these would be thrown out as outliers, and with them all that shows the mounting about the other axes.
+            sigma = max(float(np.median(norm)), self.scale * _LEAST_SIGMA / 3.0)
             weight = 1.0 / (1.0 + (norm / (3.0 * sigma)) ** 2) ** 2
         left, turned = float((self.residual**2).sum()), float((b * b).sum())
         self.explained: float = 1.0 - min(left / max(self.scale**2 * turned, 1e-12), 1.0)

@@ -1,0 +1,39 @@
+"""How a LiDAR turned, against a gyroscope."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.rotation import compare_rotations
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_few_fast_turns_are_no_outliers(seed: int) -> None:
+    """A platform that turns to and fro and swerves now and then: registration knows less of swerves; they show the mounting."""
+    random = np.random.default_rng(seed)
+    K, step_s, R_imu_lidar = 120, 0.1, so3.exp(random.normal(size=3))
+    rate = 0.25 * np.sin(np.arange(K) / 9.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    swerves = random.choice(K, 8, replace=False)
+    rate[swerves] += [[0.4, 0.03, 0.1]]
+    noise = np.full(K, 5e-4)
+    noise[swerves] = 0.01
+    turned = so3.exp((rate + noise[:, None] * random.normal(size=(K, 3))) * step_s)
+    R = [np.eye(3)]
+    for turn in turned:
+        R.append(R[-1] @ turn)
+    zeros = np.zeros(K + 1)
+    time_ns = (np.arange(K + 1) * step_s * 1e9).astype(np.int64)
+    information = np.tile(1e6 * np.eye(6), (K + 1, 1, 1))
+    path = LidarPath(time_ns, np.array(R), np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
+    imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
+    interval = np.clip((imu_ns - 1) // round(step_s * 1e9), 0, K - 1)  # a sample holds until the next
+    gyro = rate[interval] @ R_imu_lidar.T
+    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
+    assert fit is not None
+    assert np.degrees(np.linalg.norm(so3.log(fit.R_imu_lidar @ R_imu_lidar.T))) < 3.0
+    assert fit.explained > 0.97
+    assert fit.explained > fit.mirrored - 1e-3
