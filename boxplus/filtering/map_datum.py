@@ -117,6 +117,10 @@ class MapDatum:
         step[_MAP, _POSE] = self._new_share * np.eye(6)
         self._joint = step @ self._joint @ step.T
 
+    def widen(self, excess: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+        """An error of covariance (6, 6), [θ about the IMU's axes, p along the world's], that pose and map share at x (36,)."""
+        self._joint += np.kron(np.ones((2, 2)), _along_world(excess, x))
+
     def pose_covariance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6, 6) covariance of the pose at x (36,) against the first pose: [θ about the IMU's axes, p along the world's]."""
         return _turned(self._joint[_POSE, _POSE], x[R : R + 9].reshape(3, 3).T)

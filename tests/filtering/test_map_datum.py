@@ -102,3 +102,19 @@ def test_sampled_errors_spread_as_it_says() -> None:
     expected = datum.pose_covariance(x)
     scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
     np.testing.assert_allclose(sampled / scale, expected / scale, atol=0.05)
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_an_error_that_pose_and_map_share_stays_with_both(seed: int) -> None:
+    """No scan sees it, as it is measured against that map: on the spot it is in the covariance from then on."""
+    random = np.random.default_rng(seed)
+    x, cov = _state(so3.exp(random.normal(size=3)), np.zeros(3)), 1e-4 * np.eye(24)
+    root = random.normal(size=(6, 6))
+    datum, plain = MapDatum(x, cov), MapDatum(x, cov)
+    excess = 0.01 * root @ root.T
+    datum.widen(excess, x)
+    for scan in range(3):
+        before = cov
+        cov, _ = (_scan(each, np.random.default_rng(scan), x, before, 1e-2) for each in (plain, datum))
+    np.testing.assert_allclose(datum.pose_covariance(x) - plain.pose_covariance(x), excess, rtol=1e-6, atol=1e-9)

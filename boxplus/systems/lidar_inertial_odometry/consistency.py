@@ -20,6 +20,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.scan_span import span_problem
 
 _KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything
@@ -32,7 +33,6 @@ _FEWEST_SAMPLES = 5  # of the IMU within a scan; between fewer ones the motion i
 _ONE_SCAN = 100.0  # no single scan counts for more: it takes several to contradict
 _LOST_STREAK = 3
 _LEAST_FITTING = 0.6  # of the points with a plane lie on it; 0.92 at least on sound runs
-_SHORT_SPAN, _LONG_SPAN = 0.05, 1.5  # of the time between scans
 _FASTEST_M_S = 120.0
 _LARGEST_BIAS = 0.1, 0.7  # rad/s, m/s²: more than an inertial sensor in order has, and as known as three deviations
 _MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
@@ -72,6 +72,7 @@ class Consistency:
         self._innovation_text: str | None = None
         self._unmatched = 0
         self._previous_start_ns: int | None = None
+        self._first_biases: NDArray[np.float64] | None = None
         self._told: set[str] = set()
 
     @property
@@ -204,21 +205,27 @@ class Consistency:
         return [self._innovation_text]
 
     def _biases(self, x: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[str]:
-        """Whether the biases are those of a sensor in order: at a steady turn they take up whatever else is wrong."""
-        found = []
+        """Whether the biases are those of a sensor in order: at a steady turn they take up whatever else is wrong.
+
+        One that was so from the start may be a bad sensor's; none changes by as much during a run.
+        """
+        if self._first_biases is None:
+            self._first_biases = x[BW : BA + 3].copy()
+        large = changed = False
         for at, tangent, most in ((BW, T_BW, _LARGEST_BIAS[0]), (BA, T_BA, _LARGEST_BIAS[1])):
-            bias = x[at : at + 3]
-            size = float(np.linalg.norm(bias))
-            axis = bias / max(size, 1e-12)
-            sigma = float(np.sqrt(axis @ covariance[tangent : tangent + 3, tangent : tangent + 3] @ axis))
-            found.append(size - 3.0 * sigma > most)
-        if not any(found) or not self._once("bias"):
+            P = covariance[tangent : tangent + 3, tangent : tangent + 3]
+            large |= _surely_above(x[at : at + 3], P, most)
+            changed |= _surely_above(x[at : at + 3] - self._first_biases[at - BW : at - BW + 3], P, most)
+        if not large or not self._once("changed bias" if changed else "bias"):
             return []
         gyro, accel = np.degrees(np.linalg.norm(x[BW : BW + 3])), np.linalg.norm(x[BA : BA + 3])
-        return [
+        text = (
             f"the IMU's biases came to {gyro:.1f} deg/s and {accel:.2f} m/s², more than a sensor in order has: its scale or "
             "T_imu_lidar is wrong, which biases take up as long as the platform turns steadily, or the sensor is bad"
-        ]
+        )
+        if changed and self._innovation_text is None:
+            self._innovation_text = text
+        return [text]
 
     def _once(self, key: str) -> bool:
         new = key not in self._told
@@ -230,12 +237,15 @@ class Consistency:
         scan, previous = frame.scan, self._previous_start_ns
         self._previous_start_ns = scan.start_ns
         span, period = (scan.end_ns - scan.start_ns) * 1e-9, 0.0 if previous is None else (scan.start_ns - previous) * 1e-9
-        if not 0.0 < period < 1.0 or span == 0.0 or _SHORT_SPAN * period < span < _LONG_SPAN * period or not self._once("span"):
-            return []
-        return [
-            f"the points of a scan span {span * 1e3:.3g} ms, but scans come every {period * 1e3:.3g} ms: "
-            "check the unit of the point times (s, ms, µs or ns)"
-        ]
+        problem = span_problem(span, period)
+        return [problem] if problem is not None and self._once("span") else []
+
+
+def _surely_above(bias: NDArray[np.float64], P: NDArray[np.float64], most: float) -> bool:
+    """Whether a bias (3,) of covariance (3, 3) is longer than `most` by three standard deviations along it."""
+    size = float(np.linalg.norm(bias))
+    axis = bias / max(size, 1e-12)
+    return size - 3.0 * float(np.sqrt(axis @ P @ axis)) > most
 
 
 def _extrinsic(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -28,6 +28,7 @@ from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
@@ -81,6 +82,7 @@ class LidarInertialOdometry(Snapshots):
         self._unshown = UnshownMotion()
         self._weak_spell = WeakSpell(self.config.weak_threshold)
         self._consistency = Consistency(self.config, self.config.T_declared)
+        self._long_baseline = LongBaseline(self.config)
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
@@ -164,7 +166,7 @@ class LidarInertialOdometry(Snapshots):
         self._next_try = 0
         self._consistency.finish()
         self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
-        self._consistency = Consistency(self.config, self.config.T_declared)
+        self._consistency, self._long_baseline = Consistency(self.config, self.config.T_declared), LongBaseline(self.config)
         self.start, self._standstill = None, None
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
@@ -232,6 +234,8 @@ class LidarInertialOdometry(Snapshots):
         state = NavState.unpack(self._x)
         map_points_world = state.to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
+        if taken:
+            self._look_back(frame.scan.end_ns, points, map_points_world)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
@@ -320,6 +324,14 @@ class LidarInertialOdometry(Snapshots):
     def _is_astray(self, frame: Frame, on_map: float) -> bool:
         """Whether what fits the map may fit it by chance: after a gap of the IMU nothing but the points says where it is."""
         return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
+
+    def _look_back(self, time_ns: int, p_lidar: NDArray[np.float32], p_world: NDArray[np.float64]) -> None:
+        """Whether scans seconds apart fit each other as they were placed."""
+        cov = self._mounting.widened(self._datum.pose_covariance(self._x), self._x)
+        drift = self._long_baseline.add(time_ns, self._x, cov, p_lidar, p_world)
+        if drift is not None:
+            self._datum.widen(drift.excess, self._x)
+            self._warnings += [drift.text] if drift.text else []
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
         self._datum.insert(self.map.insert(p_world, downsample=True).inserted)

@@ -24,6 +24,7 @@ from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.scan_span import span_problem_of
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
@@ -38,6 +39,7 @@ _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
+_CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
@@ -150,6 +152,9 @@ class _Beginning:
 
 def _contradicted(seen: _Beginning) -> list[str]:
     """What the comparison of both sensors finds wrong, a sentence each."""
+    unit = span_problem_of(seen.scans)
+    if unit is not None:  # points put together at wrong times show no motion that anything could be compared with
+        return [unit]
     T_declared = seen.config.T_declared
     agreement = compare_sensors(seen.scans, seen.imu, seen.config, T_declared=T_declared)
     found = [finding.text for finding in contradictions(agreement, T_declared)]
@@ -203,14 +208,24 @@ def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
 
     At rest it is to show nothing; a LiDAR that sees little may turn on its own.
     """
-    off = seen.imu.gyro.mean(axis=0) if rest.at_rest else gyro_bias(path, seen.imu, seen.extrinsic)
+    turn = seen.imu.gyro.mean(axis=0)
+    off = turn if rest.at_rest else gyro_bias(path, seen.imu, seen.extrinsic)
     not_shown = rest.open_turns @ seen.extrinsic.R_imu_lidar.T
-    bias = float(np.linalg.norm(off - not_shown.T @ (not_shown @ off)))
-    if bias > _LARGEST_BIAS:
-        raise _NotYet(
-            f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: its unit, its "
-            f"sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little{_WAITING}"
-        )
+    turn, off = (rates - not_shown.T @ (not_shown @ rates) for rates in (turn, off))
+    bias = float(np.linalg.norm(off))
+    if bias <= _LARGEST_BIAS:
+        return
+    # The LiDAR turns with turn - off: opposite to the gyroscope and as fast, both cancel.
+    opposite = float(np.linalg.norm(2.0 * turn - off)) < _CANCELLED * bias
+    why = (
+        "they turn alike but in opposite senses, so the gyroscope's sign is flipped, the points are mirrored (one axis has the "
+        "wrong sign, or two are swapped), or T_imu_lidar is half a turn off"
+        if opposite
+        else "its unit, its sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little"
+    )
+    raise _NotYet(
+        f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: {why}{_WAITING}"
+    )
 
 
 def _static_start(seen: _Beginning, rest: Rest) -> Start:

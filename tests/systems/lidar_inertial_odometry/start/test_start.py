@@ -17,6 +17,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import RosetteLidar, Scenario, SpinningLidar, simulate
+from boxplus.simulation.faults import wrong_time_unit
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.worlds import sites
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -192,3 +193,25 @@ def test_an_accelerometer_without_gravity_is_refused(scale: float) -> None:
                 odometry.push_scan(event)
             else:
                 odometry.push_imu(ImuSamples.from_arrays(event.time_ns, event.gyro, scale * event.accel))
+
+
+def test_a_gyroscope_that_turns_the_other_way_is_told_from_one_in_other_units() -> None:
+    """On the spot at 90 deg/s: reversed, both turns cancel; three times as fast, they do not."""
+    simulation = simulate("spin", duration_s=3.0, lidar=LIDAR)
+    turning = frames(simulation.events())[-9:]
+    refusals = []
+    for factor in (-1.0, 3.0):
+        seen = [replace(f, imu=ImuSamples(f.imu.time_ns, factor * f.imu.gyro, f.imu.accel)) for f in turning]
+        refusals.append(find_start(seen, config(simulation)))
+    assert all(isinstance(refusal, str) for refusal in refusals)
+    assert "in opposite senses" in str(refusals[0])
+    assert "opposite" not in str(refusals[1])
+
+
+def test_where_no_start_is_found_a_wrong_unit_of_the_point_times_is_named() -> None:
+    simulation = room_walk(6.0)
+    seen = frames(wrong_time_unit(0.001).events(simulation.events()))
+    refusal = find_start(seen[40:44], config(simulation), final=True)
+    assert isinstance(refusal, str)
+    assert "scans come every 100 ms: check the unit of the point times" in refusal
+    assert "unit of the point times" not in str(find_start(frames(simulation.events())[40:44], config(simulation), final=True))

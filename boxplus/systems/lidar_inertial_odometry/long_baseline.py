@@ -1,0 +1,148 @@
+"""Scans seconds apart, laid upon each other at the estimated poses: what no scan shows against the one before it.
+
+Planes that noise or the pattern of the beams has made move along with the sensor: each scan fits the map, which the last ones
+have made, and the estimate is held back or pulled aside, a little with every scan. Scans seconds apart do not share the pattern.
+So every few seconds the newest scan is registered to a map of a few scans only, from one baseline ago, beginning at the
+estimate; both sets of scans are placed as the filter has placed them. How far the registration moves is the error that
+has come up in between, but for
+
+    C = S + D        S: covariance of this registration,   D: by how much the covariance of the pose has grown
+
+What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
+four standard deviations. Nothing is concluded where the old scans do not determine all directions of the new one.
+
+Source: docs/lidar_inertial_odometry.md, section 10.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.degeneracy import strong_covariance
+from boxplus.filtering.map_datum import positive_part
+from boxplus.filtering.nav_state import TANGENT, boxminus_into
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.systems.lidar_inertial_agreement.registration import align
+
+_BASELINE_NS = 2_500_000_000
+_MAP_SCANS = 5
+_STEPS = 6  # of the registration, which begins close by
+_FLOOR = np.repeat([3e-4, 3e-3], 3) ** 2  # rad², m²: surfaces are no planes
+_LEAST_USED, _LEAST_SHARE = 100, 0.25  # points on planes, and of all: the old scans show the same place
+_LEAST_FITTING = 0.9  # of the points with a plane
+_LARGEST_SIGMA_M = 0.05  # of the registration, or it says nothing
+_TOLD = 4.0  # standard deviations of position or rotation: √(δᵀ C⁻¹ δ)
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What scans a baseline apart say of the motion between them.
+
+    Attributes:
+        excess: (6, 6) covariance beyond what was stated: [θ about the IMU's axes, p along the world's].
+        deviations: how far the newest scan lies from where the old ones want it, in standard deviations.
+        text: a sentence where that is beyond four, else empty.
+    """
+
+    excess: NDArray[np.float64]
+    deviations: float
+    text: str
+
+
+class LongBaseline:
+    """Follows the scans of one run.
+
+    Args:
+        config: of the odometry: noise and cells of the map.
+    """
+
+    def __init__(self, config: RegistrationConfig) -> None:
+        self._config = config.model_copy(update={"threads": 1})
+        self._recent: deque[NDArray[np.float64]] = deque(maxlen=_MAP_SCANS)
+        self._old: list[NDArray[np.float64]] = []
+        self._old_covariance: NDArray[np.float64] = np.zeros((6, 6))
+        self._old_ns = 0
+
+    def add(
+        self,
+        time_ns: int,
+        x: NDArray[np.float64],
+        pose_covariance: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
+        p_world: NDArray[np.float64],
+    ) -> Drift | None:
+        """Take a scan that the filter has placed; what came out where a baseline has passed.
+
+        Args:
+            time_ns: of the state.
+            x: (36,) packed state after the scan; pose_covariance: (6, 6) against the first pose.
+            p_lidar: (n, 3) the points it was measured with, LiDAR frame at `time_ns`.
+            p_world: (m, 3) the points it brings to the map.
+        """
+        self._recent.append(p_world)
+        if time_ns - self._old_ns < _BASELINE_NS and self._old:
+            return None
+        if len(self._recent) < _MAP_SCANS:
+            return None
+        drift = self._compare(x, pose_covariance, p_lidar) if self._old else None
+        self._old, self._old_covariance, self._old_ns = list(self._recent), pose_covariance.copy(), time_ns
+        return drift
+
+    def _compare(
+        self, x: NDArray[np.float64], pose_covariance: NDArray[np.float64], p_lidar: NDArray[np.float32]
+    ) -> Drift | None:
+        found = register_to(self._old, x, p_lidar, self._config)
+        if found is None:
+            return None
+        delta, registration = found
+        C = registration + positive_part(pose_covariance - self._old_covariance)
+        squared = [float(delta[part] @ np.linalg.solve(C[part, part], delta[part])) for part in (slice(0, 3), slice(3, 6))]
+        deviations = float(np.sqrt(max(squared)))
+        text = ""
+        if deviations > _TOLD:
+            text = (
+                f"scans {_BASELINE_NS * 1e-9:g} s apart do not fit each other as they were placed: by "
+                f"{np.linalg.norm(delta[3:]) * 100:.1f} cm and {np.degrees(np.linalg.norm(delta[:3])):.2f} deg, "
+                f"{deviations:.0f} standard deviations: the estimate drifts, where single scans do not show it (few rings, a "
+                "repeating pattern, foliage, or T_imu_lidar); covariance widened"
+            )
+        return Drift(positive_part(np.outer(delta, delta) - C), deviations, text)
+
+
+def register_to(
+    old_world: Sequence[NDArray[np.float64]], x: NDArray[np.float64], p_lidar: NDArray[np.float32], config: RegistrationConfig
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Where a scan would lie if only some older scans were known.
+
+    Args:
+        old_world: the points (m, 3) of each of them, in the world.
+        x: (36,) packed state to begin at; p_lidar: (n, 3) the scan, LiDAR frame.
+        config: of the registration.
+
+    Returns:
+        The motion (6,) from x, [θ about the IMU's axes, p along the world's], and its covariance (6, 6); None where the older
+        scans do not determine it.
+    """
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    tree.insert(np.concatenate(old_world), downsample=True)
+    at = x.copy()
+    measurement = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False, confirm=True)
+    directions = align(at, measurement, config, steps=_STEPS)
+    if directions is None or directions.weak.any() or measurement.fitting_share < _LEAST_FITTING:
+        return None
+    information = measurement.at(at, rematch=False)
+    if information.used < max(_LEAST_USED, _LEAST_SHARE * len(p_lidar)):
+        return None
+    covariance = strong_covariance(information.A, directions) + np.diag(_FLOOR)
+    if float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _LARGEST_SIGMA_M**2:
+        return None
+    delta = np.zeros(TANGENT)
+    boxminus_into(at, x, delta)
+    return delta[:6], covariance
