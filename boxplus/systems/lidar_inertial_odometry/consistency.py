@@ -20,7 +20,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.scan_span import span_problem
+from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 
 _KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything

@@ -50,6 +50,19 @@ def test_biases_that_no_sensor_in_order_has_are_named_once(gyro: float, accel: f
     assert all("T_imu_lidar is wrong" in text for text in found)
 
 
+@pytest.mark.parametrize(("first", "then", "contradicted"), [(0.0, 0.8, True), (0.8, 0.85, False), (0.0, 0.6, False)])
+def test_a_bias_that_changes_by_more_than_any_sensor_does_is_a_contradiction(
+    first: float, then: float, contradicted: bool
+) -> None:
+    """One that was large from the start is that of a bad sensor, and a warning."""
+    consistency, x, told = Consistency(LioConfig(), None), NavState.identity().pack(), []
+    for accel in (first, then, then):
+        x[BA + 1] = accel
+        told += consistency._biases(x, np.zeros((TANGENT, TANGENT)))
+    assert (consistency.contradiction is not None) == contradicted
+    assert len(told) == (max(first, then) > 0.7)
+
+
 @pytest.mark.parametrize(("off_m", "samples", "told"), [(0.02, 10, 1), (0.005, 10, 0), (0.02, 1, 0)])
 def test_corrections_beyond_noise_are_named_once_after_two_seconds(off_m: float, samples: int, told: int) -> None:
     """2 cm a scan, where the prediction and a registration are good for 1 cm; with one IMU sample a scan nobody knows."""

@@ -24,8 +24,8 @@ from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.scan_span import span_problem_of
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
+from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem_of
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
 _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
