@@ -9,7 +9,7 @@ has come up in between, but for
     C = S + D        S: covariance of this registration,   D: by how much the covariance of the pose has grown
 
 What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
-four standard deviations. Nothing is concluded where the old scans do not determine all directions of the new one.
+four standard deviations. Directions of the new scan that the old ones do not determine stay where the estimate has them.
 
 Source: docs/lidar_inertial_odometry.md, section 10.
 """
@@ -31,7 +31,7 @@ from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.systems.lidar_inertial_agreement.registration import align
 
-_BASELINE_NS = 2_500_000_000
+_BASELINE_NS = 1_250_000_000
 _MAP_SCANS = 5
 _STEPS = 6  # of the registration, which begins close by
 _FLOOR = np.repeat([3e-4, 3e-3], 3) ** 2  # rad², m²: surfaces are no planes
@@ -127,15 +127,15 @@ def register_to(
         config: of the registration.
 
     Returns:
-        The motion (6,) from x, [θ about the IMU's axes, p along the world's], and its covariance (6, 6); None where the older
-        scans do not determine it.
+        The motion (6,) from x, [θ about the IMU's axes, p along the world's], and its covariance (6, 6), both without the
+        directions that the older scans do not determine; None where they fit too little of the scan.
     """
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     tree.insert(np.concatenate(old_world), downsample=True)
     at = x.copy()
     measurement = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False, confirm=True)
     directions = align(at, measurement, config, steps=_STEPS)
-    if directions is None or directions.weak.any() or measurement.fitting_share < _LEAST_FITTING:
+    if directions is None or directions.weak.all() or measurement.fitting_share < _LEAST_FITTING:
         return None
     information = measurement.at(at, rematch=False)
     if information.used < max(_LEAST_USED, _LEAST_SHARE * len(p_lidar)):
