@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import strong_covariance
-from boxplus.filtering.map_datum import positive_part
+from boxplus.filtering.map_datum import MapDatum, positive_part
 from boxplus.filtering.nav_state import TANGENT, boxminus_into
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
@@ -54,6 +54,11 @@ class Drift:
     excess: NDArray[np.float64]
     deviations: float
     text: str
+
+    def put_into(self, datum: MapDatum, x: NDArray[np.float64]) -> list[str]:
+        """Widen what is known of pose and map at x (36,); returns what is to be told."""
+        datum.widen(self.excess, x)
+        return [self.text] if self.text else []
 
 
 class LongBaseline:

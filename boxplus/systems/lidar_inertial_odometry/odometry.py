@@ -235,7 +235,9 @@ class LidarInertialOdometry(Snapshots):
         map_points_world = state.to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
-            self._look_back(frame.scan.end_ns, points, map_points_world)
+            cov = self._mounting.widened(self._datum.pose_covariance(self._x), self._x)
+            drift = self._long_baseline.add(frame.scan.end_ns, self._x, cov, points, map_points_world)
+            self._warnings += [] if drift is None else drift.put_into(self._datum, self._x)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
@@ -324,14 +326,6 @@ class LidarInertialOdometry(Snapshots):
     def _is_astray(self, frame: Frame, on_map: float) -> bool:
         """Whether what fits the map may fit it by chance: after a gap of the IMU nothing but the points says where it is."""
         return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
-
-    def _look_back(self, time_ns: int, p_lidar: NDArray[np.float32], p_world: NDArray[np.float64]) -> None:
-        """Whether scans seconds apart fit each other as they were placed."""
-        cov = self._mounting.widened(self._datum.pose_covariance(self._x), self._x)
-        drift = self._long_baseline.add(time_ns, self._x, cov, p_lidar, p_world)
-        if drift is not None:
-            self._datum.widen(drift.excess, self._x)
-            self._warnings += [drift.text] if drift.text else []
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
         self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
