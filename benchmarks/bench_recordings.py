@@ -23,6 +23,7 @@ from metrics import Metric, run_as_script
 from numpy.typing import NDArray
 
 from boxplus.evaluation.evaluation import evaluate
+from boxplus.evaluation.rpe import Delta
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion
 from boxplus.recordings.open import open_recording
@@ -95,7 +96,7 @@ def ate_cm(contestant: Contestant, case: Case) -> float:
     """ATE of the IMU, SE(3)-aligned, ground truth interpolated; infinite without a usable trajectory."""
     try:
         estimate = trajectory(contestant, case.name)
-        return 100.0 * evaluate(estimate, case.truth, method="interpolate", rpe_distance_m=None, rpe_time_s=None).ate.rmse
+        return 100.0 * evaluate(estimate, case.truth, method="interpolate", deltas=()).ate.rmse
     except ValueError as problem:
         print(f"{case.name}: {problem}")
         return np.inf
@@ -104,7 +105,7 @@ def ate_cm(contestant: Contestant, case: Case) -> float:
 def kitti_figures(contestant: Contestant, case: Case) -> tuple[float, float]:
     """Deviation of the path length [%], and median relative rotation error over a second [deg], of the Velodyne."""
     estimate = trajectory(contestant, case.name, case.T_imu_lidar)
-    report = evaluate(estimate, case.truth, method="interpolate", rpe_distance_m=None, rpe_time_s=1.0, rpe_pairs="all")
+    report = evaluate(estimate, case.truth, method="interpolate", deltas=[Delta(1.0, "s")], rpe_pairs="all")
     deviation = 100.0 * abs(estimate.path_length_m / KITTI_PATH_M - 1.0)
     return deviation, report.relative[0].rotation.median
 
@@ -175,7 +176,7 @@ def simulated(name: str) -> list[Metric]:
     ours = race(simulation, {"boxplus": lambda: Boxplus(settings(simulation.T_imu_lidar, None))})["boxplus"]
     truth = simulation.ground_truth(np.array(ours.time_ns))
     exact = Trajectory(np.array(ours.time_ns), truth.p_world_imu, quaternion.from_matrix(truth.R_world_imu))
-    report = evaluate(trajectory(ours, name), exact, rpe_distance_m=None, rpe_time_s=None)
+    report = evaluate(trajectory(ours, name), exact, deltas=())
     return [
         Metric(
             f"recordings/simulated {name}, defaults: ATE", 100.0 * report.ate.rmse, "cm", bar=SIMULATED_BARS[name], tolerance=0.1
