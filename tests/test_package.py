@@ -113,7 +113,7 @@ def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
-    for path in [*SOURCES, *STUBS, ROOT / "boxplus" / "py.typed"]:
+    for path in [*SOURCES, *STUBS, ROOT / "boxplus" / "py.typed", ROOT / "boxplus" / "report" / "page.js"]:
         target = source / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(path.read_bytes())
@@ -126,7 +126,7 @@ def test_wheel_is_pure_python_and_typed(tmp_path: Path) -> None:
         names = archive.namelist()
         (metadata,) = [archive.read(name).decode() for name in names if name.endswith("METADATA")]
         (entries,) = [archive.read(name).decode() for name in names if name.endswith("entry_points.txt")]
-    assert "boxplus/py.typed" in names
+    assert {"boxplus/py.typed", "boxplus/report/page.js"} <= set(names)
     assert {name.split("/")[0] for name in names} == {"boxplus", f"boxplus-{boxplus.__version__}.dist-info"}
     assert {str(path.relative_to(ROOT)) for path in [*SOURCES, *STUBS]} <= set(names)
     assert "License-Expression: MIT" in metadata

@@ -9,19 +9,34 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from boxplus.report.palette import FAINT, GRID, HEIGHT, INK, REJECTED, SERIES, STATUS, XYZ, gravity_tilt_deg, shown_rows
+from boxplus.report.palette import (
+    DASHES,
+    FAINT,
+    GRID,
+    HEIGHT,
+    INK,
+    MARKS,
+    REJECTED,
+    SERIES,
+    STATUS,
+    XYZ,
+    gravity_tilt_deg,
+    shown_rows,
+)
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
 from boxplus.runs.lidar_inertial.scan_log import SHARES
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES
 
+_MOST_OF_A_BAND = 600
+_PARTS = 64  # of a metre: what points of a map are rounded to, which makes the page smaller
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 
 
 def map_and_trajectory(data: Timeline, unit: str = "m") -> go.Figure:
     """The map, coloured by height, and the trajectory, coloured by status."""
     figure = go.Figure()
-    points = data.map_points
+    points = np.round(_PARTS * data.map_points) / _PARTS
     if len(points):
         low, high = np.percentile(points[:, 2], [1, 99])
         figure.add_scatter3d(
@@ -54,7 +69,7 @@ def map_and_trajectory(data: Timeline, unit: str = "m") -> go.Figure:
                 z=path[here, 2],
                 mode="markers",
                 name=f"{name} ({int((data.status == name).sum())})",
-                marker={"size": 3.5 if name == "ok" else 5.5, "color": color},
+                marker={"size": 3.5 if name == "ok" else 5.5, "color": color, "symbol": MARKS[name][0]},
                 customdata=seconds[here],
                 hovertemplate=f"{name}, %{{customdata:.1f}} s<br>(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) {unit}<extra></extra>",
             )
@@ -182,7 +197,7 @@ def points(data: RunData) -> go.Figure:
     """Points after the voxel filter: used, and rejected by reason; and the residuals of the used ones."""
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35])
     rows = shown_rows(data)
-    add_area(figure, data, rows, data.log.column("points_used"), "used", STATUS["ok"], "%{y:.0f} points", row=1)
+    add_area(figure, data, rows, data.log.column("points_used"), "used", SERIES[0], "%{y:.0f} points", row=1)
     for color, (reason, count) in zip(cycle(REJECTED), data.log.pairs("rejected").items(), strict=False):
         add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} points", row=1)
     residual_cm = 100.0 * data.log.column("residual_rms")[rows]
@@ -236,7 +251,7 @@ def add_line(
 ) -> None:
     """One line."""
     place = {} if row is None else {"row": row, "col": 1}
-    line = {"color": color, "width": 1.4}
+    line = {"color": color, "width": 1.4, "dash": DASHES.get(color, "solid")}
     hover = f"{name}: %{{y:.4g}}<extra></extra>"
     figure.add_scatter(
         x=x, y=y, name=name, legendgroup=name, showlegend=legend, mode="lines", line=line, hovertemplate=hover, **place
@@ -255,10 +270,18 @@ def _add_xyz(
     place = {} if row is None else {"row": row, "col": 1}
     for axis, (name, color) in enumerate(zip("xyz", XYZ, strict=True)):
         if sigma is not None:
-            around = np.concatenate([values[:, axis] + sigma[:, axis], (values[:, axis] - sigma[:, axis])[::-1]])
+            some = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST_OF_A_BAND)).astype(np.intp))
+            middle, half = values[some, axis], sigma[some, axis]
+            around = np.concatenate([middle + half, (middle - half)[::-1]])
             band = {"fill": "toself", "fillcolor": color, "opacity": 0.12, "line": {"width": 0}, "mode": "lines"}
             figure.add_scatter(
-                x=np.concatenate([x, x[::-1]]), y=around, legendgroup=name, showlegend=False, hoverinfo="skip", **band, **place
+                x=np.concatenate([x[some], x[some][::-1]]),
+                y=around,
+                legendgroup=name,
+                showlegend=False,
+                hoverinfo="skip",
+                **band,
+                **place,
             )
         add_line(figure, x, values[:, axis], name, color, row, legend)
 

@@ -11,8 +11,8 @@ from boxplus.runs.slam.loop_search import Closure
 from boxplus.systems.lidar_inertial_odometry.estimate import AXES, Estimate
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 
-_STATUS_RGB = {"ok": (47, 125, 91), "weak": (224, 159, 62), "lost": (193, 68, 60)}
-_AXES_RGB = [(181, 68, 60), (58, 143, 77), (53, 104, 168)]
+_STATUS_RGB = {"ok": (58, 163, 227), "weak": (221, 144, 0), "lost": (160, 48, 112)}  # STATUS and XYZ of the palette
+_AXES_RGB = [(244, 67, 1), (45, 188, 174), (99, 70, 199)]
 _MOST_POINTS = 20_000
 _MAP_SCANS = 600
 """Scans or keyframes that stay visible; older ones are replaced, so that the viewer's memory stays bounded."""

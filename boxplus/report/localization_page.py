@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from html import escape
 from pathlib import Path
 
@@ -12,17 +10,16 @@ from matplotlib.figure import Figure
 
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
-from boxplus.report.palette import INK
+from boxplus.report.palette import INK, STATUS
 from boxplus.report.plots import plain
-from boxplus.report.skeleton import html_table, tiles, warnings_section, write_html
+from boxplus.report.skeleton import html_table, picture, tiles, warnings_section, write_html
 from boxplus.runs.localization.folder import LocalizationFolder
 from boxplus.runs.localization.localization_run import LocalizationResult
 from boxplus.runs.localization.logs import LOG_COLUMNS
 from boxplus.runs.storage.row_log import read_row_log
 
-_MAP, _COLORS = "#8a8f98", {"localised": "#2f7d5b", "odometry only": "#e09f3e", "searching": "#c1443c"}
+_MAP, _COLORS = "#8a8f98", dict(zip(("localised", "odometry only", "searching"), STATUS.values(), strict=True))
 _POINTS = 60_000  # of the map in the picture
-_DPI = 80
 
 
 def write_localization_report(folder: str | Path, result: LocalizationResult) -> Path:
@@ -86,7 +83,7 @@ def _overview(own: LocalizationFolder, result: LocalizationResult) -> str:
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plain(axes)
     text = "The map from above, in its own frame, and the poses in it. Where the place was searched for there are none."
-    return f"<section><h2>In the map</h2><p>{text}</p>{_embedded(figure, 'trajectory in the map')}</section>"
+    return f"<section><h2>In the map</h2><p>{text}</p>{picture(figure, 'trajectory in the map')}</section>"
 
 
 def _timeline(own: LocalizationFolder) -> str:
@@ -105,11 +102,4 @@ def _timeline(own: LocalizationFolder) -> str:
     sigma.set(xlabel="time [s]", ylabel="σ of the position [cm]")
     plain(share)
     plain(sigma)
-    return f"<section><h2>Status</h2>{_embedded(figure, 'status over time')}</section>"
-
-
-def _embedded(figure: Figure, name: str) -> str:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=_DPI)
-    encoded = base64.b64encode(data.getvalue()).decode()
-    return f'<img alt="{escape(name)}" style="max-width:100%" src="data:image/png;base64,{encoded}">'
+    return f"<section><h2>Status</h2>{picture(figure, 'status over time')}</section>"

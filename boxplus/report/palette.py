@@ -7,16 +7,22 @@ from numpy.typing import NDArray
 
 from boxplus.report.timeline import Timeline
 
-STATUS = {"ok": "#2f7d5b", "weak": "#e09f3e", "lost": "#c1443c"}
-XYZ = ("#b5443c", "#3a8f4d", "#3568a8")
+# Chosen by search so that they differ for every kind of colour vision and show on white as on the dark page: see the tests.
+STATUS = {"ok": "#3aa3e3", "weak": "#dd9000", "lost": "#a03070"}
+MARKS = {"ok": ("circle", "o"), "weak": ("diamond", "D"), "lost": ("x", "X")}
+"""Of the status, for those who see no colours: in Plotly's words and in Matplotlib's."""
+XYZ = ("#f44301", "#2dbcae", "#6346c7")
 """Of the axes x, y and z."""
-SERIES = ("#3568a8", "#e09f3e", "#2f7d5b", "#9b5aa5", "#c1443c", "#6b7a8f", "#5fa8a0", "#a5813c")
+SERIES = ("#5d6cff", "#95b118", "#2aa38a", "#6d4f95", "#cb505e", "#556070", "#247909", "#c98fc0")
+DASHES = {XYZ[1]: "dash", XYZ[2]: "dot", SERIES[1]: "dash", SERIES[2]: "dot", SERIES[3]: "dashdot", SERIES[4]: "longdash"}
+"""Of lines that share a picture, by their colour; the others are solid."""
 HEIGHT = ("#c9d3dc", "#93abc2", "#5c7594", "#33415c")
 """Of the map, from low to high: quiet, so that the trajectory stands out."""
-REJECTED = ("#e09f3e", "#c1443c", "#9b5aa5", "#6b7a8f", "#3568a8", "#a5813c")
+REJECTED = (SERIES[1], SERIES[4], SERIES[6], SERIES[5], SERIES[2], SERIES[7])
+"""Of what was not used, beside SERIES[0] for what was."""
 INK, FAINT, GRID = "#22303c", "#6b7a8f", "#e4e8ec"
 
-_MOST_ROWS = 4000
+_MOST_ROWS = 1500  # more than a page is wide
 
 
 def shown_rows(data: Timeline) -> NDArray[np.intp]:

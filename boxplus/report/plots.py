@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from boxplus.formats.output import atomic_file, make_folder
-from boxplus.report.palette import FAINT, GRID, INK, SERIES, STATUS, XYZ, shown_rows
+from boxplus.report.palette import FAINT, GRID, INK, MARKS, SERIES, STATUS, XYZ, shown_rows
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
 from boxplus.runs.lidar_inertial.scan_log import SHARES
@@ -69,7 +69,7 @@ def trajectory_picture(data: Timeline, title: str) -> Figure:
     for name in ("weak", "lost"):
         here = status == name
         if here.any():
-            axes.scatter(path[here, 0], path[here, 1], s=14, color=STATUS[name], label=name, zorder=3)
+            axes.scatter(path[here, 0], path[here, 1], s=18, color=STATUS[name], marker=MARKS[name][1], label=name, zorder=3)
     axes.scatter(path[0, 0], path[0, 1], s=45, facecolors="white", edgecolors=INK, label="start", zorder=4)
     axes.scatter(path[-1, 0], path[-1, 1], s=45, color=INK, marker="X", label="end", zorder=4)
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -139,7 +139,14 @@ def biases_picture(data: Timeline) -> Figure:
         for axis, color in enumerate(XYZ):
             low, high = values[:, axis] - sigma[:, axis], values[:, axis] + sigma[:, axis]
             axes.fill_between(data.seconds[rows], low, high, color=color, alpha=0.13, linewidth=0)
-            axes.plot(data.seconds[rows], values[:, axis], color=color, linewidth=1.2, label="xyz"[axis])
+            axes.plot(
+                data.seconds[rows],
+                values[:, axis],
+                color=color,
+                linewidth=1.2,
+                linestyle=("-", "--", ":")[axis],
+                label="xyz"[axis],
+            )
         margin = 0.25 * float(np.ptp(values)) + 1e-6
         axes.set_ylim(values.min() - margin, values.max() + margin)
         axes.set_ylabel(label)

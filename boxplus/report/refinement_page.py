@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
-from boxplus.report.palette import INK
+from boxplus.report.palette import DASHES, FAINT, INK, XYZ
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.runs.refinement.folder import RefineFolder
 from boxplus.runs.refinement.refine_run import RefineResult
 from boxplus.runs.refinement.summary import RefineSummary
-
-_BEFORE = "#8a8f98"
-_AXES = ("#d1495b", "#2f7d5b", "#30638e")
 
 
 def write_refinement_report(folder: str | Path, summary: RefineSummary, result: RefineResult) -> Path:
@@ -78,8 +75,8 @@ def _table(summary: RefineSummary) -> str:
 
 def _from_above(result: RefineResult) -> str:
     figure = go.Figure()
-    for T, name, color in ((result.T_before, "the run", _BEFORE), (result.T_after, "refined", INK)):
-        figure.add_trace(go.Scatter(x=T[:, 4], y=T[:, 5], name=name, mode="lines", line={"color": color}))
+    for T, name, color, dash in ((result.T_before, "the run", FAINT, "dash"), (result.T_after, "refined", INK, "solid")):
+        figure.add_trace(go.Scatter(x=T[:, 4], y=T[:, 5], name=name, mode="lines", line={"color": color, "dash": dash}))
     figure.update_layout(xaxis_title="x [m]", yaxis_title="y [m]", yaxis_scaleanchor="x", height=520, margin={"t": 10})
     return figure_section("Trajectory from above", "The run, and what refining makes of it.", figure)
 
@@ -89,7 +86,8 @@ def _shifts(result: RefineResult) -> str:
     figure = go.Figure()
     for axis, name in enumerate("xyz"):
         shift = 1e3 * (result.T_after[:, 4 + axis] - result.T_before[:, 4 + axis])
-        figure.add_trace(go.Scatter(x=seconds, y=shift, name=name, mode="lines", line={"color": _AXES[axis], "width": 1.2}))
+        line = {"color": XYZ[axis], "width": 1.4, "dash": DASHES.get(XYZ[axis], "solid")}
+        figure.add_trace(go.Scatter(x=seconds, y=shift, name=name, mode="lines", line=line))
     figure.update_layout(xaxis_title="time [s]", yaxis_title="shift [mm]", height=360, margin={"t": 10})
     return figure_section(
         "By how much every pose moved", "Along the axes of the world; the first pose stays where it is.", figure

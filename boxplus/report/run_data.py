@@ -17,7 +17,7 @@ from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.storage.row_log import RowLog
 
-_MOST_POINTS = 150_000
+_MOST_POINTS = 25_000
 _THIN_FROM = 10 * _MOST_POINTS
 
 

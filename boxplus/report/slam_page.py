@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import csv
-import io
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -14,19 +12,18 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
-from boxplus.report.palette import INK
+from boxplus.report.palette import INK, STATUS
 from boxplus.report.plots import plain
-from boxplus.report.skeleton import html_table, tiles, warnings_section, write_html
+from boxplus.report.skeleton import html_table, picture, tiles, warnings_section, write_html
 from boxplus.runs.slam.loop_file import why_refused
 from boxplus.runs.slam.result import SlamResult
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.systems.slam.loop import Loop
 
-_PLACE, _QUERY = "#8a8f98", "#d1495b"
-_PICTURES = 60  # loops drawn: all accepted ones first
+_PLACE, _QUERY = "#8a8f98", STATUS["lost"]
+_PICTURES = 30  # loops drawn: all accepted ones first
 _POINTS = 8000  # of a local map in a picture
 _MAP_POINTS = 200_000  # of all local maps in the overview
-_DPI = 80
 
 
 def write_slam_report(result: SlamResult) -> Path:
@@ -76,10 +73,10 @@ def _overview(result: SlamResult) -> str:
         for cloud, T, name in zip(clouds, (own.T_odo, own.T_map), ("before", "after"), strict=True)
     )
     text = (
-        "The map from above: left of the border as the odometry has it, right of it with loops closed. Red: loops, each between "
-        "two local maps; the correction is spread over the way between."
+        "The map from above: left of the border as the odometry has it, right of it with loops closed. Violet: loops, each "
+        "between two local maps; the correction is spread over the way between."
     )
-    below, above = _embedded(after, "map after closing loops"), _embedded(before, "map before closing loops")
+    below, above = picture(after, "map after closing loops"), picture(before, "map before closing loops")
     half = '<div style="position:absolute;inset:0;clip-path:inset(0 50% 0 0)">'
     slider = (
         f'<div style="position:relative">{below}{half}{above}</div></div>'
@@ -137,7 +134,7 @@ def _earth(result: SlamResult) -> str:
         f"Origin {where}: look at the place on a map, an offset of the datum is seen nowhere else. {facts.used} fixes; "
         f"heading known to {facts.heading_sigma_deg:.2f}°, places to {facts.position_sigma_m:.2f} m."
     )
-    return f"<section><h2>On the Earth</h2><p>{text}</p>{_embedded(figure, 'fixes over the ground track')}{left_out}</section>"
+    return f"<section><h2>On the Earth</h2><p>{text}</p>{picture(figure, 'fixes over the ground track')}{left_out}</section>"
 
 
 def _table(result: SlamResult) -> str:
@@ -177,8 +174,8 @@ def _pictures(result: SlamResult) -> list[str]:
     for loop in drawn[:_PICTURES]:
         verdict = "closed" if loop.is_accepted else f"refused: {why_refused(loop)}"
         title = f"Loop [{loop.query}, {loop.place}]"
-        picture = _embedded(_both_maps(result, loop), title)
-        sections.append(f"<section><h2>{title}</h2><p>{escape(verdict)}</p>{picture}</section>")
+        drawing = picture(_both_maps(result, loop), title)
+        sections.append(f"<section><h2>{title}</h2><p>{escape(verdict)}</p>{drawing}</section>")
     if len(drawn) > _PICTURES:
         sections.append(f"<p>{len(drawn) - _PICTURES} more loops are not drawn.</p>")
     return sections
@@ -195,16 +192,9 @@ def _both_maps(result: SlamResult, loop: Loop) -> Figure:
         axes.scatter(query[:, i], query[:, j], s=1.0, linewidths=0, color=_QUERY, alpha=0.6)
         axes.set(xlabel=names[0], ylabel=names[1], aspect="equal")
         plain(axes)
-    above.set_title(f"grey: local map {loop.place}, red: {loop.query}", loc="left", fontsize=10)
+    above.set_title(f"grey: local map {loop.place}, violet: {loop.query}", loc="left", fontsize=10)
     return figure
 
 
 def _some(points: NDArray[np.float32]) -> NDArray[np.float64]:
     return points[:: max(len(points) // _POINTS, 1)].astype(np.float64)
-
-
-def _embedded(figure: Figure, name: str) -> str:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=_DPI)
-    encoded = base64.b64encode(data.getvalue()).decode()
-    return f'<img alt="{escape(name)}" style="max-width:100%" src="data:image/png;base64,{encoded}">'

@@ -16,7 +16,7 @@ from plotly.subplots import make_subplots
 from boxplus.report import figures
 from boxplus.report.cameras.visual_data import SummaryT, VisualData
 from boxplus.report.page import evidence_table, headline, matrix_text, warning_lines, weak_table
-from boxplus.report.palette import REJECTED, SERIES, STATUS, shown_rows
+from boxplus.report.palette import REJECTED, SERIES, shown_rows
 from boxplus.report.plots import biases_picture, plain, status_strip, trajectory_picture, write_pictures
 from boxplus.report.skeleton import figure_section, html_table, warnings_section, write_html
 from boxplus.report.timeline import Timeline
@@ -116,10 +116,10 @@ def _tracked(data: VisualData[VioSummary]) -> go.Figure:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, row_heights=[0.1, 0.9], vertical_spacing=0.03)
     rows = shown_rows(data)
     figures.add_status(figure, data, rows)
-    figures.add_area(figure, data, rows, data.log.column("tracked"), "agree", STATUS["ok"], "%{y:.0f} landmarks", row=2)
+    figures.add_area(figure, data, rows, data.log.column("tracked"), "agree", SERIES[0], "%{y:.0f} landmarks", row=2)
     lines = data.log.column("lines_tracked")
     if lines.any():
-        figures.add_line(figure, data.seconds[rows], lines[rows], "lines that agree", SERIES[0], row=2)
+        figures.add_line(figure, data.seconds[rows], lines[rows], "lines that agree", SERIES[3], row=2)
     for color, (reason, count) in zip(cycle(REJECTED), data.log.pairs("rejected").items(), strict=False):
         figures.add_area(figure, data, rows, count, f"rejected: {reason}", color, "%{y:.0f} corners", row=2)
     figure.update_yaxes(title_text="corners", rangemode="tozero", row=2, col=1)
@@ -141,7 +141,7 @@ def _tracked_picture(data: VisualData[VioSummary]) -> Figure:
     rows = shown_rows(data)
     status_strip(strip, data, rows)
     layers = {"agree": data.log.column("tracked"), **data.log.pairs("rejected")}
-    colors = [STATUS["ok"], *(REJECTED[index % len(REJECTED)] for index in range(len(layers) - 1))]
+    colors = [SERIES[0], *(REJECTED[index % len(REJECTED)] for index in range(len(layers) - 1))]
     axes.stackplot(
         data.seconds[rows],
         [np.asarray(values)[rows] for values in layers.values()],

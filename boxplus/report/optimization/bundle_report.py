@@ -21,7 +21,7 @@ from boxplus.report.skeleton import figure_section, html_table
 from boxplus.runs.optimization_summary import OptimizationSummary
 from boxplus.systems.bundle_adjustment.bundle_adjustment import BundleAdjustmentResult
 
-ERROR_COLORS = ("#b9c7d4", "#6f93b8", "#2f5f9e", "#e09f3e", "#c1443c")
+ERROR_COLORS = ("#c3cdd7", "#7fa3c7", "#3a6fb0", "#dd9000", "#a03070")  # from small and quiet to large
 """Of points, from small errors to large ones."""
 _WORST = 12
 _FRUSTUM = 0.015  # length of a camera's pyramid, as a share of the scene

@@ -48,7 +48,7 @@ def error_histogram(before: NDArray[np.float64], after: NDArray[np.float64], uni
             name=name,
             mode="lines",
             connectgaps=False,
-            line={"color": color, "width": 2, "shape": "hvh"},
+            line={"color": color, "width": 2, "shape": "hvh", "dash": "dot" if name == "before" else "solid"},
             hovertemplate=f"{name}: %{{y}} around %{{x:.3g}} {unit}<extra></extra>",
         )
         valid = errors[np.isfinite(errors)]

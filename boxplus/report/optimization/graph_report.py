@@ -42,11 +42,12 @@ def write_graph_report(folder: Path, summary: OptimizationSummary, graph: PoseGr
         OutputError: they cannot be written.
     """
     panels = _panels(graph, result)
-    errors = (result.errors_start, result.errors)
+    errors = (result.errors_before, result.errors)
+    where = "at the start" if graph.poses is None else "in the file"
     write_optimization_plots(folder / "plots", _picture(graph, panels, result.errors), errors, "σ", summary.history)
     numbers = [
-        (f"{result.chi2:.7g}", f"χ², {result.chi2_start:.5g} at the start"),
-        (f"{summary.errors.median:.3g} σ", f"median edge error, {summary.errors_initial.median:.3g} σ at the start"),
+        (f"{result.chi2:.7g}", f"χ², {summary.chi2_initial:.5g} {where}"),
+        (f"{summary.errors.median:.3g} σ", f"median edge error, {summary.errors_initial.median:.3g} σ {where}"),
         (result.start.replace("_", " "), "start taken"),
         (f"{summary.history[-1].number}", f"steps in {summary.timing_s['total']:.2f} s"),
         (f"{len(graph.ids):,}", "poses"),
@@ -64,10 +65,11 @@ def write_graph_report(folder: Path, summary: OptimizationSummary, graph: PoseGr
 
 def _panels(graph: PoseGraph, result: PoseGraphResult) -> list[tuple[str, NDArray[np.float64]]]:
     """Title and positions of what is drawn side by side."""
-    panels = [] if graph.poses is None else [("in the file", positions(graph, graph.poses))]
-    if result.start != "file":
-        panels.append((f"start: {result.start.replace('_', ' ')}", positions(graph, result.poses_start)))
-    return [*panels, ("after", positions(graph, result.graph.poses if result.graph.poses is not None else result.poses_start))]
+    if graph.poses is None:
+        before = (f"start: {result.start.replace('_', ' ')}, the file has no poses", positions(graph, result.poses_start))
+    else:
+        before = ("before: in the file", positions(graph, graph.poses))
+    return [before, ("after", positions(graph, result.graph.poses if result.graph.poses is not None else result.poses_start))]
 
 
 def _kinds(graph: PoseGraph, errors: NDArray[np.float64]) -> list[NDArray[np.int64]]:
@@ -190,6 +192,6 @@ def _worst_edges(graph: PoseGraph, result: PoseGraphResult) -> str:
     rows = []
     for edge in np.argsort(-result.errors, kind="stable")[:_WORST]:
         i, j = graph.ids[graph.edges[edge]]
-        rows.append((f"{i} → {j}", f"{result.errors[edge]:.4g}", f"{result.errors_start[edge]:.4g}", str(edge)))
-    table = html_table(rows, ("edge between", "after [σ]", "at the start [σ]", "number in the file"))
+        rows.append((f"{i} → {j}", f"{result.errors[edge]:.4g}", f"{result.errors_before[edge]:.4g}", str(edge)))
+    table = html_table(rows, ("edge between", "after [σ]", "before [σ]", "number in the file"))
     return f"<details open><summary>Edges with the largest errors</summary>{table}</details>"

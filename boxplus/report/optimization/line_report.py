@@ -16,14 +16,14 @@ from boxplus.report.optimization.bundle_scene import BundleScene, Viewpoint, fru
 from boxplus.report.optimization.figures import FONT
 from boxplus.report.optimization.page import write_optimization_page
 from boxplus.report.optimization.plots import plain, write_optimization_plots
-from boxplus.report.palette import GRID, INK
+from boxplus.report.palette import GRID, INK, SERIES, STATUS
 from boxplus.report.skeleton import figure_section, html_table
 from boxplus.runs.optimization_summary import OptimizationSummary
 from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentResult
 
 Floats = NDArray[np.float64]
 
-_LINE, _UNSURE, _POINT = "#2f5f9e", "#c1443c", "#9aa7b4"
+_LINE, _UNSURE, _POINT = SERIES[0], STATUS["lost"], "#9aa7b4"
 _WORST = 12
 _FRUSTUM = 0.03  # length of a camera's pyramid, as a share of the scene
 

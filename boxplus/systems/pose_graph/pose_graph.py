@@ -80,6 +80,7 @@ class PoseGraphResult:
         start_costs: the cost at every start that was compared, with Huber in place of a loss that forgets.
         chi2_start, chi2: the objective over the edges without any robust loss, twice the cost of a problem without one.
         errors_start, errors: (m,) √ of what every edge adds to chi2: its error in standard deviations.
+        errors_before: the same at the poses of the input; at the start, where it has none.
         weights: (m,) weight of every edge at the end, 0 to 1: refused, or silenced by a robust loss.
         fit: χ² of the edges that count against what their information promises.
         minima: the objective at the end of every start that was followed; more than one where the residuals did not fit.
@@ -107,6 +108,7 @@ class PoseGraphResult:
     chi2: float
     errors_start: NDArray[np.float64]
     errors: NDArray[np.float64]
+    errors_before: NDArray[np.float64]
     weights: NDArray[np.float64]
     fit: Fit
     minima: dict[Start, float]
@@ -172,6 +174,7 @@ def optimize_pose_graph(
     solved = time.perf_counter()
     poses_end = solution.values[0]
     squared_start = squared_errors(residual, graph, known[chosen])
+    squared_before = squared_start if graph.poses is None else squared_errors(residual, graph, graph.poses)
     fit = _fit(graph, squared, weights, config, len(held))
     certificate = certify(replace(graph, poses=poses_end)) if config.certify else None
     notes = [*silent_notes(whole, silent), *structure_notes(graph, held), *solution.notes, *undetermined_notes(graph, solution)]
@@ -187,6 +190,7 @@ def optimize_pose_graph(
         chi2=float(squared.sum()),
         errors_start=_spread(np.sqrt(squared_start), ~silent),
         errors=_spread(np.sqrt(squared), ~silent),
+        errors_before=_spread(np.sqrt(squared_before), ~silent),
         weights=_spread(weights, ~silent),
         fit=fit,
         minima=minima,
