@@ -152,7 +152,7 @@ def picture(figure: Figure, name: str) -> str:
 
     drawn, small = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=_DPI)
-    Image.open(drawn).convert("RGB").quantize(48).save(small, format="png", optimize=True)
+    Image.open(drawn).convert("RGB").quantize(64, method=Image.Quantize.MAXCOVERAGE).save(small, format="png", optimize=True)
     encoded = base64.b64encode(small.getvalue()).decode()
     return f'<img alt="{escape(name)}" src="data:image/png;base64,{encoded}">'
 

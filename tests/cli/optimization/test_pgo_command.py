@@ -19,6 +19,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph import pose_graph
 from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
+from tests.report.unpacked import figures_of
 from tests.small_problems import loop_graph
 
 
@@ -70,8 +71,13 @@ def test_the_page_shows_file_start_and_result(tmp_path: Path, dimension: int, wi
     result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--loss", "cauchy")
     assert result.exit_code == 0, result.output
     body = (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
-    assert ('"text":"in the file"' in body) == with_poses
-    for told in ("start: graduated", "Edges with the largest errors", "ρ Cauchy(2.385)", "dense Cholesky"):
+    assert any("before: in the file" in figure for figure in figures_of(body)) == with_poses
+    for told in (
+        "<b>graduated</b><span>start taken</span>",
+        "Edges with the largest errors",
+        "ρ Cauchy(2.385)",
+        "dense Cholesky",
+    ):
         assert told in body
     for name in ("before_after.png", "errors.png", "cost.png"):
         assert (tmp_path / "out" / "plots" / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

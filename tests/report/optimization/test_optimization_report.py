@@ -19,6 +19,7 @@ from boxplus.report.optimization.graph_report import _kinds, _panels
 from boxplus.runs.optimization_summary import ErrorFacts, IterationFacts
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
+from boxplus.systems.pose_graph.problem import positions
 from tests.small_problems import bal_problem, colmap_model, gbp_problem, in_camera, loop_graph
 
 
@@ -94,9 +95,16 @@ def test_edges_of_a_graph_are_drawn_once_each(dimension: int) -> None:
     kinds = _kinds(graph, result.errors)
     assert sum(map(len, kinds)) == len(graph.edges)
     assert (np.abs(np.diff(kinds[1], axis=1)) == 1).all()
-    assert [title for title, _ in _panels(graph, result)] == ["in the file", "start: chordal", "after"]
+    (before, p_before), (after, p_after) = _panels(graph, result)
+    assert result.start == "chordal" and (before, after) == ("before: in the file", "after")
+    assert graph.poses is not None and result.graph.poses is not None
+    assert np.array_equal(p_before, positions(graph, graph.poses))  # and not the start that was taken
+    assert np.array_equal(p_after, positions(graph, result.graph.poses))
     from_file = optimize_pose_graph(graph, PoseGraphConfig(start="file"))
-    assert [title for title, _ in _panels(graph, from_file)] == ["in the file", "after"]
+    assert_allclose(result.errors_before, from_file.errors_start, rtol=1e-12)
+    without = optimize_pose_graph(loop_graph(dimension, with_poses=False))
+    assert np.array_equal(without.errors_before, without.errors_start)
+    assert "the file has no poses" in _panels(loop_graph(dimension, with_poses=False), without)[0][0]
 
 
 @pytest.mark.filterwarnings("error")

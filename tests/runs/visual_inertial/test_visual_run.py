@@ -34,6 +34,7 @@ from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
+from tests.report.unpacked import figures_of
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
 SETTINGS = {"odometry": {"cell_size": 12, "features": 100}}
@@ -142,10 +143,10 @@ def test_lines_are_drawn_and_do_not_outlive_their_run(
 ) -> None:
     folder = VioFolder(tmp_path / "again")
     shutil.copytree(finished[0].path, folder.path)
-    assert '"name":"lines"' not in write_report(folder.path).read_text(encoding="utf-8")
+    assert not any('"name": "lines"' in figure for figure in figures_of(write_report(folder.path).read_text(encoding="utf-8")))
     ends = np.random.default_rng(1).normal(size=(9, 6)).astype(np.float32)
     write_lines(folder.lines, ends)
-    assert '"name":"lines"' in write_report(folder.path).read_text(encoding="utf-8")
+    assert any('"name": "lines"' in figure for figure in figures_of(write_report(folder.path).read_text(encoding="utf-8")))
     assert np.allclose(load_visual_run(folder.path).map_lines, ends, atol=1e-4)
     with open_camera_recording(recorded) as recording:
         run_visual_odometry(recording, folder.path, CONFIG, overwrite=True, should_stop=lambda: True)
