@@ -35,6 +35,7 @@ _SHORT = 2e-3  # m, the same where a scan is followed
 _FEWEST = 60  # points on planes
 _SCALE = 1.4826  # from the median of |e| to a standard deviation
 _LEAST_SCALE = 0.01  # m, of the residuals
+_BLUNT = 0.25  # of a stage's distance: least scale of the residuals where the start is a coarse guess
 _NOISE = 2.0  # times the information that noise of the normals alone gives
 
 
@@ -108,18 +109,27 @@ def register(
 
 
 def approach(source: Surface, target: Surface, T_start: Floats, config: RegistrationConfig) -> Floats | None:
-    """(7,) T_target_source before the last stage of `register`, from a sixth of its work; None where that gives none."""
-    return _staged(source, target, T_start, config, _STAGES[:-1])
+    """(7,) T_target_source before the last stage of `register`, from a sixth of its work; None where that gives none.
+
+    From guesses on a grid of up to a metre. Floors fit at once, and by their spread a wall that is half a metre off would be an
+    outlier, and its direction one that nothing measures: residuals are weighed by what a stage may be off.
+    """
+    return _staged(source, target, T_start, config, _STAGES[:-1], _BLUNT)
 
 
 def _staged(
-    source: Surface, target: Surface, T_start: Floats, config: RegistrationConfig, stages: tuple[tuple[float, int, int], ...]
+    source: Surface,
+    target: Surface,
+    T_start: Floats,
+    config: RegistrationConfig,
+    stages: tuple[tuple[float, int, int], ...],
+    blunt: float = 0.0,
 ) -> Floats | None:
     T = np.array(T_start, dtype=np.float64)
     for distance, steps, count in stages:
         points = _spread(source.points, count)
         for _ in range(steps):
-            found = _Matched.of(points, target, T, distance, config)
+            found = _Matched.of(points, target, T, distance, config, max(blunt * distance, _LEAST_SCALE))
             if found is None:
                 return None
             step, length = found.step(config.weak_information)
@@ -196,7 +206,13 @@ class _Matched:
 
     @classmethod
     def of(
-        cls, points: NDArray[np.float32], target: Surface, T: Floats, distance: float, config: RegistrationConfig
+        cls,
+        points: NDArray[np.float32],
+        target: Surface,
+        T: Floats,
+        distance: float,
+        config: RegistrationConfig,
+        least_scale: float = _LEAST_SCALE,
     ) -> _Matched | None:
         count = len(points)
         planes, valid = np.empty((count, 5)), np.zeros(count, dtype=np.bool_)
@@ -220,7 +236,7 @@ class _Matched:
         C = plane[:, :3] @ quaternion.to_matrix(T[:4])
         J = np.hstack([np.cross(arm, C) / lever, C])
         e = plane[:, 3]
-        scale = max(_SCALE * float(np.median(np.abs(e))), _LEAST_SCALE)
+        scale = max(_SCALE * float(np.median(np.abs(e))), least_scale)
         weight = 1.0 / (1.0 + (e / (2.0 * scale)) ** 2) ** 2
         # w about the middle moves the origin: v = v' + middle × w … on the right, T Exp(ξ) with ξ = A ξ'.
         A = np.eye(6)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from boxplus.manifolds import se3
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.simulation.worlds.world import World
-from boxplus.simulation.worlds.worlds import city, corridor
-from boxplus.systems.slam.registration import Surface, register
+from boxplus.simulation.worlds.worlds import city, corridor, hall
+from boxplus.systems.slam.config import RegistrationConfig
+from boxplus.systems.slam.registration import Surface, approach, register
 from boxplus.systems.slam.rivals import rival_shifts
 
 
@@ -48,6 +49,21 @@ def test_visits_are_laid_over_each_other_within_the_covariance() -> None:
         nees.append(xi @ np.linalg.solve(found.covariance, xi))
         np.testing.assert_allclose(found.information @ found.covariance, np.eye(6), atol=1e-6)
     assert np.mean(nees) < 2.0 * 6.0
+
+
+def test_walls_half_a_metre_off_are_no_outliers_beside_a_floor_that_fits() -> None:
+    """From the middle of a cell of 1 m, along either axis of a hall, whose floor is most of what is seen."""
+    config, errors = RegistrationConfig(), []
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        world = hall(seed=seed)
+        T = np.array([1.0, 0.0, 0.0, 0.0, random.uniform(-8.0, 8.0), random.uniform(-4.0, 4.0), 1.6])
+        there, here = seen(world, T, random), seen(world, T, random)
+        for x, y in ((0.45, 0.0), (0.0, 0.45), (-0.35, 0.35)):
+            found = approach(here, there, np.array([1.0, 0.0, 0.0, 0.0, x, y, 0.0]), config)
+            assert found is not None
+            errors.append(np.linalg.norm(found[4:]))
+    assert max(errors) < 0.1
 
 
 def test_a_bent_map_is_less_certain() -> None:
