@@ -9,8 +9,9 @@ A map is made on one drive, once for a seed of a world. Each start is another da
 moved, and another sensor (half the rings, other angles and height; `--sensor forward`: a third of the turn only) starts anywhere,
 its odometry in a world of its own, which drifts. A start ends 3 s after it was found, or with its drive, of 10 to 13 s. It is
 false where any pose that is given out is off by more than a metre or 5°. `--wrong` looks in the map of another world of the same
-kind, where nothing should be found; hall and warehouse are then the same but for what is in them. `--kidnap` carries the sensor, once it was found, to another start of the same day without its
-odometry noticing; poses off by as much are counted for how long they are given out. Settings were chosen on even seeds.
+kind, where nothing should be found; hall and warehouse are then the same but for what is in them. `--kidnap` carries the sensor,
+once it was found, to another start of the same day without its odometry noticing; poses off by as much are counted for how long
+they are given out. Settings were chosen on even seeds.
 """
 
 from __future__ import annotations
