@@ -55,11 +55,6 @@ class Drift:
     deviations: float
     text: str
 
-    def put_into(self, datum: MapDatum, x: NDArray[np.float64]) -> list[str]:
-        """Widen what is known of pose and map at x (36,); returns what is to be told."""
-        datum.widen(self.excess, x)
-        return [self.text] if self.text else []
-
 
 class LongBaseline:
     """Follows the scans of one run.
@@ -74,6 +69,22 @@ class LongBaseline:
         self._old: list[NDArray[np.float64]] = []
         self._old_covariance: NDArray[np.float64] = np.zeros((6, 6))
         self._old_ns = 0
+
+    def follow(
+        self,
+        time_ns: int,
+        x: NDArray[np.float64],
+        pose_covariance: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
+        p_world: NDArray[np.float64],
+        datum: MapDatum,
+    ) -> list[str]:
+        """Take a scan as `add` does, and widen the `datum` by what comes out; returns what is to be told."""
+        drift = self.add(time_ns, x, pose_covariance, p_lidar, p_world)
+        if drift is None:
+            return []
+        datum.widen(drift.excess, x)
+        return [drift.text] if drift.text else []
 
     def add(
         self,

@@ -81,8 +81,7 @@ class LidarInertialOdometry(Snapshots):
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
         self._weak_spell = WeakSpell(self.config.weak_threshold)
-        self._consistency = Consistency(self.config, self.config.T_declared)
-        self._long_baseline = LongBaseline(self.config)
+        self._consistency, self._long_baseline = Consistency(self.config, self.config.T_declared), LongBaseline(self.config)
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
@@ -236,8 +235,7 @@ class LidarInertialOdometry(Snapshots):
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
             cov = self._mounting.widened(self._datum.pose_covariance(self._x), self._x)
-            drift = self._long_baseline.add(frame.scan.end_ns, self._x, cov, points, map_points_world)
-            self._warnings += [] if drift is None else drift.put_into(self._datum, self._x)
+            self._warnings += self._long_baseline.follow(self._time_ns, self._x, cov, points, map_points_world, self._datum)
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
