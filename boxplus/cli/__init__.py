@@ -31,6 +31,7 @@ _COMMANDS = {
     "inspect": ("boxplus.cli.inspect:inspect", "Examine a recording: topics, rates, gaps, times, units, extrinsic."),
     "calibrate": ("boxplus.cli.calibrate:app", "Find mounting, clock offset and scales of sensors from a recording."),
     "eval": ("boxplus.cli.eval:evaluate_command", "Compare a trajectory with the ground truth: ATE, RPE."),
+    "convert": ("boxplus.cli.convert:convert_command", "Write a trajectory, cloud, graph or reconstruction in another format."),
     "map": ("boxplus.cli.lidar.map:map_app", "Join runs into one map, look into a map, or write it as one file."),
     "fleet": ("boxplus.cli.lidar.fleet:app", "Run many recordings, on this machine or a cluster, and join those that met."),
     "report": ("boxplus.cli.report:report", "Draw the report of a run again, also of an interrupted one."),
