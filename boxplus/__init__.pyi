@@ -31,6 +31,7 @@ from .manifolds.quaternion import UnitQuaternion as UnitQuaternion
 from .manifolds.se2 import SE2 as SE2
 from .manifolds.se3 import SE3 as SE3
 from .manifolds.se3 import SE3Left as SE3Left
+from .manifolds.sim3 import Sim3 as Sim3
 from .manifolds.so3 import SO3 as SO3
 from .manifolds.sphere import S2 as S2
 from .maps.ikd_tree import IkdTree as IkdTree

@@ -17,9 +17,11 @@ from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import UnitQuaternion, multiply_scalars, rotate
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
+from boxplus.manifolds.sim3 import Sim3
 from boxplus.manifolds.so3 import SO3
+from boxplus.manifolds.sphere import S2, basis_scalars
 
-_ADD, _TURN_RIGHT, _TURN_LEFT, _MOVE_LOCAL, _TURN_MATRIX, _MOVE_PLANE = range(6)
+_ADD, _TURN_RIGHT, _TURN_LEFT, _MOVE_LOCAL, _TURN_MATRIX, _MOVE_PLANE, _MOVE_SCALED, _GROW, _TILT = range(9)
 
 
 def tangent_steps(manifold: Manifold) -> NDArray[np.int64] | None:
@@ -38,6 +40,10 @@ def tangent_steps(manifold: Manifold) -> NDArray[np.int64] | None:
         rows = [(_ADD, 0, 0)] + [(_MOVE_PLANE, 0, k) for k in range(2)]
     elif manifold == Line3D:
         rows = [(_TURN_RIGHT, 0, k) for k in range(3)] + [(_ADD, 4, 0)]
+    elif manifold == S2:
+        rows = [(_TILT, 0, k) for k in range(2)]
+    elif manifold == Sim3:
+        rows = [(_TURN_RIGHT, 0, k) for k in range(3)] + [(_MOVE_SCALED, 0, k) for k in range(3)] + [(_GROW, 7, 0)]
     elif isinstance(manifold, Product):
         parts, start = [], 0
         for component in manifold.components:
@@ -89,6 +95,18 @@ def step_into(
     elif kind == _MOVE_LOCAL:
         a, b, c = rotate(x[s], x[s + 1], x[s + 2], x[s + 3], h * e0, h * e1, h * e2)
         out[s + 4], out[s + 5], out[s + 6] = x[s + 4] + a, x[s + 5] + b, x[s + 6] + c
+    elif kind == _MOVE_SCALED:
+        h *= x[s + 7]
+        a, b, c = rotate(x[s], x[s + 1], x[s + 2], x[s + 3], h * e0, h * e1, h * e2)
+        out[s + 4], out[s + 5], out[s + 6] = x[s + 4] + a, x[s + 5] + b, x[s + 6] + c
+    elif kind == _GROW:
+        out[s] *= np.exp(h)
+    elif kind == _TILT:
+        cosine, sine = 1.0 - 2.0 * sin_half * sin_half, 2.0 * sin_half * cos_half
+        B = basis_scalars(x[s], x[s + 1], x[s + 2])
+        out[s] = cosine * x[s] + sine * (e0 * B[0] + e1 * B[3])
+        out[s + 1] = cosine * x[s + 1] + sine * (e0 * B[1] + e1 * B[4])
+        out[s + 2] = cosine * x[s + 2] + sine * (e0 * B[2] + e1 * B[5])
     elif kind == _MOVE_PLANE:
         cosine, sine = np.cos(x[s]), np.sin(x[s])
         out[s + 1] += h * (cosine * e0 - sine * e1)

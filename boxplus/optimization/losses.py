@@ -5,18 +5,19 @@ the gradient is exact, ρ′ Jᵀr, and so is the curvature, Jᵀ(ρ′ I + 2 ρ
 Further out, where it would vanish or turn negative and steps along r would know no bound, the curvature is that of
 reweighted least squares, ρ′ JᵀJ, which converges linearly.
 
-A loss is a code that the compiled kernels branch on, so that others than these cannot be given from outside.
+A loss is a code that the compiled kernels branch on; `UserLoss` is one that is given from outside, as a function.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
+from boxplus.optimization.user_loss import Derivatives, compiled_loss
 
-SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH, TRUNCATED = 0, 1, 2, 3, 4, 5, 6
+SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH, TRUNCATED, USER = 0, 1, 2, 3, 4, 5, 6, 7
 # Share of ρ′ that must be left along the residual for its second-order term to be used. It matters little: over pose graphs and
 # bundle adjustments with 0 to 20 % outliers and all losses below, 0.5 took 0 to 10 % fewer iterations than reweighted least
 # squares alone in most cases. 0.1 saved a quarter in one (Cauchy at half a standard deviation), but its steps were often too
@@ -28,6 +29,9 @@ _LEAST_CURVATURE = 0.5
 class Loss:
     """A loss by its code and its scale c, in standard deviations of the whitened residual.
 
+    Attributes:
+        function: of a `UserLoss`; None for those that the kernels know.
+
     Example:
         >>> bp.losses.Huber(1.5).with_scale(3.0)
         Huber(3)
@@ -36,6 +40,7 @@ class Loss:
     code: int
     scale: float
     name: str
+    function: Derivatives | None = None
 
     def __repr__(self) -> str:
         return self.name if self.code == SQUARED else f"{self.name}({self.scale:g})"
@@ -43,11 +48,11 @@ class Loss:
     @property
     def is_redescending(self) -> bool:
         """Whether a residual pulls the less the larger it is, far out: the cost then has minima that depend on the start."""
-        return self.code not in (SQUARED, HUBER)
+        return compiled_loss(self.function)[1] if self.function is not None else self.code not in (SQUARED, HUBER)
 
     def with_scale(self, scale: float) -> Loss:
         """The same loss with another scale."""
-        return _loss(self.code, scale, self.name)
+        return replace(_loss(self.code, scale, self.name), function=self.function)
 
 
 def _loss(code: int, scale: float, name: str) -> Loss:
@@ -128,6 +133,29 @@ def Truncated(scale: float) -> Loss:
     return _loss(TRUNCATED, scale, "Truncated")
 
 
+def UserLoss(function: Derivatives, scale: float = 1.0) -> Loss:
+    """A loss of one's own: ρ(s) = c² f(s/c²), with c the scale, as all losses here are made.
+
+    Args:
+        function: takes s = ‖r‖² in squares of the scale and returns f(s), f′(s), f″(s); compiled by Numba. f(0) = 0, f′ ≥ 0, and
+            f′(0) = 1 if small residuals are to count as in least squares.
+        scale: c, in standard deviations of the whitened residual.
+
+    Raises:
+        InputError: a function that does not compile or does not return three numbers, a loss that falls or is not finite, or
+            derivatives that differences do not confirm: all are looked at for s from 10⁻⁴ to 10⁸.
+
+    Example:
+        >>> def pseudo_huber(s):
+        ...     root = np.sqrt(1.0 + s)
+        ...     return 2.0 * root - 2.0, 1.0 / root, -0.5 / (root * root * root)
+        >>> bp.losses.UserLoss(pseudo_huber, scale=1.5)
+        pseudo_huber(1.5)
+    """
+    compiled_loss(function)
+    return replace(_loss(USER, scale, function.__name__), function=function)
+
+
 @kernel(inline=True)
 def loss_at(code: int, scale: float, s: float) -> tuple[float, float, float]:
     """ρ(s), ρ′(s), ρ″(s)."""
@@ -160,6 +188,13 @@ def loss_at(code: int, scale: float, s: float) -> tuple[float, float, float]:
 def triggs(code: int, scale: float, s: float) -> tuple[float, float, float]:
     """ρ, the factor √ρ′ of residual and Jacobian, and α of Triggs: r̃ = √ρ′/(1 − α) r, J̃ = √ρ′ (I − α r rᵀ/s) J."""
     rho, first, second = loss_at(code, scale, s)
+    value, factor, alpha = triggs_factors(rho, first, second, s)
+    return value, factor, alpha
+
+
+@kernel(inline=True)
+def triggs_factors(rho: float, first: float, second: float, s: float) -> tuple[float, float, float]:
+    """As `triggs`, of ρ(s), ρ′(s) and ρ″(s)."""
     if first <= 0.0:
         return rho, 0.0, 0.0
     curvature = 1.0 + 2.0 * s * second / first

@@ -14,10 +14,11 @@ from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.optimization.linear_systems.elimination import choose_system
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
+from boxplus.optimization.linear_systems.linearization import LinearizedProblem, linearize
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.minimizers.minimize import Callback, minimize, strategy_of
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Solution, values_at
 from boxplus.optimization.solver_options import SolverOptions, options_from
 from boxplus.optimization.terms.connections import check_connections, require_connections
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
@@ -294,6 +295,21 @@ class Problem:
         at = self.values_at(values)
         return float(sum(group.evaluate(at, 1).cost for group in self.groups))
 
+    @changes
+    def linearize(self, values: Solution | Sequence[NDArray[np.float64]] | None = None) -> LinearizedProblem:
+        """Sparse Jacobian, whitened residuals and weights at `values`, by default the variables' own: for solvers of one's own.
+
+        Fixed variables and held components have no columns; what cannot be evaluated is left with zero rows of weight zero.
+
+        Raises:
+            InputError: no free variable; values as in `values_at`.
+            NotFiniteError: a residual or a Jacobian is NaN or infinite there.
+
+        Example:
+            `J, r, w = (at := problem.linearize()).jacobian, at.residuals, at.weights`, and `J.T @ (w * r)` is the gradient.
+        """
+        return linearize(self.blocks, self.groups, self.values_at(values))
+
     def defects(self) -> list[str]:
         """What is wrong with the structure, a sentence each: variables without residuals, components without gauge."""
         return structural_defects(self.blocks, [*self.groups, *held_groups(self.blocks)])
@@ -362,24 +378,7 @@ class Problem:
         Raises:
             InputError: another number of blocks or variables, points that are not on their manifolds.
         """
-        if given is None:
-            return [block.values.copy() for block in self.blocks]
-        values = given.values_of(self.blocks) if isinstance(given, Solution) else given
-        if len(values) != len(self.blocks):
-            raise InputError(f"values of {len(self.blocks)} blocks", f"{len(values)}", "give one array for each block")
-        if isinstance(given, Solution):
-            for block, other in zip(self.blocks, given._problem.layout.blocks, strict=False):  # some may be new
-                if block.manifold != other.manifold:
-                    got = f"a solution with {other.name!r} on {other.manifold}"
-                    raise InputError(f"{block.name} on {block.manifold}", got, "start from a problem of the same blocks")
-        checked = []
-        for block, array in zip(self.blocks, values, strict=True):
-            if np.shape(array) != block.values.shape:
-                raise InputError(
-                    f"{block.name} of shape {block.values.shape}", f"shape {np.shape(array)}", "keep the block's shape"
-                )
-            checked.append(block.manifold.check(block.name, array))
-        return checked
+        return values_at(self.blocks, given)
 
     def _analyse(self, options: SolverOptions) -> tuple[LeastSquares, tuple[str, ...], float]:
         """The problem as the solvers see it, what is wrong with its structure, and the seconds this took."""

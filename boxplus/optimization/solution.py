@@ -182,3 +182,23 @@ class Solution:
         ]
         lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
         return "\n".join([*lines, *self.notes])
+
+
+def values_at(blocks: Sequence[Variables], given: Solution | Sequence[NDArray[np.float64]] | None) -> list[NDArray[np.float64]]:
+    """See `Problem.values_at`."""
+    if given is None:
+        return [block.values.copy() for block in blocks]
+    values = given.values_of(blocks) if isinstance(given, Solution) else given
+    if len(values) != len(blocks):
+        raise InputError(f"values of {len(blocks)} blocks", f"{len(values)}", "give one array for each block")
+    if isinstance(given, Solution):
+        for block, other in zip(blocks, given._problem.layout.blocks, strict=False):  # some may be new
+            if block.manifold != other.manifold:
+                got = f"a solution with {other.name!r} on {other.manifold}"
+                raise InputError(f"{block.name} on {block.manifold}", got, "start from a problem of the same blocks")
+    checked = []
+    for block, array in zip(blocks, values, strict=True):
+        if np.shape(array) != block.values.shape:
+            raise InputError(f"{block.name} of shape {block.values.shape}", f"shape {np.shape(array)}", "keep the block's shape")
+        checked.append(block.manifold.check(block.name, array))
+    return checked

@@ -46,33 +46,34 @@ def compiled_loops(
     jacobian: Callable[..., Any] | None,
     dim: int,
     dofs: tuple[int, ...],
-    data: tuple[tuple[str, int], ...],
+    data: tuple[tuple[str, int, bool], ...],
     has_steps: bool,
 ) -> Loops:
-    """Loops for a function and its Jacobian; dofs are those of its variables, data (dtype, number of axes) of every data array.
+    """Loops for a function and its Jacobian; dofs are those of its variables, data (dtype, number of axes, whether one row
+    is for all residuals) of every data array.
 
     Raises:
         InputError: a function that does not take these arguments, does not compile, or returns something else than
             `dim` numbers.
     """
-    variables = len(dofs)
+    variables, shared = len(dofs), [is_shared for _, _, is_shared in data]
     rows: list[types.Type] = [types.Array(types.float64, 1, "C")] * variables
-    rows += [_row_type(dtype, axes) for dtype, axes in data]
+    rows += [_row_type(dtype, axes) for dtype, axes, _ in data]
     _check_arguments("function", function, len(rows), "one row for each variable, then one for each data array")
     compute, returned = _compiled("function", function, tuple(rows), checked=True)
     store = _Store(returned, dim, function.__name__)
     names: dict[str, Any] = {"function": compute, "np": np, "step_into": step_into, "copy_into": copy_into}
     names["present"] = present if returned is not None else _as_it_is
-    evaluate = _loop("evaluate", _evaluate_source(variables, len(data), store), names)
+    evaluate = _loop("evaluate", _evaluate_source(variables, shared, store), names)
     if jacobian is not None:
         expected = f"the arguments of {function.__name__} and then one (dim, dof) array to fill for each variable"
         _check_arguments("jacobian", jacobian, len(rows) + variables, expected)
         matrices = [types.Array(types.float64, 2, "C")] * variables
         names["jacobian"], _ = _compiled("jacobian", jacobian, (*rows, *matrices), checked=True)
-        source = _analytic_source(variables, len(data), store)
+        source = _analytic_source(variables, shared, store)
     elif has_steps:
         names["function"], _ = _compiled("function", function, tuple(rows), checked=False)
-        source = _numeric_source(variables, len(data), store, dofs)
+        source = _numeric_source(variables, shared, store, dofs)
     else:
         return Loops(evaluate, None)
     return Loops(evaluate, _loop("linearize", source, names))
@@ -218,10 +219,10 @@ class _Store:
         return ["found"] if self.is_scalar else [f"found[{c}]" for c in range(self.dim)]
 
 
-def _evaluate_source(variables: int, data: int, store: _Store) -> str:
+def _evaluate_source(variables: int, data: list[bool], store: _Store) -> str:
     arguments = _arguments(variables, data)
     return f"""
-def evaluate(begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", data)}r, valid):
+def evaluate(begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", len(data))}r, valid):
     for n in range(np.uint64(begin), np.uint64(end)):
         e = function({", ".join(arguments)})
 {_residual(store)}
@@ -230,12 +231,12 @@ def evaluate(begin, end, {_names("x", variables)}{_names("index", variables)}{_n
 """
 
 
-def _analytic_source(variables: int, data: int, store: _Store) -> str:
+def _analytic_source(variables: int, data: list[bool], store: _Store) -> str:
     arguments = _arguments(variables, data)
     zero = "\n".join(f"        J{s}[n, :, :] = 0.0" for s in range(variables))
     return f"""
 def linearize(
-    begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", data)}r, {_names("J", variables)}valid
+    begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", len(data))}r, {_names("J", variables)}valid
 ):
     for n in range(np.uint64(begin), np.uint64(end)):
 {zero}
@@ -247,7 +248,7 @@ def linearize(
 """
 
 
-def _numeric_source(variables: int, data: int, store: _Store, dofs: tuple[int, ...]) -> str:
+def _numeric_source(variables: int, data: list[bool], store: _Store, dofs: tuple[int, ...]) -> str:
     """Every residual at its point (probe 0) and one step ahead and one behind along each direction of each tangent.
 
     All moved variables are written first and read later, which spares the processor waiting for its own stores; there is a
@@ -286,12 +287,12 @@ def _numeric_source(variables: int, data: int, store: _Store, dofs: tuple[int, .
             "continue",
         ]
     )
-    call = ", ".join([*moved, *(f"data{k}[n]" for k in range(data))])
+    call = ", ".join([*moved, *_entries(data)])
     zeros = "\n".join(f"            J{s}[n, :, :] = 0.0" for s in range(variables))
     new_line = "\n"
     return f"""
 def linearize(
-    begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", data)}
+    begin, end, {_names("x", variables)}{_names("index", variables)}{_names("data", len(data))}
     {_names("steps", variables)}{_names("h", variables)}r, {_names("J", variables)}valid
 ):
     one, two = np.uint64(1), np.uint64(2)
@@ -321,8 +322,13 @@ def _residual(store: _Store) -> str:
     return _indent("\n".join(lines), 8)
 
 
-def _arguments(variables: int, data: int) -> list[str]:
-    return [f"x{s}[index{s}[n]]" for s in range(variables)] + [f"data{k}[n]" for k in range(data)]
+def _arguments(variables: int, data: list[bool]) -> list[str]:
+    return [f"x{s}[index{s}[n]]" for s in range(variables)] + _entries(data)
+
+
+def _entries(data: list[bool]) -> list[str]:
+    """The row of every data array; `data` says which have one for all residuals."""
+    return [f"data{k}[0]" if is_shared else f"data{k}[n]" for k, is_shared in enumerate(data)]
 
 
 def _names(stem: str, count: int) -> str:

@@ -38,8 +38,9 @@ class UserResidual(Residual):
         function: as above; it must not change its arguments.
         dim: rows of one residual.
         manifolds: of the connected variables.
-        data: arrays (N,) or (N, …) with the measurements; an entry of (N,) comes as a scalar.
-        count: N, where there are no data.
+        data: arrays (N,) or (N, …) with the measurements; an entry of (N,) comes as a scalar. What is the same for all residuals
+            comes as a number, or as the single row of (1, …).
+        count: N, where no data tell.
         jacobian: takes the arguments of the function and then, for every variable, an array (dim, dof) of zeros to fill with
             ∂r(x ⊞ δ)/∂δ. In a batch, it returns one array (n, dim, dof) for each variable. Without it, Jacobians are central
             differences on the manifold; `jacobian_kind` says which.
@@ -92,6 +93,7 @@ class UserResidual(Residual):
             raise InputError("dim ≥ 1", str(dim), "give the number of rows of one residual")
         self.data = tuple(_data(k, array) for k, array in enumerate(data))
         rows = _count(self.data, count)
+        self._is_shared = tuple(len(array) == 1 != rows for array in self.data)
         if roles is None:
             code = getattr(function, "__code__", getattr(getattr(function, "py_func", None), "__code__", None))
             roles = code.co_varnames[: len(connected)] if code is not None else ()
@@ -112,7 +114,7 @@ class UserResidual(Residual):
         self._tables = tables if all(table is not None for table in tables) else None
         self._loops: Loops | None = None
         if not is_batch:
-            types = tuple((array.dtype.name, array.ndim) for array in self.data)
+            types = tuple((d.dtype.name, d.ndim, shared) for d, shared in zip(self.data, self._is_shared, strict=True))
             self._loops = compiled_loops(
                 function, jacobian, dim, tuple(manifold.dof for manifold in connected), types, self._tables is not None
             )
@@ -146,20 +148,25 @@ class UserResidual(Residual):
     ) -> list[NDArray[np.float64]]:
         return [values[rows[begin:end]] for values, rows in zip(x, index, strict=True)]
 
+    def _rows_of_data(self, begin: int, end: int) -> list[NDArray[Any]]:
+        """Entries [begin, end) of every data array; a row for all residuals is repeated, without a copy."""
+        parts = zip(self.data, self._is_shared, strict=True)
+        return [np.broadcast_to(d, (end - begin, *d.shape[1:])) if shared else d[begin:end] for d, shared in parts]
+
     def _at(self, begin: int, end: int, values: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Residuals and validity of rows [begin, end) with one value (end − begin, size) of every variable each."""
         if self._loops is None:
             return self._call_batch(begin, end, values)
         r, valid = np.zeros((end - begin, self.dim)), np.ones(end - begin, dtype=np.bool_)
         rows = (np.arange(end - begin, dtype=np.uint32),) * len(values)
-        data = (array[begin:end] for array in self.data)
+        data = (array if shared else array[begin:end] for array, shared in zip(self.data, self._is_shared, strict=True))
         self._run(self._loops.evaluate, 0, end - begin, (*values, *rows, *data), (r, valid), first=begin)
         return r, valid
 
     def _call_batch(
         self, begin: int, end: int, values: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        returned = self.function(*values, *(array[begin:end] for array in self.data))
+        returned = self.function(*values, *self._rows_of_data(begin, end))
         if not (isinstance(returned, tuple) and len(returned) == 2):
             returned = returned, np.ones(end - begin, dtype=np.bool_)
         r, valid = np.asarray(returned[0], dtype=np.float64), np.asarray(returned[1])
@@ -174,7 +181,7 @@ class UserResidual(Residual):
     def _call_batch_jacobian(
         self, jacobian: Callable[..., Any], begin: int, end: int, values: Sequence[NDArray[np.float64]], jacobians: Arrays
     ) -> None:
-        returned = jacobian(*values, *(array[begin:end] for array in self.data))
+        returned = jacobian(*values, *self._rows_of_data(begin, end))
         matrices = [np.asarray(J, dtype=np.float64) for J in (returned if isinstance(returned, tuple | list) else (returned,))]
         shapes = [(end - begin, self.dim, manifold.dof) for manifold in self.manifolds]
         if [J.shape for J in matrices] != shapes:
@@ -247,22 +254,24 @@ class UserResidual(Residual):
 
 def _data(number: int, array: ArrayLike) -> NDArray[Any]:
     values = as_array(array, f"data[{number}]")
-    if values.dtype.kind not in "fiub" or values.ndim == 0:
+    if values.dtype.kind not in "fiub":
         raise InputError(
-            f"data[{number}] as numbers (N, …)",
+            f"data[{number}] as numbers (N, …), (1, …) or one number",
             f"{values.dtype} of shape {values.shape}",
-            "give one row for each residual; a constant is written into the function or taken from around it",
+            "give one row for each residual, or one for all",
         )
-    return np.array(values, dtype=np.float64 if values.dtype.kind == "f" else np.int64, order="C")
+    return np.array(np.atleast_1d(values), dtype=np.float64 if values.dtype.kind == "f" else np.int64, order="C")
 
 
 def _count(data: tuple[NDArray[Any], ...], count: int | None) -> int:
     lengths = {len(array) for array in data} | ({count} if count is not None else set())
-    if len(lengths) != 1:
+    if len(lengths) > 1:
+        lengths -= {1}  # rows for all residuals
+    if len(lengths) != 1 or (count is not None and lengths != {count}):
         raise InputError(
-            "data arrays of one length N, or count",
+            "data arrays of one length N (or 1, for all residuals), or count",
             f"lengths {[len(array) for array in data]}" + ("" if count is None else f" and count {count}"),
-            "give one row for each residual",
+            "give one row for each residual, or one for all: [row], not row",
         )
     return lengths.pop()
 

@@ -130,7 +130,7 @@ def _whitened(rows: Indices, is_spatial: bool, is_exact: bool, with_jacobians: b
         evaluate_rows_2d(0, count, T_i, T_j, i, j, Z, r, valid)
     whiten_residuals(0, count, W, False, r)
     factor, projection = np.empty(count), np.empty(count)
-    weigh_residuals(0, count, code, scale, r, valid, valid, factor, projection, np.empty(4))
+    weigh_residuals(0, count, code, scale, r, valid, valid, factor, projection, np.empty((0, 3)), np.empty(4))
     if with_jacobians:
         whiten_jacobian(0, count, W, False, J_i)
         whiten_jacobian(0, count, W, False, J_j)

@@ -149,9 +149,9 @@ class IncrementalProblem:
         loss = loss if loss is not None else Squared()
         blocks = [self.blocks[c.block.number] for c in rows]
         kind = type(residual)
-        if kind in (RelativePose, RelativePose2D) and all(
-            b.manifold == m for b, m in zip(blocks, residual.manifolds, strict=True)
-        ):
+        # The kernels of relative poses know the losses by their codes.
+        at_home = all(b.manifold == m for b, m in zip(blocks, residual.manifolds, strict=True))
+        if kind in (RelativePose, RelativePose2D) and at_home and loss.function is None:
             self._add_relative_poses(residual, rows, loss, name)
         else:
             check_connections(residual, rows, (), carry_over)

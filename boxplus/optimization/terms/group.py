@@ -21,6 +21,7 @@ from boxplus.optimization.terms.weighting import (
     whiten_jacobian,
     whiten_residuals,
 )
+from boxplus.optimization.user_loss import compiled_loss
 from boxplus.residuals.residual import Residual
 
 # Residuals linearised, whitened and weighted in one go: few enough to stay in the second-level cache.
@@ -159,6 +160,8 @@ class Group:
         self.loss = loss
         scaled = self.residual.count if loss.code != SQUARED else 0
         self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
+        self._fill = compiled_loss(loss.function)[0] if loss.function is not None else None
+        self._derivatives = np.zeros((scaled if self._fill is not None else 0, 3))
 
     def set_weights(self, weights: NDArray[np.float64] | None) -> None:
         """Count ‖W r‖² (N,) times from the next linearisation on, whatever the loss; None for once. See `Problem.set_weights`."""
@@ -206,6 +209,12 @@ class Group:
         """Cost at the point `values`; overwrites `r` and `valid`, not the Jacobians."""
         return self._visit(values, threads, None)
 
+    def unweighed(self) -> Group:
+        """The same residuals under least squares, with arrays of its own: what it linearises disturbs nobody."""
+        other = Group(self.residual, self.connections, Squared(), self.name)
+        other.removed, other._root = self.removed, self._root
+        return other
+
     def accept(self) -> None:
         """The next costs are compared over the residuals that are valid now."""
         self.counted[:] = self.valid
@@ -236,9 +245,11 @@ class Group:
                 whiten_residuals(begin, end, factors, diagonal, self.r)
             if self._root is not None:
                 self.r[begin:end] *= self._root[begin:end, None]
+            if self._fill is not None:
+                self._fill(begin, end, self.loss.scale, self.r, self.valid, self._derivatives)
             weigh_residuals(
                 begin, end, self.loss.code, self.loss.scale, self.r, self.valid, self.counted,
-                self._factor, self._projection, self._sums[chunk],
+                self._factor, self._projection, self._derivatives, self._sums[chunk],
             )  # fmt: skip
             if changes is None:
                 return

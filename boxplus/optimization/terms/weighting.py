@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.optimization.losses import SQUARED, triggs
+from boxplus.optimization.losses import SQUARED, USER, triggs, triggs_factors
 
 _SIX = np.uint64(6)
 
@@ -127,6 +127,7 @@ def weigh_residuals(
     counted: NDArray[np.bool_],
     factor: NDArray[np.float64],
     projection: NDArray[np.float64],
+    derivatives: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
     """Cost of the rows [begin, end), and Triggs' scaling of their whitened residuals.
@@ -137,6 +138,7 @@ def weigh_residuals(
         valid: (N,) of this linearisation; an invalid residual costs nothing.
         counted: (N,) residuals that were valid at the point the step started from.
         factor, projection: (N,) receive √ρ′ and α/‖r̃‖² for `weigh_jacobian`; untouched for least squares.
+        derivatives: (N, 3) ρ, ρ′, ρ″ of a loss of a user's own; of any length for others.
         sums: receives ½ Σ ρ over the valid rows, the same over those of them that are `counted`, the number of rows
             counted but no longer valid, and the number of valid rows.
     """
@@ -154,7 +156,10 @@ def weigh_residuals(
             s += r[n, i] * r[n, i]
         rho = s
         if code != SQUARED:
-            rho, root, alpha = triggs(code, scale, s)
+            if code == USER:
+                rho, root, alpha = triggs_factors(derivatives[n, 0], derivatives[n, 1], derivatives[n, 2], s)
+            else:
+                rho, root, alpha = triggs(code, scale, s)
             grow = root / (1.0 - alpha)
             for i in range(dim):
                 r[n, i] *= grow

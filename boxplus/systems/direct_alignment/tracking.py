@@ -130,7 +130,7 @@ def track(
         Pose, covariance, brightness; and a status other than `converged`, with the reason, when they must not be believed.
 
     Raises:
-        InputError: an image of another shape or not finite, a start that is no pose.
+        InputError: an image of another shape or not finite, a start that is no pose, a loss of a user's own.
 
     Example:
         >>> v, u = np.mgrid[:120, :160]
@@ -147,6 +147,8 @@ def track(
         )
     if max_iterations < 1:
         raise InputError("max_iterations at least 1", f"{max_iterations}", "leave it out for 50")
+    if loss is not None and loss.function is not None:
+        raise InputError("a loss that the kernels of direct alignment know", f"{loss!r}", "take one of `losses` but `UserLoss`")
     starts = SE3Left.check("T_21", T_21)
     if not len(starts):
         raise InputError("at least one start T_21", "none", "leave it out to begin without motion")
