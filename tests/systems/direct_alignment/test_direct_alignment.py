@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
-from boxplus.optimization.losses import Squared
+from boxplus.optimization.losses import Squared, UserLoss
 from boxplus.residuals.camera.photometric import Photometric
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.direct_alignment import align_rgbd
@@ -126,6 +126,10 @@ def test_it_says_when_it_cannot() -> None:
     assert same.status == "converged" and np.abs(same.T_21 - [1, 0, 0, 0, 0, 0, 0]).max() < 1e-9
 
 
+def squared(s: float) -> tuple[float, float, float]:
+    return s, 1.0, 0.0
+
+
 def test_refusals() -> None:
     first, depth, second = textured_plane(6, se3.exp(np.zeros(6)))
     with pytest.raises(InputError, match="two images of the same shape"):
@@ -138,6 +142,8 @@ def test_refusals() -> None:
         align_rgbd(first, np.zeros_like(depth), second, CAMERA)
     with pytest.raises(InputError, match="1 to 6 levels"):
         align_rgbd(first, depth, second, CAMERA, levels=9)
+    with pytest.raises(InputError, match="kernels of direct alignment know – got squared"):
+        align_rgbd(first, depth, second, CAMERA, loss=UserLoss(squared))
     with pytest.raises(InputError, match="max_iterations at least 1"):
         align_rgbd(first, depth, second, CAMERA, max_iterations=0)
 
