@@ -13,7 +13,6 @@ from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RA
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     Cause,
     Finding,
-    clock_drift,
     contradictions,
     judges_clocks,
     judges_lengths,
@@ -22,6 +21,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
 )
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import ARM, TranslationFit
+from boxplus.systems.lidar_inertial_agreement.watch import clock_drift
 
 _KEYS: dict[Cause, tuple[str, str]] = {
     "gyro_unit": ("gyro_scale", "wrong unit"),

@@ -50,7 +50,6 @@ _SLOPE_KNOWN = 0.3
 _FARTHEST_REVERSED = 4.5  # feet, and a third of it
 _FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
-_DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MOUNTED = 0.95  # share of the turning that a mounting explains
@@ -389,19 +388,3 @@ def _of_slope(slope: float, std: float, deviations: float = 3.0) -> Finding | No
 def matrix_text(R: NDArray[np.float64]) -> str:
     """A (3, 3) matrix on one line."""
     return "[" + "; ".join(", ".join(f"{value:.4f}" for value in row) for row in R) + "]"
-
-
-def clock_drift(earlier: Agreement, later: Agreement) -> Finding | None:
-    """Clocks that run at different speeds, or one that steps: both comparisons show the offset, and it differs."""
-    before, after = earlier.rotation, later.rotation
-    if before is None or after is None or not judges_clocks(before) or not judges_clocks(after):
-        return None
-    change, known = after.offset_s - before.offset_s, float(np.hypot(before.offset_std_s, after.offset_std_s))
-    if abs(change) < max(_DRIFT_S, _DRIFT_DEVIATIONS * known):
-        return None
-    seconds = float(later.path.time_ns[-1] - earlier.path.time_ns[-1]) * 1e-9
-    return Finding(
-        "clock_drift",
-        f"within {seconds:.0f} s the offset of the LiDAR's clock to the IMU's changed by {change * 1e3:+.0f} ± "
-        f"{known * 1e3:.0f} ms: the clocks drift apart or one of them steps; synchronise them",
-    )

@@ -20,7 +20,6 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     Finding,
-    clock_drift,
     contradictions,
     judges,
     judges_clocks,
@@ -34,6 +33,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.registration import thinned
 
+_DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _WINDOW_S = 4.0
 _FEWEST_SCANS = 20
 _MOST_POINTS = 6000
@@ -195,3 +195,19 @@ class Watch:
             self._slopes.append(slope)
             self._slopes_until_ns = int(agreement.path.time_ns[-1])
         return lengths_of_many(self._slopes)
+
+
+def clock_drift(earlier: Agreement, later: Agreement) -> Finding | None:
+    """Clocks that run at different speeds, or one that steps: both comparisons show the offset, and it differs."""
+    before, after = earlier.rotation, later.rotation
+    if before is None or after is None or not judges_clocks(before) or not judges_clocks(after):
+        return None
+    change, known = after.offset_s - before.offset_s, float(np.hypot(before.offset_std_s, after.offset_std_s))
+    if abs(change) < max(_DRIFT_S, _DRIFT_DEVIATIONS * known):
+        return None
+    seconds = float(later.path.time_ns[-1] - earlier.path.time_ns[-1]) * 1e-9
+    return Finding(
+        "clock_drift",
+        f"within {seconds:.0f} s the offset of the LiDAR's clock to the IMU's changed by {change * 1e3:+.0f} ± "
+        f"{known * 1e3:.0f} ms: the clocks drift apart or one of them steps; synchronise them",
+    )

@@ -11,7 +11,6 @@ from boxplus.simulation import Fault, faults
 from boxplus.systems.lidar_inertial_agreement import agreement as agreement_module
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
-    clock_drift,
     contradictions,
     judges_clocks,
     judges_lengths,
@@ -19,6 +18,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     lengths_of_many,
     slope_of,
 )
+from boxplus.systems.lidar_inertial_agreement.watch import clock_drift
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, turned
 
 FEET = 3.28084
