@@ -52,11 +52,12 @@ def cache_root() -> Path:
     return base / "boxplus"
 
 
-def _module_files(dotted_name: str) -> list[Path]:
+@functools.cache
+def _module_files(dotted_name: str) -> tuple[Path, ...]:
     """The file of a module; of a package also its stub, which says where the names come from that it imports on first use."""
     path = _PACKAGE_ROOT.joinpath(*dotted_name.split(".")[1:])
     candidates = (path.with_suffix(".py"), path / "__init__.py", path / "__init__.pyi")
-    return [candidate for candidate in candidates if candidate.is_file()]
+    return tuple(candidate for candidate in candidates if candidate.is_file())
 
 
 @functools.cache

@@ -37,6 +37,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def _forget() -> None:
+    _kernel_cache._module_files.cache_clear()
     _kernel_cache._imported_files.cache_clear()
     _kernel_cache._source_key.cache_clear()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+from difflib import get_close_matches
 from typing import Annotated, Any
 
 import typer
@@ -55,15 +56,26 @@ class _Commands(TyperGroup):
         stand_in.command(cmd_name, help=_COMMANDS[cmd_name][1])(lambda: None)
         return typer.main.get_command(stand_in)
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """All of each sentence."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-") and not ctx.resilient_parsing:
+            close = [repr(name) for name in get_close_matches(args[0], _COMMANDS)]
+            meant = f"did you mean {' or '.join(close)}?" if close else "'boxplus --help' lists them all"
+            ctx.fail(f"No such command {args[0]!r}: {meant}")
         name, command, rest = super().resolve_command(ctx, args)
         if name is None or command is None:
             return name, command, rest
+        from boxplus.cli.help import Command
+
         module, _, attribute = _COMMANDS[name][0].partition(":")
         found = getattr(importlib.import_module(module), attribute)
         if not isinstance(found, typer.Typer):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
-            single.command(name)(found)
+            single.command(name, cls=Command)(found)
             found = single
         return name, typer.main.get_command(found), rest
 
@@ -82,7 +94,6 @@ class _Commands(TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # brackets in help texts are units and extras, not markup
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_FAILED
 from boxplus.cli.cameras.calibrate_cameras import cameras
-from boxplus.cli.options import takes_recording_options
+from boxplus.cli.help import Command
+from boxplus.cli.model_options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -23,10 +25,10 @@ def _calibrate() -> None:
     """Find out how sensors are mounted, timed and scaled, from a recording of them."""
 
 
-app.command("cameras")(cameras)
+app.command("cameras", cls=Command)(cameras)
 
 
-@app.command("lidar-imu")
+@app.command("lidar-imu", cls=Command)
 @takes_recording_options
 def lidar_imu(
     recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
@@ -41,9 +43,9 @@ def lidar_imu(
 
     Exit code 1 when the motion does not determine the mounting: the file then holds the rest and says what motion would.
     """
-    from rich.console import Console
     from rich.progress import Progress
 
+    from boxplus.cli.console import make_console
     from boxplus.errors import InputError
     from boxplus.recordings import open_recording
     from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
@@ -52,7 +54,7 @@ def lidar_imu(
         raise InputError("a new file for the calibration", f"{output} exists", "choose another --output, or give --overwrite")
     with (
         open_recording(recording, options) as opened,
-        Progress(console=Console(stderr=True), transient=True) as progress,
+        Progress(console=make_console(stderr=True), transient=True) as progress,
     ):
         task = progress.add_task(f"comparing LiDAR and IMU of {recording.name}", total=1.0)
         found = calibrate_lidar_imu(opened, options, lambda done: progress.update(task, completed=done))
@@ -65,7 +67,7 @@ def lidar_imu(
         typer.echo(str(output))
     if not found.has_mounting:
         typer.echo("the motion does not determine T_imu_lidar: not written", err=True)
-        raise typer.Exit(1)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _write(path: Path, text: str) -> None:
@@ -77,9 +79,10 @@ def _write(path: Path, text: str) -> None:
 
 
 def _print_table(quantities: Sequence[Quantity]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from boxplus.cli.console import make_console
 
     table = Table(show_lines=False, pad_edge=False)
     for heading in ("", "what", "value", "standard deviation", "advice"):
@@ -87,4 +90,4 @@ def _print_table(quantities: Sequence[Quantity]) -> None:
     for quantity in quantities:
         known = Text("known", style="green") if quantity.determined else Text("open", style="yellow")
         table.add_row(known, quantity.name, Text(quantity.value), Text(quantity.std), Text(quantity.advice))
-    Console().print(table)
+    make_console().print(table)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_INTERRUPTED
+
 if TYPE_CHECKING:
     from boxplus.simulation.simulation import Simulation
 
@@ -37,7 +39,7 @@ def demo(
     threads = {"threads": min(2, os.cpu_count() or 1)}
     summary = run(recording, results.path, load_run_config(overrides={"odometry": threads}), overwrite=True)
     if summary.state != "finished":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
     truth = output / f"{name}.gt.tum"
     evaluation = evaluate(read_trajectory(results.trajectory), read_trajectory(truth, "tum"), method="interpolate")
     scan, factor = summary.timing.scan_ms, summary.timing.real_time_factor
@@ -52,8 +54,7 @@ def demo(
 
 def _provide(simulation: Simulation, recording: Path) -> None:
     """Write the recording, unless the same one is already there."""
-    from rich.console import Console
-
+    from boxplus.cli.console import make_console
     from boxplus.simulation.recording_writer import write_recording
 
     parameters = Path(f"{recording}.json")  # written last
@@ -61,6 +62,6 @@ def _provide(simulation: Simulation, recording: Path) -> None:
     if parameters.is_file() and parameters.read_text(encoding="utf-8") == wanted:
         typer.echo(f"{recording}: simulated before, used again")
         return
-    with Console(highlight=False).status(f"simulating {recording.name}") as status:
+    with make_console().status(f"simulating {recording.name}") as status:
         write_recording(simulation, recording, progress=lambda share: status.update(f"simulating {recording.name}: {share:.0%}"))
     typer.echo(f"{recording}: {simulation.scan_count} scans simulated")

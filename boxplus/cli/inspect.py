@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options
+from boxplus.cli import EXIT_FAILED
+from boxplus.cli.model_options import takes_recording_options
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -43,9 +44,9 @@ def inspect(
 
     Where there is nothing to examine, no such file or folder, it is 2, as with every command.
     """
-    from rich.console import Console
     from rich.progress import Progress
 
+    from boxplus.cli.console import make_console
     from boxplus.errors import RecordingError
     from boxplus.runs.inspection.diagnosis import diagnose
     from boxplus.runs.transform import parse_transform
@@ -53,7 +54,7 @@ def inspect(
     if not recording.exists():
         raise RecordingError("a recording", f"no file or folder {recording}", "check the path")
     T_given = None if T_imu_lidar is None else parse_transform(T_imu_lidar)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=make_console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)
         diagnosis = diagnose(
             recording,
@@ -70,7 +71,7 @@ def inspect(
     else:
         _print_table(diagnosis)
     if diagnosis.verdict == "error":
-        raise typer.Exit(1)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _write(output: Path, diagnosis: Diagnosis) -> None:
@@ -82,15 +83,16 @@ def _write(output: Path, diagnosis: Diagnosis) -> None:
 
 
 def _print_table(diagnosis: Diagnosis) -> None:
-    from rich.console import Console
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
+    from boxplus.cli.console import make_console
     from boxplus.errors import printable
 
-    console = Console()
+    console = make_console()
     title = Text(printable(f"{diagnosis.path.name}: {diagnosis.format}"))
-    table = Table(title=title, title_justify="left", show_lines=False, pad_edge=False)
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     table.add_column("what", no_wrap=True)
     table.add_column("value", overflow="fold")

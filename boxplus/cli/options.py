@@ -1,81 +1,88 @@
-"""Options that several commands share: how a recording is read, and on how many threads."""
+"""Options that several commands share: settings, results, what is printed."""
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
-from pydantic import BaseModel, ValidationError
-
-from boxplus.errors import BoxplusError
-from boxplus.recordings.options import OtherLidar, RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.runs.lidar_inertial.config import RunConfig
 
 ConfigT = TypeVar("ConfigT", bound="RunConfig")
 
-_TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None, tuple[OtherLidar, ...] | None: list[str] | None}
-"""What a command line can take, for what it cannot."""
+RESULTS, SETTINGS, PRINTING = "Results", "Settings", "On the terminal"
 
-_PANEL = "Reading the recording (found from the data unless given)"
+RecordingArgument = Annotated[
+    Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.", metavar="RECORDING")
+]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.", rich_help_panel=SETTINGS),
+]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        help="One setting, with its section or without: scan_voxel=0.5, map.voxel=0.2; may be repeated.",
+        metavar="KEY=VALUE",
+        rich_help_panel=SETTINGS,
+    ),
+]
+MountingOption = Annotated[
+    str | None,
+    typer.Option(
+        "--T-imu-lidar",
+        help="Pose of the LiDAR in the IMU frame (p_imu = T p_lidar): 16 numbers row by row, 'xyz_qwxyz: x y z qw qx qy qz', "
+        "'xyz_qxyzw: …', 'xyz_rpy_deg: x y z roll pitch yaw', or a file with one of these.",
+        metavar="POSE",
+        rich_help_panel=SETTINGS,
+    ),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.", rich_help_panel=SETTINGS),
+]
+NoMapOption = Annotated[bool, typer.Option("--no-map", help="Write no map.", rich_help_panel=RESULTS)]
+NoReportOption = Annotated[bool, typer.Option("--no-report", help="Draw no report.", rich_help_panel=RESULTS)]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the results of an earlier run.", rich_help_panel=RESULTS)
+]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.", rich_help_panel=RESULTS)
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option(
+        "--json",
+        help="Print run.json on the standard output, and everything else on the standard error.",
+        rich_help_panel=PRINTING,
+    ),
+]
+GroundTruthOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--gt", help="Ground truth to compare with at the end: TUM, KITTI, EuRoC or boxplus CSV.", rich_help_panel=RESULTS
+    ),
+]
+QuietOption = Annotated[
+    bool,
+    typer.Option("--quiet", "-q", help="Print warnings and errors only, on the standard error.", rich_help_panel=PRINTING),
+]
 
 
-def takes_recording_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of a recording with a LiDAR; see `takes_options`."""
-    return takes_options(RecordingOptions)(command)
+def odometry_overrides(T_imu_lidar: str | None, threads: int | None) -> dict[str, object]:
+    """What `--T-imu-lidar` and `--threads` change of the odometry's settings.
 
-
-def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command one option for every field of a model, and pass them to it as `options`.
-
-    `--point-time-unit` sets `point_time_unit`; the unit at the end of a name (`start_s`) is left out. A tuple of texts is an
-    option that may be repeated.
-
-    Raises, when the command is called:
-        typer.BadParameter: a value outside its range.
+    Raises:
+        InputError: no pose, or one whose order nobody can tell.
     """
+    from boxplus.runs.transform import parse_transform
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command, eval_str=True)
-        fields = model.model_fields
-
-        @functools.wraps(command)
-        def with_options(**words: Any) -> None:
-            given = {name: words.pop(name) for name in fields}
-            given = {name: None if value == [] else value for name, value in given.items()}
-            try:
-                options = model(**given)
-            except ValidationError as error:
-                first = error.errors()[0]
-                cause = first.get("ctx", {}).get("error")
-                if isinstance(cause, BoxplusError):
-                    raise cause from error
-                name = _flag(str(first["loc"][0]))
-                raise typer.BadParameter(f"{first['msg']} (got {first['input']!r})", param_hint=name) from error
-            command(**words, options=options)
-
-        added = [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=Annotated[
-                    _TEXTS.get(field.annotation, field.annotation),
-                    typer.Option(_flag(name), help=_sentence(field.description or ""), rich_help_panel=_PANEL),
-                ],
-            )
-            for name, field in fields.items()
-        ]
-        kept = [parameter for name, parameter in own.parameters.items() if name != "options"]
-        with_options.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
-        return with_options
-
-    return decorate
+    given: dict[str, object] = {} if threads is None else {"threads": threads}
+    return given if T_imu_lidar is None else {**given, "T_imu_lidar": parse_transform(T_imu_lidar).tolist()}
 
 
 def with_default_threads(config: ConfigT) -> ConfigT:
@@ -84,11 +91,3 @@ def with_default_threads(config: ConfigT) -> ConfigT:
         return config
     both = {"threads": min(2, os.cpu_count() or 1)}
     return config.model_copy(update={"odometry": config.odometry.model_copy(update=both)})
-
-
-def _flag(name: str) -> str:
-    return "--" + name.removesuffix("_s").removesuffix("_hz").removesuffix("_m").replace("_", "-")
-
-
-def _sentence(description: str) -> str:
-    return f"{description[0].upper()}{description[1:]}."

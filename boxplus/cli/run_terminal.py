@@ -1,9 +1,7 @@
-"""What a run shows on a terminal: evidence before, progress while it goes on, results at the end; and Ctrl-C."""
+"""What a run shows on a terminal: evidence before, progress while it goes on, results at the end."""
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,12 +9,12 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from rich import box
-from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from boxplus.cli.console import make_console
 from boxplus.errors import printable
 from boxplus.recordings.info import Evidence
 from boxplus.runs.run_facts import RunFacts
@@ -27,10 +25,16 @@ _SHOWN_WARNINGS = 8
 
 
 class RunTerminal:
-    """Prints on the standard output; without a terminal the progress bar is left out."""
+    """Prints on the standard output; without a terminal the progress bar is left out.
 
-    def __init__(self) -> None:
-        self._console = Console(highlight=False)
+    Args:
+        quiet: print warnings, and what is not to be trusted or not finished, alone, and on the standard error.
+        as_json: leave the standard output to a summary as JSON, and print on the standard error.
+    """
+
+    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
+        self._console = make_console(stderr=as_json, quiet=quiet)
+        self._alarms = make_console(stderr=True) if quiet else self._console
 
     def status(self, text: str) -> AbstractContextManager[object]:
         """A line that stands while something takes its time."""
@@ -59,7 +63,9 @@ class RunTerminal:
             TaskProgressColumn(),
             TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(),
+            TextColumn("elapsed,"),
             TimeRemainingColumn(),
+            TextColumn("to go"),
         )
         with ProgressBar(*columns, console=self._console, disable=not self._console.is_terminal) as bar:
             task = bar.add_task("odometry", total=1.0, text="")
@@ -88,8 +94,8 @@ class RunTerminal:
             files: names of those that may be there.
         """
         console = self._console
-        style = "green" if summary.state == "finished" and summary.contradiction is None else "yellow"
-        console.print(Text(printable(summary.describe_state()), style))
+        good = summary.state == "finished" and summary.contradiction is None
+        (console if good else self._alarms).print(Text(printable(summary.describe_state()), "green" if good else "yellow"))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")
         table.add_column()
@@ -104,12 +110,25 @@ class RunTerminal:
         console.print(table)
         for warning in summary.warnings[:_SHOWN_WARNINGS]:
             times = f" ({warning.count} times)" if warning.count > 1 else ""
-            console.print(Text.assemble(("warning: ", "yellow"), printable(warning.text) + times))
+            self._alarms.print(Text.assemble(("warning: ", "yellow"), printable(warning.text) + times))
         if len(summary.warnings) > _SHOWN_WARNINGS:
-            console.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
+            self._alarms.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
         for name in files:
             if (folder / name).exists():
                 console.print(f"  {folder / name}", soft_wrap=True, markup=False)
+
+    def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        """A table with a row for each of several things."""
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for heading in headings:
+            table.add_column(heading, overflow="fold")
+        for row in rows:
+            table.add_row(*(Text(printable(cell)) for cell in row))
+        self._console.print(table)
+
+    def print_failure(self, what: str, error: str) -> None:
+        """That one of several things failed, and why."""
+        self._alarms.print(Text.assemble(("failed: ", "bold red"), printable(f"{what}: {error}")))
 
 
 class _Rate:
@@ -127,28 +146,6 @@ class _Rate:
         self._seen.append((now, scans))
         begin, first = self._seen[0]
         return (scans - first) / (now - begin) if now > begin else 0.0
-
-
-@contextmanager
-def stop_on_interrupt(announce: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Yields a question: was it asked to stop? The first Ctrl-C (or SIGTERM) only asks, the second stops at once."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield stop.is_set
-        return
-
-    def ask(number: int, frame: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-        announce()
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop.is_set
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def speed_text(real_time_factor: float, total_s: float, compiled: int) -> str:

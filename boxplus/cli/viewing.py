@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from boxplus.cli.options import PRINTING
+
 ViewOption = Annotated[
     str | None,
     typer.Option(
@@ -15,6 +17,7 @@ ViewOption = Annotated[
         metavar="WHERE",
         help="Show it in 3D: window, FILE.rrd to open later with 'rerun FILE.rrd', or the address of a viewer on this machine, "
         "rerun+http://127.0.0.1:9876/proxy (needs: pip install 'boxplus[view]').",
+        rich_help_panel=PRINTING,
     ),
 ]
 

@@ -7,12 +7,11 @@ def warmup() -> None:
     """Compile everything now, so that the first run does not have to. Takes a minute, once."""
     import time
 
-    from rich.console import Console
-
     from boxplus._jit import on_compilation
     from boxplus._kernel_cache import cache_root
+    from boxplus.cli.console import make_console
 
-    console = Console(highlight=False)
+    console = make_console()
     began = time.perf_counter()
     compiled: set[str] = set()
     with console.status("compiling kernels …") as status:

@@ -120,9 +120,14 @@ class RunFolder(OdometryFolder):
         """The merged map, in the other format."""
         return self.path / "map.pcd"
 
+    @property
+    def evaluation(self) -> Path:
+        """The comparison with a ground truth, where one was given."""
+        return self.path / "evaluation.json"
+
     def own_files(self) -> Iterator[Path]:
         """The files in the folder that a run writes."""
-        yield from self.existing([self.scans, self.map_ply, self.map_pcd], PLOTS)
+        yield from self.existing([self.scans, self.map_ply, self.map_pcd, self.evaluation], PLOTS)
         yield from (path for path in self.tiles.rglob("*") if path.is_file() and is_map_file(path.relative_to(self.tiles)))
 
     def own_folders(self) -> Iterator[Path]:

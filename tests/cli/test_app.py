@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,32 @@ def test_unknown_command() -> None:
     result = CliRunner().invoke(app, ["oi"])
     assert result.exit_code == 2
     assert "No such command 'oi'" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"{name} nowhere" for name in ("lio", "slam", "vio", "vo", "refine", "ba", "pgo", "inspect", "report")),
+        "localize nowhere --map nowhere",
+        "calibrate lidar-imu nowhere",
+        "calibrate cameras nowhere --target nowhere --resolution 752x480",
+        "eval nowhere nowhere",
+        *(f"map {name} nowhere" for name in ("info", "export", "grid", "height", "merge")),
+        "map update nowhere nowhere",
+        "fleet run nowhere",
+        "simulate nowhere",
+        *(f"{name} --no-such-option" for name in _COMMANDS),
+    ],
+)
+def test_what_is_not_there_has_exit_code_2_and_says_what_to_do(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, words.split())
+    assert result.exit_code == 2, result.output
+    if "--no-such-option" not in words:
+        assert re.fullmatch(r"error: expected [^–]+ – got [^–]+ – [^–]+\n", result.stderr), result.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_field_of_the_recording_is_an_option() -> None:

@@ -13,6 +13,8 @@ import typer
 from boxplus.cli import EXIT_FAILED, EXIT_UNTRUSTED
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from boxplus.runs.camera_calibration.summary import CalibrationSummary
 
 
@@ -60,9 +62,10 @@ def cameras(
     Writes camchain.yaml (Kalibr's form, which vio and inspect read), run.json (with covariances) and report.html. Exit codes: 0
     done, 1 the views do not determine a lens (no camchain is written), 2 bad input, 3 done but not to be trusted.
     """
-    from rich.console import Console
+
     from rich.progress import Progress
 
+    from boxplus.cli.console import make_console
     from boxplus.cli.optimization.terminal import versions
     from boxplus.errors import InputError
     from boxplus.formats.output import atomic_file
@@ -85,7 +88,7 @@ def cameras(
     from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
     from boxplus.systems.camera_calibration.findings import Finding, judge
 
-    started, console = datetime.now(UTC), Console(highlight=False)
+    started, console = datetime.now(UTC), make_console()
     if (imu is None) != (imu_noise is None):
         raise InputError("both --imu and --imu-noise, or none", "one of them", "give samples and noise densities together")
     seen, board = read_corner_file(corners, _size(resolution)), read_target(target)
@@ -95,7 +98,7 @@ def cameras(
     own = [folder / name for name in FILES]
     ctx.with_resource(output_folder(folder, "boxplus calibrate cameras", lambda: own, list, overwrite=overwrite))
     samples, noise = (None, None) if inertial is None else (inertial.samples, inertial.noise)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=make_console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"calibrating {seen.cameras} cameras from {len(seen.pixels):,} corners", total=1.0)
         config = CameraCalibrationConfig(lens=lens.value, max_views=max_views)
         found = calibrate_cameras(
@@ -149,13 +152,11 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _print(console: object, summary: CalibrationSummary) -> None:
-    from rich.console import Console
+def _print(terminal: Console, summary: CalibrationSummary) -> None:
     from rich.table import Table
 
     from boxplus.runs.camera_calibration.camchain import IMU_MOUNTING_DOUBTS
 
-    terminal = console if isinstance(console, Console) else Console()
     table = Table(show_lines=False, pad_edge=False)
     for heading in ("camera", "parameter", "value", "standard deviation"):
         table.add_column(heading)

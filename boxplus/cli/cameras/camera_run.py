@@ -10,7 +10,6 @@ import typer
 
 if TYPE_CHECKING:
     from boxplus.evaluation.alignment import AlignmentKind
-    from boxplus.formats.trajectory import Trajectory
     from boxplus.recordings.cameras.events import CameraRecording
     from boxplus.recordings.cameras.options import CameraRecordingOptions
     from boxplus.runs.cameras.facts import FrameTiming
@@ -60,7 +59,9 @@ def run_cameras(
     Raises:
         BoxplusError: bad input, or results that cannot be written.
     """
-    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.cli.ground_truth import compare_with
+    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.recordings.cameras.open import open_camera_recording
     from boxplus.runs.cameras.folder import claim_camera_folder
@@ -79,7 +80,7 @@ def run_cameras(
             summary = odometry(opened, resume=resume, progress=progress, should_stop=should_stop)
         shown, frames = list(rows(summary)), summary.estimates[0]
         if truth is not None and frames:
-            shown.append(("against --gt", _compare(folder, truth, alignment(summary))))
+            shown.append(("against --gt", compare_with(truth, folder.trajectory, folder.evaluation, alignment(summary))))
         if report and frames:
             from boxplus.report import write_report
 
@@ -87,20 +88,6 @@ def run_cameras(
                 write_report(folder.path)
     terminal.print_results(summary, shown, folder.path, FILES)
     return summary
-
-
-def _compare(folder: CameraRunFolder, truth: Trajectory, alignment: AlignmentKind) -> str:
-    """Write `evaluation.json`; returns its main line."""
-    import json
-
-    from boxplus.evaluation.evaluation import evaluate
-    from boxplus.formats.output import atomic_file
-    from boxplus.formats.trajectory import read_trajectory
-
-    evaluation = evaluate(read_trajectory(folder.trajectory), truth, alignment=alignment, method="interpolate")
-    with atomic_file(folder.evaluation) as file:
-        file.write(f"{json.dumps(evaluation.to_dict(), indent=2)}\n".encode())
-    return f"{evaluation.title}: {evaluation.ate.line('m')}"
 
 
 def timing_rows(timing: FrameTiming) -> list[tuple[str, str]]:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_options
+from boxplus.cli.model_options import takes_options
+from boxplus.cli.options import (
+    RESULTS,
+    SETTINGS,
+    ConfigOption,
+    GroundTruthOption,
+    NoReportOption,
+    OverwriteOption,
+    ResumeOption,
+)
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 
@@ -18,28 +27,30 @@ if TYPE_CHECKING:
 
 @takes_options(CameraRecordingOptions)
 def vio(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, EuRoC folder, or images with an IMU.")],
+    recording: Annotated[
+        Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, EuRoC folder, or images with an IMU.", metavar="RECORDING")
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.", rich_help_panel=RESULTS),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
-    ] = None,
+    config: ConfigOption = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. features=200; may be repeated.", metavar="KEY=VALUE")
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting, e.g. features=200; may be repeated.", metavar="KEY=VALUE", rich_help_panel=SETTINGS
+        ),
     ] = None,
     mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the accelerometer gives the scale.")] = False,
     lines: Annotated[
         bool,
         typer.Option("--lines", help="Follow straight lines too: where walls are bare. Takes longer."),
     ] = False,
-    ground_truth: Annotated[
-        Path | None, typer.Option("--gt", help="Ground truth to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
-    ] = None,
+    ground_truth: GroundTruthOption = None,
     view: ViewOption = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
     *,
     options: CameraRecordingOptions,
 ) -> None:

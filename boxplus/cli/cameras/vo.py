@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_options
+from boxplus.cli.model_options import takes_options
+from boxplus.cli.options import (
+    RESULTS,
+    SETTINGS,
+    ConfigOption,
+    NoReportOption,
+    OverwriteOption,
+    ResumeOption,
+)
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 
 if TYPE_CHECKING:
@@ -17,23 +25,27 @@ if TYPE_CHECKING:
 
 @takes_options(CameraRecordingOptions)
 def vo(
-    recording: Annotated[Path, typer.Argument(help="TUM RGB-D, 7-Scenes, KITTI or EuRoC folder, ROS bag, or images.")],
+    recording: Annotated[
+        Path, typer.Argument(help="TUM RGB-D, 7-Scenes, KITTI or EuRoC folder, ROS bag, or images.", metavar="RECORDING")
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.", rich_help_panel=RESULTS),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
-    ] = None,
+    config: ConfigOption = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. patches=400; may be repeated.", metavar="KEY=VALUE")
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting, e.g. patches=400; may be repeated.", metavar="KEY=VALUE", rich_help_panel=SETTINGS
+        ),
     ] = None,
     mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the scale is not known then.")] = False,
     ground_truth: Annotated[
         Path | None, typer.Option("--gt", help="Trajectory of the camera to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
     ] = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
     *,
     options: CameraRecordingOptions,
 ) -> None:

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_UNTRUSTED
+from boxplus.cli.help import Command
+
 if TYPE_CHECKING:
     from boxplus.runs.fleet.status import FleetStatus
 
@@ -24,7 +27,7 @@ def _group() -> None:
     """A group of commands, of which there is one."""
 
 
-@app.command("run")
+@app.command("run", cls=Command)
 def run_command(
     recordings: Annotated[
         Path, typer.Argument(help="Folder with recordings, or a .txt file with one path a line.", metavar="FOLDER_OR_LIST")
@@ -88,4 +91,4 @@ def run_command(
     for own in status.failed:
         typer.echo(f"failed: {own.name}: {own.error}", err=True)
     if status.failed:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)

@@ -1,4 +1,4 @@
-"""`boxplus lio`: a recording in, a trajectory, a map and a report out."""
+"""`boxplus lio`: recordings in, of each a trajectory, a map and a report out."""
 
 from __future__ import annotations
 
@@ -7,72 +7,114 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options, with_default_threads
+from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli.model_options import takes_recording_options
+from boxplus.cli.options import (
+    RESULTS,
+    ConfigOption,
+    GroundTruthOption,
+    JsonOption,
+    MountingOption,
+    NoMapOption,
+    NoReportOption,
+    OverwriteOption,
+    QuietOption,
+    ResumeOption,
+    SettingsOption,
+    ThreadsOption,
+    odometry_overrides,
+    with_default_threads,
+)
 from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.errors import InputError
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
+    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.lidar_inertial.config import RunConfig
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
 
 @takes_recording_options
 def lio(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap; several, or a folder of them.", metavar="RECORDING"
+        ),
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, e.g. scan_voxel=0.5; may be repeated.", metavar="KEY=VALUE")
-    ] = None,
-    T_imu_lidar: Annotated[
-        str | None,
+        Path | None,
         typer.Option(
-            "--T-imu-lidar",
-            help="Pose of the LiDAR in the IMU frame (p_imu = T p_lidar): 16 numbers row by row, 'xyz_qwxyz: x y z qw qx qy qz', "
-            "'xyz_qxyzw: …', 'xyz_rpy_deg: x y z roll pitch yaw', or a file with one of these.",
+            "--output",
+            "-o",
+            help="Folder for the results, of several recordings with one for each in it; default: RECORDING_boxplus here.",
+            rich_help_panel=RESULTS,
         ),
     ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    T_imu_lidar: MountingOption = None,
+    threads: ThreadsOption = None,
+    ground_truth: GroundTruthOption = None,
     view: ViewOption = None,
-    no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    no_map: NoMapOption = False,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
     *,
     options: RecordingOptions,
 ) -> None:
     """Turn a recording into a trajectory, a map and a report.
 
-    No configuration is needed: topics, times and units are found from the data, with the evidence printed. Exit codes: 0 done,
-    1 the results could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other), 130
-    interrupted (results up to there are complete).
+    No configuration is needed: topics, times and units are found from the data, with the evidence printed. Of several recordings
+    one that fails leaves the others unharmed, and a table at the end says how each came out. Exit codes: 0 done, 1 the results
+    could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other; of several
+    recordings, one failed or is not to be trusted), 130 interrupted (results up to there are complete).
     """
+    from boxplus.cli.lidar.several import run_several, several_recordings
+    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config
-    from boxplus.runs.transform import parse_transform
 
-    odometry: dict[str, object] = {}
-    if T_imu_lidar is not None:
-        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
-    if threads is not None:
-        odometry["threads"] = threads
     overrides: dict[str, dict[str, object]] = {
         "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry,
+        "odometry": odometry_overrides(T_imu_lidar, threads),
         "map": {"save": False} if no_map else {},
     }
     run_config = with_default_threads(load_run_config(config, settings or (), overrides))
-    folder = output or Path(f"{recording.resolve().stem}_boxplus")
-    summary = run(recording, folder, run_config, overwrite=overwrite, resume=resume, view=view, report=not no_report)
+    truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+
+    def run_one(recording: Path, folder: Path) -> RunSummary:
+        return run(
+            recording,
+            folder,
+            run_config,
+            terminal=terminal,
+            ground_truth=truth,
+            overwrite=overwrite,
+            resume=resume,
+            view=view,
+            report=not no_report,
+        )
+
+    several = several_recordings(recordings)
+    if several is not None:
+        if view is not None or truth is not None:
+            raise InputError("one recording with --view or --gt", f"{len(several)}", "run them one by one, or leave it out")
+        raise typer.Exit(run_several(several, output, run_one, terminal, as_json=as_json))
+    recording = recordings[0]
+    summary = run_one(recording, output or Path(f"{recording.resolve().stem}_boxplus"))
+    if as_json:
+        typer.echo(summary.model_dump_json(indent=2))
     if summary.state == "interrupted":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
     if summary.contradiction is not None:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)
 
 
 def run(
@@ -80,6 +122,8 @@ def run(
     folder: Path,
     config: RunConfig,
     *,
+    terminal: RunTerminal | None = None,
+    ground_truth: Trajectory | None = None,
     overwrite: bool = False,
     resume: bool = False,
     view: str | None = None,
@@ -88,16 +132,19 @@ def run(
     """Run the odometry with everything a terminal shows: evidence, progress, results.
 
     Raises:
-        BoxplusError: bad input, or results that cannot be written.
+        BoxplusError: bad input, or results that cannot be written; after everything else, a ground truth that the trajectory
+            cannot be compared with.
     """
-    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.cli.ground_truth import compare_with
+    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.recordings.info import Evidence
     from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
     from boxplus.runs.lidar_inertial.odometry_run import run_odometry
     from boxplus.runs.run_folder import claim_run_folder
 
-    terminal = RunTerminal()
+    terminal = terminal or RunTerminal()
     with (
         viewing("LiveView", recording.name, view) as shown,
         stop_on_interrupt(terminal.announce_stop) as should_stop,
@@ -131,8 +178,16 @@ def run(
 
             with terminal.status("drawing the report"):
                 write_report(folder)
-    files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json")
-    terminal.print_results(summary, _rows(summary), folder, files)
+        rows, incomparable = _rows(summary), None
+        if ground_truth is not None and summary.scans:
+            try:
+                rows.append(("against --gt", compare_with(ground_truth, claimed.trajectory, claimed.evaluation, "se3")))
+            except InputError as error:  # the run is as good as without it
+                incomparable = error
+    files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "evaluation.json", "run.json")
+    terminal.print_results(summary, rows, folder, files)
+    if incomparable is not None:
+        raise incomparable
     return summary
 
 

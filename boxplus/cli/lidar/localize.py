@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options, with_default_threads
+from boxplus.cli.model_options import takes_recording_options
+from boxplus.cli.options import (
+    RESULTS,
+    ConfigOption,
+    MountingOption,
+    NoReportOption,
+    OverwriteOption,
+    RecordingArgument,
+    SettingsOption,
+    ThreadsOption,
+    odometry_overrides,
+    with_default_threads,
+)
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -16,29 +28,23 @@ if TYPE_CHECKING:
 
 @takes_recording_options
 def localize(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    recording: RecordingArgument,
     saved: Annotated[
         Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio' or 'boxplus slam', map folder, or point cloud file.")
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_localized here.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Folder for the results; default: RECORDING_localized here.", rich_help_panel=RESULTS
+        ),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="One setting, e.g. localization.least_fit=0.6; may be repeated.", metavar="KEY=VALUE"),
-    ] = None,
-    T_imu_lidar: Annotated[
-        str | None, typer.Option("--T-imu-lidar", help="Pose of the LiDAR in the IMU frame, as for 'boxplus lio'.")
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    T_imu_lidar: MountingOption = None,
+    threads: ThreadsOption = None,
     keep_map: Annotated[bool, typer.Option("--keep-map", help="Write the odometry's own map too.")] = False,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    no_report: NoReportOption = False,
+    overwrite: OverwriteOption = False,
     *,
     options: RecordingOptions,
 ) -> None:
@@ -48,21 +54,18 @@ def localize(
     where it is found on, and never while it is searched for. Exit codes: as 'boxplus lio'; 3 also where no place was found.
     """
     from boxplus.runs.localization.config import load_localization_config
-    from boxplus.runs.transform import parse_transform
 
-    odometry: dict[str, object] = {} if threads is None else {"threads": threads}
-    if T_imu_lidar is not None:
-        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
     overrides: dict[str, dict[str, object]] = {
         "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry,
+        "odometry": odometry_overrides(T_imu_lidar, threads),
         "map": {"save": keep_map},
     }
     run_config = with_default_threads(load_localization_config(config, settings or (), overrides))
     folder = output or Path(f"{recording.resolve().stem}_localized")
 
     from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
-    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.localization.folder import claim_localization_folder
     from boxplus.runs.localization.localization_run import run_localization

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_UNTRUSTED
+from boxplus.cli.help import Command
 from boxplus.cli.lidar.map_grid import grid, height
 from boxplus.errors import InputError
 
@@ -30,7 +32,7 @@ def _tiles(folder: Path) -> Path:
     return inner if (folder / "run.json").is_file() and inner.is_dir() else folder
 
 
-@map_app.command("info")
+@map_app.command("info", cls=Command)
 def info_command(folder: _Folder) -> None:
     """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
     from boxplus.maps.tiles.store import TileStore
@@ -48,7 +50,7 @@ def info_command(folder: _Folder) -> None:
         typer.echo(sentence)
 
 
-@map_app.command("export")
+@map_app.command("export", cls=Command)
 def export_command(
     folder: _Folder,
     output: Annotated[
@@ -77,11 +79,11 @@ def export_command(
     typer.echo(f"{count:,} points → {' and '.join(str(path) for path in outputs)}")
 
 
-map_app.command("grid")(grid)
-map_app.command("height")(height)
+map_app.command("grid", cls=Command)(grid)
+map_app.command("height", cls=Command)(height)
 
 
-@map_app.command("merge")
+@map_app.command("merge", cls=Command)
 def merge_command(
     runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', in the order of time.", metavar="RUN…")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the joint map.")] = Path("merged"),
@@ -108,11 +110,11 @@ def merge_command(
     _show(result.summary)
     if not result.summary.joined:
         typer.echo(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)
     typer.echo(f"{_counts(result.summary)} → {output}")
 
 
-@map_app.command("update")
+@map_app.command("update", cls=Command)
 def update_command(
     merged: Annotated[Path, typer.Argument(help="Output folder of 'boxplus map merge'.", metavar="MAP")],
     runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', later ones.", metavar="RUN…")],
@@ -129,7 +131,7 @@ def update_command(
             if number >= len(alignment.sessions) - len(runs):
                 typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
         typer.echo(f"none of the runs met the map: {merged} stays as it was")
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)
     _show(result.summary)
     typer.echo(f"{_counts(result.summary)} → {merged}")
 

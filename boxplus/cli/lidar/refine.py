@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_INTERRUPTED
+
 if TYPE_CHECKING:
     from boxplus.runs.refinement.refine_run import RefineResult
     from boxplus.runs.refinement.summary import RefineSummary
@@ -51,7 +53,8 @@ def refine_command(
     run_config = load_refine_config(config, settings or (), overrides)
     folder = output or Path(f"{run.resolve()}_refined")
 
-    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.refinement.folder import claim_refine_folder
     from boxplus.runs.refinement.refine_run import read_odometry_run, refine_run
@@ -59,11 +62,11 @@ def refine_command(
 
     terminal = RunTerminal()
     truth = read_trajectory(gt) if gt is not None else None
+    odometry = read_odometry_run(run)  # before a folder is made
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         claim_refine_folder(folder, run, overwrite=overwrite) as claimed,
     ):
-        odometry = read_odometry_run(run)
         with terminal.progress() as progress:
             result = refine_run(
                 odometry,
@@ -91,7 +94,7 @@ def refine_command(
                 write_refinement_report(folder, summary, result)
     _print(summary, result, folder)
     if summary.state == "interrupted":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def _print(summary: RefineSummary, result: RefineResult, folder: Path) -> None:

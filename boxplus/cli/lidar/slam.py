@@ -7,7 +7,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.options import takes_recording_options, with_default_threads
+from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli.model_options import takes_recording_options
+from boxplus.cli.options import (
+    RESULTS,
+    ConfigOption,
+    MountingOption,
+    NoMapOption,
+    NoReportOption,
+    OverwriteOption,
+    RecordingArgument,
+    ResumeOption,
+    SettingsOption,
+    ThreadsOption,
+    odometry_overrides,
+    with_default_threads,
+)
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
 
@@ -18,36 +33,28 @@ if TYPE_CHECKING:
 
 @takes_recording_options
 def slam(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    recording: RecordingArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_slam here.")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_slam here.", rich_help_panel=RESULTS),
     ] = None,
     loops: Annotated[
         Path | None, typer.Option("--loops", help="YAML file of loops to forbid or to force, pairs as in loops.csv.")
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="One setting, e.g. slam.least_overlap=0.6; may be repeated.", metavar="KEY=VALUE"),
-    ] = None,
-    T_imu_lidar: Annotated[
-        str | None, typer.Option("--T-imu-lidar", help="Pose of the LiDAR in the IMU frame, as for 'boxplus lio'.")
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    T_imu_lidar: MountingOption = None,
+    threads: ThreadsOption = None,
     gnss_lever_arm: Annotated[
         str | None,
         typer.Option("--gnss-lever-arm", help="Antenna of the satellite receiver in the IMU frame, x,y,z [m]."),
     ] = None,
     utm: Annotated[bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).")] = False,
-    no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    no_map: NoMapOption = False,
+    no_report: NoReportOption = False,
     view: ViewOption = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.")] = False,
+    overwrite: OverwriteOption = False,
+    resume: ResumeOption = False,
     *,
     options: RecordingOptions,
 ) -> None:
@@ -59,18 +66,14 @@ def slam(
     """
     from boxplus.runs.slam.config import load_slam_config
     from boxplus.runs.slam.loop_file import read_loop_decisions
-    from boxplus.runs.transform import parse_transform
     from boxplus.sensors.gnss import antenna_offset
 
-    odometry: dict[str, object] = {} if threads is None else {"threads": threads}
-    if T_imu_lidar is not None:
-        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
     gnss: dict[str, object] = {"utm": True} if utm else {}
     if gnss_lever_arm is not None:
         gnss["lever_arm"] = antenna_offset(gnss_lever_arm).tolist()
     overrides: dict[str, dict[str, object]] = {
         "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry,
+        "odometry": odometry_overrides(T_imu_lidar, threads),
         "gnss": gnss,
         "map": {"save": False} if no_map else {},
     }
@@ -78,7 +81,8 @@ def slam(
     forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
     folder = output or Path(f"{recording.resolve().stem}_slam")
 
-    from boxplus.cli.run_terminal import RunTerminal, stop_on_interrupt
+    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
@@ -114,9 +118,9 @@ def slam(
                 write_report(result)
     terminal.print_results(result.odometry, _rows(result), folder, ("report.html", "trajectory.tum", "loops.csv", "map.ply"))
     if result.summary.state == "interrupted":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
     if result.summary.contradiction is not None:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)
 
 
 def _rows(result: SlamResult) -> list[tuple[str, str]]:

@@ -16,12 +16,10 @@ from boxplus.cli.optimization.terminal import (
     LossOption,
     MethodChoice,
     MethodOption,
-    NoReportOption,
     OutputOption,
-    OverwriteOption,
-    ThreadsOption,
     TimeLimitOption,
 )
+from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
 from boxplus.cli.viewing import ViewOption, viewing
 
 if TYPE_CHECKING:
@@ -74,7 +72,8 @@ def ba(
     method: MethodOption = MethodChoice.levenberg_marquardt,
     linear_solver: LinearSolverOption = LinearSolverChoice.auto,
     max_iterations: Annotated[
-        int | None, typer.Option("--max-iterations", min=0, help="Steps tried at most; 100, of line sets 1000.")
+        int | None,
+        typer.Option("--max-iterations", min=0, help="Steps tried at most; 100, of line sets 1000.", rich_help_panel="Solver"),
     ] = None,
     time_limit: TimeLimitOption = None,
     threads: ThreadsOption = None,
@@ -82,6 +81,8 @@ def ba(
     view: ViewOption = None,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Adjust cameras, and points or lines, so that they explain best where these were seen.
 
@@ -89,30 +90,31 @@ def ba(
     problem does not determine its variables or the results could not be written, 2 bad input, 3 finished but not to be trusted
     (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
     """
+    from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
     from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
-    from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.errors import InputError
     from boxplus.formats.reconstructions.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
     from boxplus.report.optimization.bundle_scene import camera_centers
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
     from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-    from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig
 
-    started, terminal = datetime.now(UTC), OptimizationTerminal()
+    started, terminal = datetime.now(UTC), OptimizationTerminal(quiet=quiet, as_json=as_json)
     robust = parse_loss(loss)
     if format is FormatChoice.lines or (format is FormatChoice.auto and is_line_set(file)):
         if view is not None:
             raise InputError("--view with cameras and points", "a line set", "leave it out; scene.ply shows the result")
         if refine_intrinsics or refine_principal_point:
             raise InputError("--refine-intrinsics with points", "a line set", "the intrinsics of line sets are held")
+        from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig
+
         line_config = LineAdjustmentConfig(use_points=points, triangulate=triangulate)
         if sigma is not None:
             line_config = line_config.model_copy(update={"sigma_px": sigma, "sigma_point_px": sigma})
         solver = solver_options(line_config.solver, method, linear_solver, max_iterations, time_limit, threads)
         line_config = line_config.model_copy(update={"solver": solver})
-        adjust_line_set(ctx, file, output, line_config, robust, method, no_report=no_report, overwrite=overwrite)
+        adjust_line_set(ctx, terminal, file, output, line_config, robust, method, no_report=no_report, overwrite=overwrite)
         return
     if triangulate or not points:
         raise InputError("--triangulate and --no-points with a line set", f"{file}", "leave them out")

@@ -11,7 +11,7 @@ import typer
 from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
 
 if TYPE_CHECKING:
-    from boxplus.cli.optimization.terminal import MethodChoice
+    from boxplus.cli.optimization.terminal import MethodChoice, OptimizationTerminal
     from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
@@ -27,6 +27,7 @@ def is_line_set(file: Path) -> bool:
 
 def adjust_line_set(
     ctx: typer.Context,
+    terminal: OptimizationTerminal,
     file: Path,
     output: Path | None,
     config: LineAdjustmentConfig,
@@ -37,14 +38,13 @@ def adjust_line_set(
     overwrite: bool,
 ) -> None:
     """Read, adjust, write and report; exit codes as those of the command."""
-    from boxplus.cli.optimization.terminal import OptimizationTerminal
-    from boxplus.cli.run_terminal import stop_on_interrupt
+    from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
     from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.bundle_adjustment.line_adjustment import adjust_lines
 
-    started, terminal = datetime.now(UTC), OptimizationTerminal()
+    started = datetime.now(UTC)
     start = read_vgg_lines(file)
     folder = output or Path(f"{file.resolve().name}_boxplus")
     files, folders = _own_files(folder, start)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -16,13 +17,12 @@ from boxplus.cli.optimization.terminal import (
     MaxIterationsOption,
     MethodChoice,
     MethodOption,
-    NoReportOption,
     OutputOption,
-    OverwriteOption,
-    ThreadsOption,
     TimeLimitOption,
 )
+from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
 from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.errors import InputError
 
 if TYPE_CHECKING:
     from boxplus.formats.graphs.pose_graph import PoseGraph
@@ -110,6 +110,8 @@ def pgo(
     view: ViewOption = None,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Find the poses that agree best with the relative poses measured between them.
 
@@ -117,15 +119,16 @@ def pgo(
     not determine its variables or the results could not be written, 2 bad input, 3 done but not to be trusted (not the global
     minimum, or odometry and the loop closures kept contradict each other), 130 interrupted (results up to there are complete).
     """
+    from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
-    from boxplus.cli.run_terminal import stop_on_interrupt
     from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
     from boxplus.systems.pose_graph.problem import positions
 
-    started, terminal = datetime.now(UTC), OptimizationTerminal()
+    started, terminal = datetime.now(UTC), OptimizationTerminal(quiet=quiet, as_json=as_json)
     robust = parse_loss(loss)
+    _check_choices(objective, robust_choice, None if robust is None else loss, certify=certify)
     config = PoseGraphConfig()
     config = config.model_copy(
         update={
@@ -137,6 +140,8 @@ def pgo(
         }
     )
     with terminal.console.status("reading"):
+        if file.is_dir():
+            raise InputError("a pose graph file, g2o or TORO", f"the folder {file}", "give a file in it")
         kind = graph_format(file)
         graph = read_pose_graph(
             file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
@@ -156,9 +161,9 @@ def pgo(
     with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
         result = optimize_pose_graph(graph, config, loss=robust, callback=show)
         stopped = should_stop()
-    reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
     if shown is not None and result.graph.poses is not None:
         shown.show_graph(True, positions(graph, result.graph.poses), graph.edges)
+    reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
     summary = _summary(file, name, started, graph, result, config, robust, reading, stopped)
     write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
     _write_graph_ply(folder / "graph.ply", result.graph)
@@ -172,9 +177,28 @@ def pgo(
     summary.write(folder / "run.json")
     terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "edges.csv", "run.json"])
     if summary.state == "interrupted":
-        raise typer.Exit(130)
+        raise typer.Exit(EXIT_INTERRUPTED)
     if summary.doubt is not None:
-        raise typer.Exit(3)
+        raise typer.Exit(EXIT_UNTRUSTED)
+
+
+def _check_choices(objective: ObjectiveChoice, robust: RobustChoice, loss: str | None, *, certify: bool) -> None:
+    """What `optimize_pose_graph` refuses, said in the words of the command line, and before the file is read."""
+    others = [f"--loss {loss}"] if loss is not None else []
+    if robust is not RobustChoice.none:
+        if objective is ObjectiveChoice.chordal:
+            others.append("--objective chordal")
+        if others:
+            raise InputError("--robust gnc alone, which has a loss of its own", " and ".join(others), "leave one of them out")
+    if certify:
+        others += [] if robust is RobustChoice.none else ["--robust gnc"]
+        others += ["--objective logarithm"] if objective is not ObjectiveChoice.chordal else []
+        if others:
+            raise InputError(
+                "--certify with --objective chordal, of which alone optimality can be certified, and without a robust loss",
+                " and ".join(others),
+                "say --objective chordal --certify, without --loss and --robust; or leave --certify out",
+            )
 
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from boxplus.cli.console import make_console
+from boxplus.cli.options import RESULTS
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from boxplus.optimization.solver_options import SolverOptions
     from boxplus.runs.optimization_summary import OptimizationSummary
 
+_SOLVER = "Solver"
 _WIDTHS = (4, 16, 10, 10, 10, 10, 9)
 # Scales at which a robust loss is 95 % as good as least squares where all errors are Gaussian.
 _LOSS_SCALE = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "geman_mcclure": 3.787, "welsch": 2.985}
@@ -53,19 +55,22 @@ class LinearSolverChoice(StrEnum):
     schur = "schur"
 
 
-OutputOption = Annotated[Path | None, typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.")]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Folder for the results; default: FILE_boxplus here.", rich_help_panel=RESULTS),
+]
 LossOption = Annotated[str, typer.Option("--loss", help=f"Robust loss: {_LOSS_HELP}")]
-MethodOption = Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.")]
+MethodOption = Annotated[MethodChoice, typer.Option("--method", help="How a step is chosen.", rich_help_panel=_SOLVER)]
 LinearSolverOption = Annotated[
-    LinearSolverChoice, typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.")
+    LinearSolverChoice,
+    typer.Option("--linear-solver", help="How a step is computed; auto says what it chose and why.", rich_help_panel=_SOLVER),
 ]
-MaxIterationsOption = Annotated[int, typer.Option("--max-iterations", min=0, help="Steps tried at most.")]
-TimeLimitOption = Annotated[float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].")]
-ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
+MaxIterationsOption = Annotated[
+    int, typer.Option("--max-iterations", min=0, help="Steps tried at most.", rich_help_panel=_SOLVER)
 ]
-NoReportOption = Annotated[bool, typer.Option("--no-report", help="Draw no report.")]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")]
+TimeLimitOption = Annotated[
+    float | None, typer.Option("--time-limit", min=0.001, help="No step is begun after this time [s].", rich_help_panel=_SOLVER)
+]
 
 
 def parse_loss(text: str) -> Loss | None:
@@ -147,10 +152,17 @@ def summary_of(solution: Solution, config: Any, loss: Loss | None, stopped: bool
 
 
 class OptimizationTerminal:
-    """Prints on the standard output, the same on a terminal and in a pipe but for the colours."""
+    """Prints on the standard output, the same on a terminal and in a pipe but for the colours and the wrapping.
 
-    def __init__(self) -> None:
-        self.console = Console(highlight=False)
+    Args:
+        quiet: print warnings, and what is not to be trusted or did not converge, alone, and on the standard error.
+        as_json: leave the standard output to a summary as JSON, and print on the standard error.
+    """
+
+    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
+        self.console = make_console(stderr=as_json, quiet=quiet)
+        self._alarms = make_console(stderr=True) if quiet else self.console
+        self._as_json = as_json
         self._last: float | None = None
 
     def facts(self, title: str, rows: Mapping[str, str]) -> None:
@@ -165,7 +177,7 @@ class OptimizationTerminal:
 
     def warn(self, text: str) -> None:
         """A warning."""
-        self.console.print(Text.assemble(("warning: ", "yellow"), text), soft_wrap=True)
+        self._alarms.print(Text.assemble(("warning: ", "yellow"), text), soft_wrap=True)
 
     @contextmanager
     def steps(self, method: MethodChoice, should_stop: Callable[[], bool]) -> Iterator[Callable[[Iteration], bool]]:
@@ -210,9 +222,10 @@ class OptimizationTerminal:
         self.console.print("interrupted: stopping after this step; Ctrl-C again stops at once")
 
     def results(self, summary: OptimizationSummary, unit: str, folder: Path, files: list[str]) -> None:
-        """Why it stopped, errors before and after, notes and files."""
+        """Why it stopped, errors before and after, notes and files; all of it once more where JSON is asked for."""
         good = summary.status == "converged" and summary.state == "finished" and summary.doubt is None
-        self.console.print(Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow"), soft_wrap=True)
+        ended = Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow")
+        (self.console if good else self._alarms).print(ended, soft_wrap=True)
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in (f"error [{unit}]", "rms", "median", "99th perc.", "largest", "not valid"):
             table.add_column(Text(heading), justify="left" if heading.startswith("error") else "right")
@@ -239,10 +252,12 @@ class OptimizationTerminal:
         for note in summary.notes:
             self.warn(note)
         if summary.doubt is not None:
-            self.console.print(Text.assemble(("not to be trusted: ", "bold red"), summary.doubt), soft_wrap=True)
+            self._alarms.print(Text.assemble(("not to be trusted: ", "bold red"), summary.doubt), soft_wrap=True)
         for name in files:
             if (folder / name).exists():
                 self.console.print(f"  {folder / name}", soft_wrap=True, markup=False)
+        if self._as_json:
+            typer.echo(summary.model_dump_json(indent=2))
 
 
 def state_and_reason(solution: Solution, stopped: bool) -> tuple[Literal["finished", "interrupted"], str]:

@@ -37,7 +37,9 @@ def read_colmap(path: str | Path) -> ColmapModel:
     if (folder / colmap_text.FILES[0]).is_file():
         return colmap_text.read_colmap_text(folder)
     raise InputError(
-        "a COLMAP model: a folder with cameras, images and points3D, as .bin or .txt", f"{folder} without", "give its folder"
+        "a COLMAP model: a folder with cameras, images and points3D, as .bin or .txt",
+        f"{Path(path)}, {_what_is_there(Path(path))}",
+        "give the folder that has them (often sparse/0), or one BAL file, not its folder",
     )
 
 
@@ -63,3 +65,12 @@ def write_colmap(folder: str | Path, model: ColmapModel, format: Literal["text",
         raise InputError("the format text or binary", repr(kind), "choose one of them")
     write = colmap_text.write_colmap_text if kind == "text" else colmap_binary.write_colmap_binary
     write(make_folder(folder), model)
+
+
+def _what_is_there(path: Path) -> str:
+    """A file by itself, or the first names in a folder."""
+    if not path.is_dir():
+        return "a file beside which there is none"
+    names = sorted(entry.name for entry in path.iterdir())
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f"a folder with {', '.join(names[:4])}{more}" if names else "an empty folder"

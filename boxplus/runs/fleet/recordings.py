@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from boxplus.errors import InputError
@@ -39,15 +40,26 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
             raise InputError("a list of recordings, one a line", f"none in {base}", "write paths into it")
     else:
         raise InputError("a folder with recordings, or a list in a .txt file", f"{base}", "check the path")
-    named: dict[str, Path] = {}
-    for entry in found:
+    return named(found)
+
+
+def holds_recordings(path: str | Path) -> bool:
+    """Whether it is a folder of recordings, and no recording itself."""
+    folder = Path(path)
+    return folder.is_dir() and not _is_recording(folder) and any(map(_is_recording, folder.iterdir()))
+
+
+def named(recordings: Iterable[Path]) -> dict[str, Path]:
+    """Recordings by the names of their files or folders, with a number where two are alike."""
+    found: dict[str, Path] = {}
+    for entry in recordings:
         stem, number = entry.name if entry.is_dir() else entry.stem, 1
         name = stem
-        while name in named:
+        while name in found:
             number += 1
             name = f"{stem}_{number}"
-        named[name] = entry.resolve()
-    return named
+        found[name] = entry.resolve()
+    return found
 
 
 def _is_recording(entry: Path) -> bool:

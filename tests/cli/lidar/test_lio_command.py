@@ -111,7 +111,7 @@ def test_unwritable_output_has_exit_code_1(bag: Path, tmp_path: Path) -> None:
 
 def test_view_without_the_extra(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    code, _, err = call("lio", bag, "-o", tmp_path / "out", "--view")
+    code, _, err = call("lio", bag, "-o", tmp_path / "out", "--view", "window")
     assert code == 2
     text = (
         "error: expected rerun-sdk for the live view – got an installation without it – install it: pip install 'boxplus[view]'"

@@ -178,13 +178,13 @@ def test_bad_input_is_one_paragraph(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_interrupt_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from contextlib import contextmanager
 
-    from boxplus.cli import run_terminal
+    from boxplus.cli import interrupt
 
     @contextmanager
     def at_once(announce: object):  # type: ignore[no-untyped-def]
         yield lambda: True
 
-    monkeypatch.setattr(run_terminal, "stop_on_interrupt", at_once)
+    monkeypatch.setattr(interrupt, "stop_on_interrupt", at_once)
     write_bal(tmp_path / "scene.txt", bal_problem())
     result = call(tmp_path / "scene.txt", "-o", tmp_path / "out")
     assert result.exit_code == 130
@@ -193,3 +193,21 @@ def test_an_interrupt_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.Mo
     assert "stopped: interrupted after step 0; everything up to there is written" in result.output
     assert np.isfinite(read_bal(tmp_path / "out" / "adjusted.txt").points).all()
     assert "interrupted" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
+
+
+def test_a_script_gets_json_or_silence(tmp_path: Path) -> None:
+    write_bal(tmp_path / "scene.txt", bal_problem())
+    result = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--no-report", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == json.loads((tmp_path / "out" / "run.json").read_text())
+    silent = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--no-report", "--quiet", "--overwrite")
+    assert (silent.exit_code, silent.stdout, silent.stderr) == (0, "", "")
+
+
+def test_a_folder_without_a_model_says_what_it_holds(tmp_path: Path) -> None:
+    write_bal(tmp_path / "scene.txt", bal_problem())
+    result = call(tmp_path)
+    assert result.exit_code == 2
+    assert (
+        f"got {tmp_path}, a folder with scene.txt – give the folder that has them (often sparse/0), or one BAL" in result.stderr
+    )

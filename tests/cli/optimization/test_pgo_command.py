@@ -206,3 +206,38 @@ def test_contradictions_and_local_minima_exit_with_3(tmp_path: Path) -> None:
     assert local.exit_code == 3 and "not certified" in words(local)
     best = call(tmp_path / "wound.g2o", "-o", tmp_path / "best", *asked)
     assert best.exit_code == 0 and "optimality certified: the global minimum of SE-Sync's objective" in words(best)
+
+
+def test_a_script_gets_json_or_silence(tmp_path: Path) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == json.loads((tmp_path / "out" / "run.json").read_text())
+    assert "linear solver" in result.stderr
+    silent = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report", "--quiet", "--overwrite")
+    assert (silent.exit_code, silent.stdout, silent.stderr) == (0, "", "")
+    stopped = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report", "-q", "--overwrite", "--max-iterations", "0")
+    assert stopped.stdout == "" and len(stopped.stderr.splitlines()) == 1  # why it stopped
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--certify"], "got --objective logarithm – say --objective chordal --certify"),
+        (["--certify", "--objective", "chordal", "--loss", "huber:2"], "got --loss huber:2 – say"),
+        (
+            ["--robust", "gnc", "--loss", "huber:2"],
+            "expected --robust gnc alone, which has a loss of its own – got --loss huber:2",
+        ),
+    ],
+)
+def test_choices_that_exclude_each_other_are_named_as_options(tmp_path: Path, arguments: list[str], told: str) -> None:
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    result = call(tmp_path / "loops.g2o", *arguments)
+    assert result.exit_code == 2 and told in result.stderr
+
+
+def test_a_folder_is_no_pose_graph(tmp_path: Path) -> None:
+    result = call(tmp_path)
+    assert result.exit_code == 2
+    assert result.stderr == f"error: expected a pose graph file, g2o or TORO – got the folder {tmp_path} – give a file in it\n"

@@ -1,0 +1,94 @@
+"""`--help` of every command: groups, placeholders, and examples that can be run as they stand."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from boxplus.cli import _COMMANDS, app
+from boxplus.cli.examples import EXAMPLES
+
+
+def commands(group: Any, ctx: Any, before: str = "") -> Iterator[tuple[str, Any]]:
+    """Every command that does something, by the words that call it."""
+    for name in group.list_commands(ctx):
+        _, command, _ = group.resolve_command(ctx, [name])
+        path = f"{before}{name}"
+        if hasattr(command, "list_commands"):
+            yield from commands(command, command.make_context(name, [], parent=ctx, resilient_parsing=True), f"{path} ")
+        else:
+            yield path, command
+
+
+ROOT = typer.main.get_command(app)
+ALL = dict(commands(ROOT, ROOT.make_context("boxplus", [], resilient_parsing=True)))
+
+
+def test_every_command_has_examples_and_nothing_else_has() -> None:
+    assert set(ALL) == set(EXAMPLES)
+    assert {path.split()[0] for path in ALL} == set(_COMMANDS)
+
+
+@pytest.mark.parametrize(("path", "line"), [(path, line) for path, lines in EXAMPLES.items() for line, _ in lines])
+def test_an_example_is_understood(path: str, line: str) -> None:
+    words = shlex.split(line.split(" > ")[0])
+    depth = 1 + len(path.split())
+    assert words[:depth] == ["boxplus", *path.split()]
+    context = ALL[path].make_context(path, words[depth:])  # refuses options and values that there are not
+    assert all(context.params[param.name] not in (None, [], ()) for param in ALL[path].params if param.required)
+
+
+@pytest.mark.parametrize("path", list(ALL))
+def test_help_shows_examples_and_no_type_of_python(path: str) -> None:
+    result = CliRunner().invoke(app, [*path.split(), "--help"], prog_name="boxplus")
+    assert result.exit_code == 0
+    assert all(f"\n  {line}" in result.stdout for line, _ in EXAMPLES[path])
+    assert not re.search(r"<(path|str|int|float|list|bool)|list\[|\{", result.stdout.split("Examples:")[0].replace("{topic", ""))
+
+
+def test_options_stand_in_groups() -> None:
+    text = CliRunner().invoke(app, ["lio", "--help"], prog_name="boxplus").stdout
+    headings = re.findall(r"^(\w[^\n]*):$", text, re.MULTILINE)
+    reading = "Reading the recording (found from the data unless given)"
+    assert headings == ["Arguments", "Results", "Settings", "On the terminal", reading, "Options", "Examples"]
+    assert text.index("Results:") < text.index("--gt PATH") < text.index("Settings:") < text.index("--threads N")
+
+
+def test_usage_says_what_may_be_left_out_and_what_may_be_repeated() -> None:
+    for path, usage in (("lio", "RECORDING…"), ("pgo", "FILE"), ("simulate", "[SCENARIO]"), ("map update", "MAP RUN…")):
+        assert (
+            f"Usage: boxplus {path} [OPTIONS] {usage}\n"
+            in CliRunner().invoke(app, [*path.split(), "--help"], prog_name="boxplus").stdout
+        )
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["lioo"], "No such command 'lioo': did you mean 'lio'?"),
+        (["reprot", "out"], "No such command 'reprot': did you mean 'report'?"),
+        (["xyzzy"], "No such command 'xyzzy': 'boxplus --help' lists them all"),
+        (["map", "merg"], "No such command 'merg'. Did you mean 'merge'?"),
+        (["lio", "--thread", "2", "a.bag"], "No such option: --thread (Possible options: --threads)"),
+        (["lio"], "Missing argument 'RECORDING'"),
+    ],
+)
+def test_what_was_meant_is_asked(words: list[str], told: str) -> None:
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
+    assert told in result.stderr
+
+
+def test_a_shell_is_told_commands_and_options() -> None:
+    def completions(line: str) -> str:
+        environment = {"_BOXPLUS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
+        return CliRunner().invoke(app, [], prog_name="boxplus", env=environment).stdout
+
+    assert completions("boxplus lo").split() == ["localize"] or "localize" in completions("boxplus lo")
+    assert "--threads" in completions("boxplus lio --thr").split()
