@@ -68,7 +68,9 @@ def write_colmap(folder: str | Path, model: ColmapModel, format: Literal["text",
 
 
 def _what_is_there(path: Path) -> str:
-    """A file by itself, or the first names in a folder."""
+    """Nothing, a file by itself, or the first names in a folder."""
+    if not path.exists():
+        return "which is not there"
     if not path.is_dir():
         return "a file beside which there is none"
     names = sorted(entry.name for entry in path.iterdir())

@@ -137,8 +137,18 @@ def test_binary_is_preferred_unless_a_text_file_is_named(tmp_path: Path) -> None
     write_colmap(tmp_path, random_model(1), "binary")
     assert read_colmap(tmp_path).format == "binary"
     assert read_colmap(tmp_path / "cameras.txt").format == "text"
-    with pytest.raises(InputError, match=r"expected a COLMAP model: a folder with cameras.* – got .*elsewhere without"):
+    with pytest.raises(
+        InputError, match=r"expected a COLMAP model: a folder with cameras.* – got .*elsewhere, which is not there – "
+    ):
         read_colmap(tmp_path / "elsewhere")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes").touch()
+    for path, there in (
+        (tmp_path / "other", "a folder with notes"),
+        (tmp_path / "other" / "notes", "a file beside which there is none"),
+    ):
+        with pytest.raises(InputError, match=f"got .*, {there} – give the folder that has them"):
+            read_colmap(path)
     with pytest.raises(InputError, match=r"expected the format text or binary – got 'xml'"):
         write_colmap(tmp_path, random_model(0), "xml")
 
