@@ -108,6 +108,18 @@ class _LogFormatter(logging.Formatter):
         return printable(super().format(record))
 
 
+def leave(state: str, *, untrusted: bool) -> None:
+    """End a command with the code of a run that was interrupted, or of one that is not to be trusted.
+
+    Raises:
+        typer.Exit: with that code.
+    """
+    if state == "interrupted":
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if untrusted:
+        raise typer.Exit(EXIT_UNTRUSTED)
+
+
 def _print_version(wanted: bool) -> None:
     if wanted:
         import boxplus

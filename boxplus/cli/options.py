@@ -18,6 +18,10 @@ RESULTS, SETTINGS, PRINTING = "Results", "Settings", "On the terminal"
 RecordingArgument = Annotated[
     Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.", metavar="RECORDING")
 ]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.", rich_help_panel=RESULTS),
+]
 ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a run.", rich_help_panel=SETTINGS),

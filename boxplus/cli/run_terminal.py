@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -16,9 +17,12 @@ from rich.text import Text
 
 from boxplus.cli.console import make_console
 from boxplus.errors import printable
-from boxplus.recordings.info import Evidence
-from boxplus.runs.run_facts import RunFacts
-from boxplus.runs.run_loop import Progress
+
+if TYPE_CHECKING:
+    from boxplus.recordings.cameras.info import CameraRecordingInfo
+    from boxplus.recordings.info import Evidence, RecordingInfo
+    from boxplus.runs.run_facts import RunFacts
+    from boxplus.runs.run_loop import Progress
 
 _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red", "weak": "yellow", "lost": "bold red"}
 _SHOWN_WARNINGS = 8
@@ -44,9 +48,10 @@ class RunTerminal:
         """Say that Ctrl-C was heard."""
         self._console.print("interrupted: finishing the files; Ctrl-C again stops at once")
 
-    def print_evidence(self, path: Path, facts: str, evidence: Iterable[Evidence]) -> None:
+    def print_evidence(self, info: RecordingInfo | CameraRecordingInfo, evidence: Iterable[Evidence]) -> None:
         """How the recording is read, and why."""
-        self._console.print(Text.assemble((printable(path.name), "bold"), f": {facts}"))
+        facts = f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
+        self._console.print(Text.assemble((printable(info.path.name), "bold"), f": {facts}"))
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in ("reading", "found", "", "evidence"):
             table.add_column(heading, overflow="fold")

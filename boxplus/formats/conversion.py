@@ -16,6 +16,7 @@ from boxplus.formats.trajectory import read_trajectory, write_csv, write_kitti, 
 Target = Literal["tum", "kitti", "csv", "cloud", "g2o", "toro", "colmap-text", "colmap-binary", "bal"]
 
 _TRAJECTORIES = {"tum": write_tum, "kitti": write_kitti, "csv": write_csv}
+_LOST = {"tum": ("covariances",), "kitti": ("stamps", "covariances"), "csv": ()}
 _OF_ENDINGS: dict[str, Target] = {
     ".tum": "tum",
     ".csv": "csv",
@@ -53,11 +54,8 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
     if to in _TRAJECTORIES:
         trajectory = read_trajectory(path)
         _TRAJECTORIES[to](target, trajectory)
-        lost = [
-            word
-            for word, present in (("stamps", trajectory.time_ns is not None), ("covariances", trajectory.covariance is not None))
-            if present and (to == "kitti" or (word == "covariances" and to == "tum"))
-        ]
+        held = {"stamps": trajectory.time_ns, "covariances": trajectory.covariance}
+        lost = [name for name in _LOST[to] if held[name] is not None]
         return _sentence(f"{len(trajectory):,} poses", lost, trajectory.warnings)
     if to == "cloud":
         cloud = read_cloud(path)

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
-import typer
-
 if TYPE_CHECKING:
     from boxplus.evaluation.alignment import AlignmentKind
     from boxplus.recordings.cameras.events import CameraRecording
@@ -73,9 +71,7 @@ def run_cameras(
         open_camera_recording(recording, options) as opened,
         claim_camera_folder(folder, overwrite=overwrite, resume=resume),
     ):
-        info = opened.info
-        facts = f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
-        terminal.print_evidence(info.path, facts, info.evidence)
+        terminal.print_evidence(opened.info, opened.info.evidence)
         with terminal.progress() as progress:
             summary = odometry(opened, resume=resume, progress=progress, should_stop=should_stop)
         shown, frames = list(rows(summary)), summary.estimates[0]
@@ -101,17 +97,3 @@ def timing_rows(timing: FrameTiming) -> list[tuple[str, str]]:
         rows.append(("per frame", text))
     rows.append(("speed", speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)))
     return rows
-
-
-def exit_for(summary: RunFacts) -> None:
-    """Leave with the code of an interrupted run, or of one that is not to be trusted.
-
-    Raises:
-        typer.Exit: with that code.
-    """
-    from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
-
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if summary.contradiction is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)

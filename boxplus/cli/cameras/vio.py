@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import leave
 from boxplus.cli.model_options import takes_options
 from boxplus.cli.options import (
-    RESULTS,
     SETTINGS,
     ConfigOption,
     GroundTruthOption,
     NoReportOption,
+    OutputOption,
     OverwriteOption,
     ResumeOption,
 )
@@ -30,10 +31,7 @@ def vio(
     recording: Annotated[
         Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, EuRoC folder, or images with an IMU.", metavar="RECORDING")
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.", rich_help_panel=RESULTS),
-    ] = None,
+    output: OutputOption = None,
     config: ConfigOption = None,
     settings: Annotated[
         list[str] | None,
@@ -60,7 +58,7 @@ def vio(
     could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other), 130
     interrupted (results up to there are complete).
     """
-    from boxplus.cli.cameras.camera_run import exit_for, run_cameras
+    from boxplus.cli.cameras.camera_run import run_cameras
     from boxplus.runs.cameras.folder import VioFolder
     from boxplus.runs.settings_file import load_settings
     from boxplus.runs.visual_inertial.config import VioRunConfig
@@ -85,7 +83,7 @@ def vio(
             ground_truth=ground_truth,
             report=not no_report,
         )
-    exit_for(summary)
+    leave(summary.state, untrusted=summary.contradiction is not None)
 
 
 def _rows(summary: VioSummary) -> list[tuple[str, str]]:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import leave
 from boxplus.cli.model_options import takes_options
 from boxplus.cli.options import (
-    RESULTS,
     SETTINGS,
     ConfigOption,
     NoReportOption,
+    OutputOption,
     OverwriteOption,
     ResumeOption,
 )
@@ -28,10 +29,7 @@ def vo(
     recording: Annotated[
         Path, typer.Argument(help="TUM RGB-D, 7-Scenes, KITTI or EuRoC folder, ROS bag, or images.", metavar="RECORDING")
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_boxplus here.", rich_help_panel=RESULTS),
-    ] = None,
+    output: OutputOption = None,
     config: ConfigOption = None,
     settings: Annotated[
         list[str] | None,
@@ -55,7 +53,7 @@ def vo(
     could not be written, 2 bad input, 3 finished, but not to be trusted (the view was lost, or something contradicts), 130
     interrupted (results up to there are complete).
     """
-    from boxplus.cli.cameras.camera_run import exit_for, run_cameras
+    from boxplus.cli.cameras.camera_run import run_cameras
     from boxplus.runs.cameras.folder import DirectFolder
     from boxplus.runs.direct.config import DirectRunConfig
     from boxplus.runs.direct.direct_run import run_direct_odometry
@@ -79,7 +77,7 @@ def vo(
         ground_truth=ground_truth,
         report=not no_report,
     )
-    exit_for(summary)
+    leave(summary.state, untrusted=summary.contradiction is not None)
 
 
 def _rows(summary: DirectSummary) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli import leave
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -111,10 +111,7 @@ def lio(
     summary = run_one(recording, output or Path(f"{recording.resolve().stem}_boxplus"))
     if as_json:
         typer.echo(summary.model_dump_json(indent=2))
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if summary.contradiction is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(summary.state, untrusted=summary.contradiction is not None)
 
 
 def run(
@@ -153,15 +150,11 @@ def run(
     ):
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
             extrinsic = choose_extrinsic(opened, config.odometry)
-        info = opened.info
         mounting = Evidence(
             "T_imu_lidar", extrinsic.source, "warning" if extrinsic.warning else "ok", extrinsic.warning or extrinsic.text
         )
-        terminal.print_evidence(
-            info.path,
-            f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages",
-            [*(entry for entry in info.evidence if entry.key != "T_imu_lidar"), mounting],
-        )
+        found = [entry for entry in opened.info.evidence if entry.key != "T_imu_lidar"]
+        terminal.print_evidence(opened.info, [*found, mounting])
         with terminal.progress() as progress:
             summary = run_odometry(
                 opened,

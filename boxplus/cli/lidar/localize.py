@@ -63,7 +63,7 @@ def localize(
     run_config = with_default_threads(load_localization_config(config, settings or (), overrides))
     folder = output or Path(f"{recording.resolve().stem}_localized")
 
-    from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+    from boxplus.cli import leave
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
@@ -79,10 +79,7 @@ def localize(
     ):
         with terminal.status("opening the map"):
             opened_map = open_saved_map(saved, run_config.local_maps)
-        info = opened.info
-        terminal.print_evidence(
-            info.path, f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages", info.evidence
-        )
+        terminal.print_evidence(opened.info, opened.info.evidence)
         with terminal.progress() as progress:
             result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
         if not no_report:
@@ -92,10 +89,7 @@ def localize(
                 write_localization_report(folder, result)
     files = ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
     terminal.print_results(result.odometry, _rows(result), folder, files)
-    if result.summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if result.summary.contradiction is not None or result.summary.found_after_s is None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(result.summary.state, untrusted=result.summary.contradiction is not None or result.summary.found_after_s is None)
 
 
 def _rows(result: LocalizationResult) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli import leave
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -94,10 +94,7 @@ def slam(
         open_recording(recording, run_config.recording) as opened,
         claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
     ):
-        info = opened.info
-        terminal.print_evidence(
-            info.path, f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages", info.evidence
-        )
+        terminal.print_evidence(opened.info, opened.info.evidence)
         with terminal.progress() as progress:
             result = run_slam(
                 opened,
@@ -117,10 +114,7 @@ def slam(
             with terminal.status("drawing the report"):
                 write_report(result)
     terminal.print_results(result.odometry, _rows(result), folder, ("report.html", "trajectory.tum", "loops.csv", "map.ply"))
-    if result.summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if result.summary.contradiction is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(result.summary.state, untrusted=result.summary.contradiction is not None)
 
 
 def _rows(result: SlamResult) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli import leave
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -154,10 +154,7 @@ def ba(
             write_bundle_report(folder, summary, start, result)
     summary.write(folder / "run.json")
     terminal.results(summary, "px", folder, ["report.html", name, "scene.ply", "run.json"])
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if summary.doubt is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(summary.state, untrusted=summary.doubt is not None)
 
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:

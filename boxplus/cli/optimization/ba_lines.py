@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli import leave
 
 if TYPE_CHECKING:
     from boxplus.cli.optimization.terminal import MethodChoice, OptimizationTerminal
@@ -66,10 +66,7 @@ def adjust_line_set(
             write_line_report(folder, summary, start, result)
     summary.write(folder / "run.json")
     terminal.results(summary, "px", folder, ["report.html", _ADJUSTED, "scene.ply", "run.json"])
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if summary.doubt is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(summary.state, untrusted=summary.doubt is not None)
 
 
 def _sizes(data: VggLines) -> dict[str, int]:

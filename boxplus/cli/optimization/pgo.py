@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli import leave
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -176,10 +176,7 @@ def pgo(
         _write_edges(folder / "edges.csv", graph, result)
     summary.write(folder / "run.json")
     terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "edges.csv", "run.json"])
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if summary.doubt is not None:
-        raise typer.Exit(EXIT_UNTRUSTED)
+    leave(summary.state, untrusted=summary.doubt is not None)
 
 
 def _check_choices(objective: ObjectiveChoice, robust: RobustChoice, loss: str | None, *, certify: bool) -> None:

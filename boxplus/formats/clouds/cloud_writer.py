@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -82,6 +83,15 @@ class CloudWriter(ABC):
             self.abort()
             raise output_error(self.path, error) from error
         self.count += len(records)
+
+    @contextmanager
+    def _explained(self, kind: type[Exception]) -> Iterator[None]:
+        """The error that a library has of its own for what the disk says becomes ours, and nothing is left behind."""
+        try:
+            yield
+        except kind as error:
+            self.abort()
+            raise OutputError(f"expected to write {self.path} – got {error} – check the disk and the folder") from error
 
     def _open_file(self) -> BinaryIO:
         if self._file is None:

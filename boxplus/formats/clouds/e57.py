@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus.errors import InputError, OutputError
+from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import CloudWriter
 from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
 
@@ -34,10 +34,8 @@ class E57Writer(CloudWriter):
 
     def _begin(self, file: BinaryIO, with_intensity: bool) -> None:
         file.flush()
-        try:
+        with self._explained(self._pye57.libe57.E57Exception):
             self._scans = self._pye57.E57(str(self._temporary), mode="w")
-        except self._pye57.libe57.E57Exception as error:
-            raise self._failed(error) from error
 
     def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
         self._held.append(records)
@@ -52,26 +50,18 @@ class E57Writer(CloudWriter):
         columns = {f"cartesian{axis}": np.ascontiguousarray(records[:, k]) for k, axis in enumerate("XYZ")}
         if self._with_intensity:
             columns["intensity"] = np.ascontiguousarray(records[:, 3])
-        try:
+        with self._explained(self._pye57.libe57.E57Exception):
             self._scans.write_scan_raw(columns, name=f"boxplus {self._scans.scan_count}")
-        except self._pye57.libe57.E57Exception as error:
-            raise self._failed(error) from error
 
     def _finish(self, file: BinaryIO) -> None:
         self._write_scan()
-        try:
+        with self._explained(self._pye57.libe57.E57Exception):
             self._scans.close()
-        except self._pye57.libe57.E57Exception as error:
-            raise self._failed(error) from error
 
     def abort(self) -> None:
         """Remove what was written; the name stays free, or keeps the file it had before."""
         self._scans, self._held = None, []
         super().abort()
-
-    def _failed(self, error: Exception) -> OutputError:
-        self.abort()
-        return OutputError(f"expected to write {self.path} – got {error} – check the disk and the folder")
 
 
 def write_e57(path: str | Path, points: ArrayLike, intensity: ArrayLike | None = None) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus.errors import InputError, OutputError
+from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import CloudWriter
 from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
 
@@ -38,6 +37,7 @@ class LasWriter(CloudWriter):
 
     def __init__(self, path: str | Path) -> None:
         self._laspy = _import()
+        self._lazrs_error = importlib.import_module("lazrs").LazrsError
         super().__init__(path)
         self._writer: Any = None
 
@@ -66,23 +66,12 @@ class LasWriter(CloudWriter):
         if self._with_intensity:
             points.intensity = np.clip(np.nan_to_num(np.round(records[:, 3])), 0, _LARGEST).astype(np.uint16)
             points[_EXACT] = records[:, 3]
-        with self._explained():
+        with self._explained(self._lazrs_error):
             self._writer.write_points(points)
 
     def _finish(self, file: BinaryIO) -> None:
-        with self._explained():
+        with self._explained(self._lazrs_error):
             self._writer.close()
-
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """The compressor has an error of its own for what the disk says."""
-        import lazrs
-
-        try:
-            yield
-        except lazrs.LazrsError as error:
-            self.abort()
-            raise OutputError(f"expected to write {self.path} – got {error} – check the disk and the folder") from error
 
 
 def write_las(path: str | Path, points: ArrayLike, intensity: ArrayLike | None = None) -> None:
