@@ -7,7 +7,8 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 
-_SUFFIXES = (".bag", ".mcap", ".db3", ".pcap", ".pcapng")
+_PARTS = (".mcap", ".db3")
+_SUFFIXES = (".bag", *_PARTS, ".pcap", ".pcapng")
 _LISTS = (".txt", ".list")
 
 
@@ -44,9 +45,13 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
 
 
 def holds_recordings(path: str | Path) -> bool:
-    """Whether it is a folder of recordings, and no recording itself."""
+    """Whether it is a folder of recordings, and no recording itself to `open_recording`."""
     folder = Path(path)
-    return folder.is_dir() and not _is_recording(folder) and any(map(_is_recording, folder.iterdir()))
+    if not folder.is_dir() or _is_recording(folder):
+        return False
+    # Parts of a ROS 2 bag without metadata.yaml are one recording to the readers, and stay one.
+    loose = {entry.suffix.lower() for entry in folder.iterdir() if entry.is_file() and _is_recording(entry)}
+    return any(map(_is_recording, folder.iterdir())) and not (loose and loose <= set(_PARTS))
 
 
 def named(recordings: Iterable[Path]) -> dict[str, Path]:

@@ -16,7 +16,7 @@ from boxplus.maps.descriptors.features import Features
 from boxplus.runs.fleet import fleet_run, tasks
 from boxplus.runs.fleet.executor import InProcess, RayExecutor, TaskEnd
 from boxplus.runs.fleet.fleet_run import FleetFolder, run_fleet
-from boxplus.runs.fleet.recordings import find_recordings
+from boxplus.runs.fleet.recordings import find_recordings, holds_recordings
 from boxplus.runs.fleet.status import RecordingStatus
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.settings_file import load_settings
@@ -104,6 +104,21 @@ def test_a_recording_that_is_finished_is_not_run_again(tmp_path: Path, monkeypat
     folder.config.write_text("other settings", encoding="utf-8")
     again = tasks.run_recording("r", str(tmp_path / "none.bag"), str(tmp_path), config)
     assert again.state == "failed" and "check the path" in str(again.error)
+
+
+def test_parts_of_a_bag_without_metadata_are_one_recording(tmp_path: Path) -> None:
+    """The readers open such a folder as one; taken for several, each part had a start and a map of its own."""
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for name in ("part_0.mcap", "part_1.mcap"):
+        (parts / name).touch()
+    assert not holds_recordings(parts)
+    (parts / "other.bag").touch()
+    assert holds_recordings(parts)
+    ros2 = tmp_path / "days" / "monday"
+    ros2.mkdir(parents=True)
+    (ros2 / "metadata.yaml").touch()
+    assert holds_recordings(tmp_path / "days") and not holds_recordings(ros2)
 
 
 def test_recordings_are_found_in_a_folder_or_a_list(tmp_path: Path) -> None:
