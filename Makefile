@@ -45,7 +45,7 @@ $(VENV)/.python:
 
 $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and what it needs into $(VENV) (once; about a minute)"
-	@$(PIP) install -e .
+	@$(PIP) install -e '.[report]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.python

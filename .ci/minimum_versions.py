@@ -59,7 +59,7 @@ for command in commands:
 """
 
 
-EXTRAS = ("las", "e57", "geo")
+EXTRAS = ("report", "las", "e57", "geo")
 """Optional dependencies that the smoke test uses as well."""
 
 

@@ -23,7 +23,7 @@ PLATFORMS = {
     "Linux aarch64 (Jetson, Raspberry Pi)": ["manylinux_2_28_aarch64", "manylinux_2_17_aarch64"],
     "macOS 14 on Apple silicon": [f"macosx_{version}_0_arm64" for version in range(11, 15)],
 }
-CHECKED_EXTRAS = ("las", "e57", "geo")
+CHECKED_EXTRAS = ("report", "las", "e57", "geo")
 KNOWN_TO_LACK = {"Linux aarch64 (Jetson, Raspberry Pi)": {"e57"}}
 """What the documentation says is missing there."""
 PYTHONS = ("3.11", "3.14")

@@ -26,6 +26,7 @@ def demo(
     import os
 
     from boxplus.cli.lidar.lio import run
+    from boxplus.cli.options import without_report
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config
@@ -36,8 +37,9 @@ def demo(
     recording = output / name
     _provide(simulate(_SCENARIO, duration_s=duration), recording)
     results = RunFolder(output / f"{name}_results")
+    report = not without_report(False)
     threads = {"threads": min(2, os.cpu_count() or 1)}
-    summary = run(recording, results.path, load_run_config(overrides={"odometry": threads}), overwrite=True)
+    summary = run(recording, results.path, load_run_config(overrides={"odometry": threads}), overwrite=True, report=report)
     if summary.state != "finished":
         raise typer.Exit(EXIT_INTERRUPTED)
     truth = output / f"{name}.gt.tum"
@@ -49,7 +51,8 @@ def demo(
     typer.echo(f"accuracy  {error_cm:.2f} cm position, {error_deg:.3f} deg rotation (rms) over {summary.path_length_m:.0f} m")
     if scan is not None:
         typer.echo(f"speed     {scan.median:.1f} ms per scan (median), {factor:.1f} × real time with reading and writing")
-    typer.echo(f"report    {results.report}")
+    if report:
+        typer.echo(f"report    {results.report}")
 
 
 def _provide(simulation: Simulation, recording: Path) -> None:

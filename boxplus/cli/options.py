@@ -8,12 +8,23 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from boxplus._extras import has
+
 if TYPE_CHECKING:
     from boxplus.runs.lidar_inertial.config import RunConfig
 
 ConfigT = TypeVar("ConfigT", bound="RunConfig")
 
 RESULTS, SETTINGS, PRINTING = "Results", "Settings", "On the terminal"
+
+
+def without_report(wanted: bool) -> bool:
+    """As asked for, and where a report cannot be drawn: that is said before the run, which is worth as much without."""
+    if not wanted and not has("matplotlib", "plotly"):
+        typer.echo("warning: no report is drawn, for want of matplotlib or plotly: pip install 'boxplus[report]'", err=True)
+        return True
+    return wanted
+
 
 RecordingArgument = Annotated[
     Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.", metavar="RECORDING")
@@ -50,7 +61,9 @@ ThreadsOption = Annotated[
     typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.", rich_help_panel=SETTINGS),
 ]
 NoMapOption = Annotated[bool, typer.Option("--no-map", help="Write no map.", rich_help_panel=RESULTS)]
-NoReportOption = Annotated[bool, typer.Option("--no-report", help="Draw no report.", rich_help_panel=RESULTS)]
+NoReportOption = Annotated[
+    bool, typer.Option("--no-report", callback=without_report, help="Draw no report.", rich_help_panel=RESULTS)
+]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace the results of an earlier run.", rich_help_panel=RESULTS)
 ]

@@ -49,10 +49,10 @@ def _run_odometry() -> None:
 
 
 def _close_loops() -> None:
-    import importlib.util
 
     import numpy as np
 
+    from boxplus._extras import has
     from boxplus.maps.local_maps.builder import LocalMapBuilder
     from boxplus.maps.local_maps.config import LocalMapConfig
     from boxplus.simulation.drifting_drive import DriftConfig, simulate_drifting_drive
@@ -63,8 +63,7 @@ def _close_loops() -> None:
     route = [[20.0, 0.0], [40.0, 0.0], [40.0, 40.0], [0.0, 40.0], [0.0, 0.0], [40.0, 0.0]]
     config = DriftConfig(channels=16, azimuth_steps=200)
     drive = simulate_drifting_drive(city(1, 1, pitch=40.0, street=14.0), route, config)
-    has_opencv = importlib.util.find_spec("cv2") is not None
-    slam = Slam(SlamConfig(appearance="density" if has_opencv else "scan_context"))
+    slam = Slam(SlamConfig(appearance="density" if has("cv2") else "scan_context"))
     builder, zero = LocalMapBuilder(LocalMapConfig(voxel=0.5)), np.zeros((6, 6))
     for time_ns, T_odo_body, scan in zip(drive.time_ns.tolist(), drive.T_odo_body, drive.scans, strict=True):
         for local_map in builder.push(time_ns, T_odo_body, zero, scan):
@@ -134,15 +133,15 @@ def _follow_camera() -> None:
 
 
 def _follow_camera_and_imu() -> None:
-    import importlib.util
     import tempfile
     from pathlib import Path
 
+    from boxplus._extras import has
     from boxplus.runs.visual_inertial.config import VioRunConfig
     from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
     from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 
-    if importlib.util.find_spec("cv2") is None:  # then there is no run either
+    if not has("cv2"):  # then there is no run either
         return
     # A start at rest and one in motion, and a window from which keyframes leave.
     config = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})

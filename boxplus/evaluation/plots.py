@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._extras import require
 from boxplus.evaluation.evaluation import Evaluation
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.formats.trajectory import Trajectory
@@ -53,11 +54,9 @@ def save_figures(figures: dict[str, Figure], folder: str | Path) -> list[Path]:
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> Figure:
     """A figure of that size [inches] with empty axes, drawn without any window."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
+    agg = require("matplotlib.backends.backend_agg", "which draws plots")
+    figure: Figure = require("matplotlib.figure", "which draws plots").Figure(figsize=size, layout="constrained")
+    agg.FigureCanvasAgg(figure)
     for axes in np.ravel(figure.subplots(rows, columns)):
         axes.grid(color="#e6e6e6", linewidth=0.6)
         axes.set_axisbelow(True)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX, output_error
 
@@ -22,11 +23,7 @@ def require_rasterio() -> Any:
     Raises:
         InputError: it is not installed.
     """
-    try:
-        import rasterio
-    except ImportError as error:
-        raise InputError("rasterio, to write a GeoTIFF", "an installation without it", "pip install 'boxplus[geo]'") from error
-    return rasterio
+    return require("rasterio", "which writes GeoTIFF")
 
 
 def write_geotiff(

@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._extras import require
 from boxplus.errors import RecordingError
 from boxplus.recordings.bags.container import READ_ERRORS
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
@@ -44,15 +44,8 @@ def _ouster_metadata(path: Path) -> Path | None:
     return max(fitting, key=lambda file: len(file.stem), default=None)
 
 
-def _decoder(module: str, package: str) -> ModuleType:
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise RecordingError(
-            f"the decoder {package} for this capture", f"{error}", "install it with: pip install boxplus[sensors]"
-        ) from error
+def _decoder(module: str) -> Any:
+    return require(module, "which decodes this capture", RecordingError)
 
 
 def _interval(first_ns: int, options: RecordingOptions) -> tuple[int, int]:
@@ -98,8 +91,8 @@ def _ouster_errors() -> tuple[type[Exception], ...]:
 
 
 def _open_ouster(path: Path, metadata: Path, options: RecordingOptions) -> Recording:
-    core = _decoder("ouster.sdk.core", "ouster-sdk")
-    sdk = _decoder("ouster.sdk", "ouster-sdk")
+    core = _decoder("ouster.sdk.core")
+    sdk = _decoder("ouster.sdk")
 
     def packets() -> Iterator[Any]:
         for _, packet in sdk.open_packet_source(str(path), meta=[str(metadata)]):
@@ -189,8 +182,8 @@ def _ouster_scan(frame: Any, table: Any, options: RecordingOptions) -> Scan:
 
 
 def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
-    decoder = _decoder("velodyne_decoder", "velodyne-decoder")
-    errors = (*READ_ERRORS, _decoder("dpkt", "velodyne-decoder").dpkt.Error)
+    decoder = _decoder("velodyne_decoder")
+    errors = (*READ_ERRORS, _decoder("dpkt").dpkt.Error)
     stamps: list[float] = []
     packets = 0
     try:
@@ -249,7 +242,7 @@ def _open_velodyne(path: Path, options: RecordingOptions) -> Recording:
     return _recording(info, events, round(stamps[0] * 1e9), options, errors)
 
 
-def _velodyne_model(decoder: ModuleType, path: Path) -> Any:
+def _velodyne_model(decoder: Any, path: Path) -> Any:
     """HDL-64E captures carry their model and calibration across packets; the others name their model in each."""
     model, _ = decoder.hdl64e.detect_hdl64e(str(path))
     return model

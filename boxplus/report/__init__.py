@@ -6,6 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from boxplus._extras import require
+
 if TYPE_CHECKING:
     from boxplus.report.cameras.visual_data import VisualData
     from boxplus.report.run_data import RunData
@@ -26,9 +28,11 @@ def write_report(run: str | Path | AnyRun) -> Path:
         The path of the report.
 
     Raises:
-        InputError: no run's folder, or a run without a single estimate.
+        InputError: no run's folder, or a run without a single estimate; matplotlib or plotly is not installed.
         OutputError: the files cannot be written.
     """
+    for library in ("matplotlib", "plotly"):
+        require(library, "which draws reports")
     from boxplus.report.cameras.direct_page import write_direct_report
     from boxplus.report.cameras.visual_page import write_visual_report
     from boxplus.report.page import write_page

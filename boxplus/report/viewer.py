@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from boxplus._extras import require
 from boxplus.errors import InputError
 
 WINDOW = "window"
@@ -69,15 +70,10 @@ class Viewer:
     def __init__(self, title: str, where: str | None = WINDOW) -> None:
         if where is not None:
             check_target(where)
-        try:
-            import rerun
-        except ImportError as error:
-            raise InputError(
-                "rerun-sdk for the live view", "an installation without it", "install it: pip install 'boxplus[view]'"
-            ) from error
+        rerun = require("rerun", "which shows a run in 3D")
         self.note: str | None = None
         """Why nothing more is shown; None while all is."""
-        self._rerun: Any = rerun
+        self._rerun = rerun
         self._process: subprocess.Popen[bytes] | None = None
         self._file: Path | None = None
         self._address: tuple[str, int] | None = None

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._extras import require
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 
@@ -160,11 +161,7 @@ def require_utm() -> None:
 
 
 def _pyproj() -> Any:
-    try:
-        import pyproj
-    except ImportError as error:
-        raise InputError("pyproj for UTM coordinates", "it is not installed", "pip install 'boxplus[gnss]'") from error
-    return pyproj
+    return require("pyproj", "which knows UTM")
 
 
 def _rows(values: ArrayLike, name: str) -> Floats:

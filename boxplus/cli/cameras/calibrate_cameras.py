@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli import EXIT_FAILED, EXIT_UNTRUSTED
+from boxplus.cli.options import NoReportOption
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,7 +55,7 @@ def cameras(
     max_views: Annotated[
         int, typer.Option("--max-views", min=8, help="Frames used for lenses and mountings, evenly chosen.")
     ] = 80,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Do not draw report.html.")] = False,
+    no_report: NoReportOption = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier calibration in the folder.")] = False,
 ) -> None:
     """Lenses of cameras, how they are mounted to each other and on an IMU, from an AprilGrid that they saw.

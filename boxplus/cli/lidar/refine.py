@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli import EXIT_INTERRUPTED
+from boxplus.cli.options import NoReportOption
 
 if TYPE_CHECKING:
     from boxplus.runs.refinement.refine_run import RefineResult
@@ -35,7 +36,7 @@ def refine_command(
         int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
     ] = None,
     no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Draw no report.")] = False,
+    no_report: NoReportOption = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
 ) -> None:
     """Refine a finished run: all its poses, the planes they see and the IMU samples between them, at once.

@@ -8,10 +8,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import CloudWriter
 from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
 
+_PURPOSE = "which reads and writes E57 files"
 _SCAN = 4_000_000  # points that one scan of the file holds: so many are kept in memory
 
 
@@ -27,7 +29,7 @@ class E57Writer(CloudWriter):
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._pye57 = _import()
+        self._pye57 = require("pye57", _PURPOSE)
         super().__init__(path)
         self._held: list[NDArray[np.float32]] = []
         self._scans: Any = None
@@ -81,7 +83,7 @@ def read_e57(path: str | Path) -> PointCloud:
     Raises:
         InputError: pye57 is not installed; the file is missing, cut or malformed; coordinates that float32 cannot hold.
     """
-    pye57, source = _import(), Path(path)
+    pye57, source = require("pye57", _PURPOSE), Path(path)
     with opened(source, "E57"):
         pass
     try:
@@ -99,11 +101,3 @@ def read_e57(path: str | Path) -> PointCloud:
     if scans and all("intensity" in scan for scan in scans):
         intensity = np.concatenate([np.asarray(scan["intensity"], np.float32) for scan in scans])
     return PointCloud(as_points(columns, source), intensity)
-
-
-def _import() -> Any:
-    try:
-        import pye57
-    except ImportError as error:
-        raise InputError("pye57, for E57 files", "an installation without it", "pip install 'boxplus[e57]'") from error
-    return pye57

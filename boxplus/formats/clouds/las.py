@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._extras import has, require
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import CloudWriter
 from boxplus.formats.clouds.point_cloud import PointCloud, as_points, opened
 
+_PURPOSE, _PACKING = "which reads and writes LAS files", "which packs LAS to LAZ"
 _EXACT = "intensity_exact"
 _SCALE = 1e-4  # m: LAS keeps coordinates as whole multiples of it
 _FARTHEST = _SCALE * (2**31 - 1)
@@ -36,8 +36,8 @@ class LasWriter(CloudWriter):
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._laspy = _import()
-        self._lazrs_error = importlib.import_module("lazrs").LazrsError
+        self._laspy = require("laspy", _PURPOSE)
+        self._lazrs_error = require("lazrs", _PACKING).LazrsError
         super().__init__(path)
         self._writer: Any = None
 
@@ -110,7 +110,7 @@ def read_survey(path: str | Path) -> tuple[PointCloud, NDArray[np.float64]]:
     """
     source = Path(path)
     columns, intensity, header = _columns(source)
-    if importlib.util.find_spec("pyproj"):
+    if has("pyproj"):
         faults: tuple[type[BaseException], ...] = (*_faults(), RuntimeError)
         try:
             crs = header.parse_crs()
@@ -132,7 +132,8 @@ def _nearby(values: NDArray[np.float64]) -> float:
 
 def _columns(path: Path) -> tuple[list[NDArray[np.float64]], NDArray[np.float32] | None, Any]:
     """x, y and z, intensity where there is any, and the header."""
-    laspy = _import()
+    laspy = require("laspy", _PURPOSE)
+    require("lazrs", _PACKING)  # laspy finds it by itself
     with opened(path, "LAS") as file:
         try:
             cloud = laspy.read(file, closefd=False)
@@ -145,15 +146,6 @@ def _columns(path: Path) -> tuple[list[NDArray[np.float64]], NDArray[np.float32]
     if found != cloud.header.point_count:
         raise InputError(f"{cloud.header.point_count} points, as the header says", f"{found} ({path})", "the file was cut")
     return columns, intensity if exact or intensity.any() else None, cloud.header
-
-
-def _import() -> Any:
-    try:
-        import laspy
-        import lazrs  # noqa: F401  laspy finds it by itself
-    except ImportError as error:
-        raise InputError("laspy and lazrs, for LAS and LAZ", "an installation without", "pip install 'boxplus[las]'") from error
-    return laspy
 
 
 def _faults() -> tuple[type[BaseException], ...]:

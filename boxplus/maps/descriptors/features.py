@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._extras import require
 from boxplus._jit import kernel
-from boxplus._opencv import opencv
 from boxplus.maps.descriptors.config import DescriptorConfig
 from boxplus.maps.descriptors.density_image import density_image
 
@@ -48,7 +48,7 @@ def describe(points: ArrayLike, config: DescriptorConfig | None = None) -> Featu
         InputError: OpenCV, the extra `vision`, is not installed; what `density_image` refuses.
     """
     config = config if config is not None else DescriptorConfig()
-    cv2 = opencv("which describes density images")
+    cv2 = require("cv2", "which describes density images")
     image = density_image(points, config.cell)
     # A margin of empty ground: corners at the rim of what was seen are described too.
     pixels = np.pad(image.pixels, _PATCH + 1)

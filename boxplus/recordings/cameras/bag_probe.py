@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings.bags.container import Channel, Container, interval, share
 from boxplus.recordings.bags.messages import MalformedMessageError, parse_imu
@@ -196,7 +196,7 @@ def _probe(
 
 def _look_at(image: ImageMessage, probe: _Probe) -> None:
     if image.needs_opencv:
-        opencv("to decode compressed images and Bayer mosaics", RecordingError)
+        require("cv2", "to decode compressed images and Bayer mosaics", RecordingError)
     try:
         pixels = image.pixels()
     except MalformedImageError as error:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.errors import RecordingError
 
 Pixels = NDArray[Any]
@@ -78,7 +78,7 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
     if order is not None:
         return np.ascontiguousarray(pixels[:, :, list(order)])
     if encoding in _BAYER:
-        cv2 = opencv("to decode Bayer mosaics", RecordingError)
+        cv2 = require("cv2", "to decode Bayer mosaics", RecordingError)
         return np.asarray(cv2.cvtColor(pixels[:, :, 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2RGB")))
     return pixels[:, :, 0]
 
@@ -101,7 +101,7 @@ def decode_file(data: bytes) -> Pixels:
         what = "PNG"
     else:
         raise MalformedImageError("neither JPEG, PNG, PGM nor PPM" if data else "an empty file")
-    cv2 = opencv(f"to decode {what} images", RecordingError)
+    cv2 = require("cv2", f"to decode {what} images", RecordingError)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

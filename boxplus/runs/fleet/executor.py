@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol
 
-from boxplus._ray import ray
+from boxplus._extras import require
 from boxplus.errors import InputError
 
 _RETRIES = 3  # of a task whose worker or machine was lost
@@ -53,7 +53,7 @@ class RayExecutor:
     """
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
-        self._ray = ray("which runs tasks on many machines")
+        self._ray = require("ray", "which runs tasks on many machines")
         self._address, self._workers = address, workers
 
     def __enter__(self) -> RayExecutor:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.nearest_rotation import nearest_rotation
@@ -209,7 +209,7 @@ def _essential(m1: Matrix, m2: Matrix, f: float, parallax: float) -> tuple[Matri
 
 def _sampled(m1: Matrix, m2: Matrix, f: float) -> list[tuple[Matrix, Matrix]]:
     """Motions from random samples of five corners."""
-    cv2 = opencv("which finds the essential matrix")
+    cv2 = require("cv2", "which finds the essential matrix")
     cv2.setRNGSeed(0)
     one, two = (np.ascontiguousarray(m[:, :2]) for m in (m1, m2))
     E, _ = cv2.findEssentialMat(one, two, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=_SAMPLED_PX / f)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.manifolds import se3
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.descriptors.place_index import PlaceIndex
@@ -31,7 +31,7 @@ class Places:
 
     def __init__(self, session: Session, config: SlamConfig) -> None:
         if config.appearance == "density":
-            opencv("which describes density images")
+            require("cv2", "which describes density images")
         self.session, self._config = session, config
         self.chain = session.chain()
         self.features: list[Features] = []

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.manifolds import se3
 from boxplus.maps.descriptors.features import WORDS, Features, describe
 from boxplus.maps.descriptors.place_index import Candidate, PlaceIndex
@@ -48,7 +48,7 @@ class Proposer:
         self._densities = PlaceIndex(config.descriptor)
         self._contexts = ScanContextIndex()
         if config.appearance == "density":
-            opencv("which describes density images")  # now, not after the first local map
+            require("cv2", "which describes density images")  # now, not after the first local map
 
     def propose(self, query: int, maps: Maps, before: int, odometry: OdometryChain, T_map: Sequence[Floats]) -> list[Proposal]:
         """Places before number `before` for the newest map, number `query`, which is remembered for later ones.

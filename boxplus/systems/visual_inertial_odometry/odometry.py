@@ -17,7 +17,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.sensors.camera_image import CameraImage
@@ -85,7 +85,7 @@ class VisualInertialOdometry:
         self._to_8_bits = EightBits()  # for lines; corners have their own
         self._line_tracker = line_tracker
         if self.config.lines and line_tracker is None:
-            self._line_tracker = LineTracker(opencv("which finds lines"), self.rig, self.config.max_lines)
+            self._line_tracker = LineTracker(require("cv2", "which finds lines"), self.rig, self.config.max_lines)
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._waiting: deque[Tracks] = deque()

@@ -113,9 +113,7 @@ def test_view_without_the_extra(bag: Path, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rerun", None)
     code, _, err = call("lio", bag, "-o", tmp_path / "out", "--view", "window")
     assert code == 2
-    text = (
-        "error: expected rerun-sdk for the live view – got an installation without it – install it: pip install 'boxplus[view]'"
-    )
+    text = "error: expected rerun-sdk, which shows a run in 3D – got it is not installed – pip install 'boxplus[view]'"
     assert err.strip() == text
     assert not (tmp_path / "out").exists()
 

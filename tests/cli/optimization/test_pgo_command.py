@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -241,3 +242,17 @@ def test_a_folder_is_no_pose_graph(tmp_path: Path) -> None:
     result = call(tmp_path)
     assert result.exit_code == 2
     assert result.stderr == f"error: expected a pose graph file, g2o or TORO – got the folder {tmp_path} – give a file in it\n"
+
+
+@pytest.mark.parametrize("missing", ["matplotlib", "plotly"])
+def test_without_the_libraries_of_reports_there_is_none_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "no report is drawn, for want of matplotlib or plotly: pip install 'boxplus[report]'" in words(result)
+    assert (tmp_path / "out" / "optimized.g2o").exists() and not (tmp_path / "out" / "report.html").exists()
+    quiet = call(tmp_path / "loops.g2o", "-o", tmp_path / "asked", "--no-report")
+    assert "for want of" not in quiet.output

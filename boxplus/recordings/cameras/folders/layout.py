@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.calibration import StatedCamera, read_camchain, usable_mountings
 from boxplus.recordings.cameras.decode import MalformedImageError, Pixels, decode_file, needs_opencv
@@ -184,7 +184,7 @@ def first_size(images: ImageFiles) -> tuple[int, int]:
         try:
             data = file.read_bytes()
             if needs_opencv(data):
-                opencv(f"to decode the images in {images.source}", RecordingError)
+                require("cv2", f"to decode the images in {images.source}", RecordingError)
             pixels = decode_file(data)
         except MalformedImageError as error:
             reason = f"{file.name}: {error}"

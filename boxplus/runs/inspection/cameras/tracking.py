@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.cameras import CameraModel
 
 _CORNERS = 300
@@ -34,7 +34,7 @@ class Turned(NamedTuple):
 
 def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixels (N, 2) of corners in the first image, and where they are in the second, those that are found again both ways."""
-    cv2 = opencv("which follows corners")
+    cv2 = require("cv2", "which follows corners")
     none = np.zeros((0, 2))
     corners = cv2.goodFeaturesToTrack(first, _CORNERS, 0.01, 12.0)
     if corners is None:
@@ -48,7 +48,7 @@ def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray
 
 def rotation_between(model: CameraModel, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Turned | int:
     """The rotation between two images, from the essential matrix; where too few corners agree on one, how many were followed."""
-    cv2 = opencv("which follows corners")
+    cv2 = require("cv2", "which follows corners")
     before, after = follow(first, second)
     rays_1, found_1 = model.unproject(before)
     rays_2, found_2 = model.unproject(after)

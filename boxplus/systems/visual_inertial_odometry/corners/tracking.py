@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._opencv import opencv
+from boxplus._extras import require
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.centres import centred
@@ -80,7 +80,7 @@ class FeatureTracker:
     """
 
     def __init__(self, config: VioConfig, rig: Rig) -> None:
-        self._cv2, self._config, self._rig = opencv("which follows corners"), config, rig
+        self._cv2, self._config, self._rig = require("cv2", "which follows corners"), config, rig
         self._to_8_bits = EightBits()
         self._images: list[Grey | None] = [None] * len(rig.cameras)
         self._before: Grey | None = None

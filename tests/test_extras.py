@@ -1,0 +1,41 @@
+"""Libraries that are not always installed: what is said where one is missing."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from boxplus import _extras
+from boxplus.errors import InputError, RecordingError
+
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def test_every_library_is_declared_in_the_extra_that_is_named() -> None:
+    for name, extra in _extras._LIBRARIES.values():
+        if name == "dpkt":  # what velodyne-decoder brings
+            continue
+        names = [re.split(r"[\[>=;]", text)[0].lower() for text in PROJECT["optional-dependencies"][extra]]
+        assert any(found.startswith(name.lower()) for found in names), (name, extra, names)
+
+
+def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    text = r"Ray, which runs tasks – got it is not installed – pip install 'boxplus\[fleet\]'"
+    with pytest.raises(InputError, match=text):
+        _extras.require("ray", "which runs tasks")
+    with pytest.raises(RecordingError, match=text):
+        _extras.require("ray", "which runs tasks", RecordingError)
+    assert not _extras.has("ray")
+
+
+def test_a_library_that_is_broken_says_how(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delitem(sys.modules, "laspy", raising=False)
+    (tmp_path / "laspy.py").write_text("import no_such_library\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="it cannot be imported: No module named 'no_such_library'"):
+        _extras.require("laspy", "which reads LAS files")
