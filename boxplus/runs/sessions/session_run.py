@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +107,10 @@ def open_session_run(folder: str | Path, name: str) -> SessionRun:
         raise InputError("a run that kept its scans", f"no {own.spool.name} in {own.path}", _ADVICE)
     stored, outcome = LocalMapFolder(own.local_maps), read_graph(own.graph)
     placed = outcome.placed  # in the frame of its trajectory and map, which is the Earth's where it was laid onto it
-    maps = [stored[number] for number in range(len(placed.time_ns))]
+    # Steps are known as the run's own loops found: no better than was assumed, worse where these say that it drifts more.
+    drift = max(outcome.drift_scale, 1.0)
+    stored_maps = [stored[number] for number in range(len(placed.time_ns))]
+    maps = [replace(local_map, covariance=drift * local_map.covariance) for local_map in stored_maps]
     loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
     extrinsic = read_summary(own.odometry.summary).extrinsic
     T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)

@@ -23,9 +23,11 @@ from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.anchored_pose import AnchoredRelativePose
 from boxplus.residuals.gravity_direction import GravityDirection
+from boxplus.residuals.prior import Prior
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.sessions.encounter import Encounter
 from boxplus.systems.sessions.session import Session
+from boxplus.systems.slam.graph import vertical_sigmas
 from boxplus.systems.slam.loop import Floats
 
 _INLIER = 0.999  # of true encounters within the threshold
@@ -89,7 +91,8 @@ class _Graph:
             measured = se3.compose(se3.inverse(poses[steps]), poses[steps + 1])
             problem.add_residuals(RelativePose(measured, covariance=covariance), x[steps], x[steps + 1], name="odometry")
         for number, (session, begin, count) in enumerate(zip(sessions, first, counts, strict=True)):
-            vertical = GravityDirection(np.tile(_UP, (count, 1)), session.up, sigma=gravity_sigma)
+            sigma = vertical_sigmas(session.T_session_map, gravity_sigma)
+            vertical = GravityDirection(np.tile(_UP, (count, 1)), session.up, sigma=sigma)
             problem.add_residuals(vertical, x[begin + np.arange(count)], name=f"gravity_{number}")
             if session.loops:
                 i, j = begin + np.array([[loop.place, loop.query] for loop in session.loops]).T
@@ -112,7 +115,12 @@ class _Graph:
         ).T
         self.encounters = problem.add_residuals(residual, A[a], x[i], A[b], x[j], name="encounters")
         problem.fix(A[0:1])
-        problem.fix(x[first])
+        for session, begin in zip(sessions, first, strict=True):
+            if session.start_covariance.any():
+                start = Prior(SE3, poses[begin], covariance=session.start_covariance)
+                problem.add_residuals(start, x[begin : begin + 1], name=f"start_{session.name}")
+            else:
+                problem.fix(x[begin : begin + 1])
 
     def solve(self) -> tuple[NDArray[np.bool_], Solution]:
         """Which encounters are kept, and the minimum with them."""

@@ -38,6 +38,7 @@ _RIVAL_AGREEMENT = 0.6  # of density images, for a rival that is turned
 _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
 _BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: by which two likenesses of one alignment differ
 _PREDICTED = 2  # places that are looked at for each local map of the query session
+_AS_WELL = "the maps fit as well"  # begins what is said of a rival
 _FIRST = 2  # encounters that agree make a hypothesis
 
 
@@ -106,11 +107,13 @@ class _Meeting:
         if not self.loops:
             alike = f"{self.proposed} pairs of local maps look alike, but no two at one alignment"
             return alike if self.proposed else "no local map of one looks like one of the other"
-        ambiguous = sum(
-            loop.refusal is not None and loop.refusal.startswith("the maps fit as well") for loop in self.loops.values()
-        )
-        if ambiguous >= _FIRST:
-            return f"what they have in common looks the same in several places: {ambiguous} encounters fit as well elsewhere"
+        ambiguous = [(loop, rival) for loop in self.loops.values() if (rival := _rival_of(loop))]
+        if len(ambiguous) >= _FIRST:
+            loop, rival = ambiguous[0]
+            return (
+                f"what they have in common looks the same in several places: {len(ambiguous)} encounters fit as well elsewhere, "
+                f"local map {loop.query} over {loop.place} {rival}"
+            )
         passed = sum(loop.refusal is None for loop in self.loops.values())
         return f"{len(self.loops)} pairs of local maps look alike at one alignment, and {passed or 'none'} of them fit"
 
@@ -174,7 +177,7 @@ class _Meeting:
                 continue
             if fitting_share(own, there, other.T_target_source, tolerance, c.registration) >= c.rival_fit * here:
                 turn = se3.log(se3.compose(se3.inverse(loop.T_place_query), other.T_target_source))[:3]
-                return f"the maps fit as well turned by {np.rad2deg(np.linalg.norm(turn)):.0f}°"
+                return f"{_AS_WELL} turned by {np.rad2deg(np.linalg.norm(turn)):.0f}°"
         return None
 
     def _largest_agreeing(self, loops: list[Loop]) -> list[Loop]:
@@ -198,7 +201,12 @@ class _Meeting:
         predicted, fitting, _ = self._check_predictions(rival)
         if fitting < max(share * confirmed, self.config.least_confirmed * predicted):
             return None
-        return f"{mine} local maps agree on where one session is in the other, but {theirs} say something else that fits too"
+        own, other = (self._joined(loops).T_world_session[1] for loops in (chosen, rival))
+        middle = self.query.session.T_session_map[:, 4:].mean(axis=0)
+        turn = np.rad2deg(np.linalg.norm(se3.log(se3.compose(se3.inverse(own), other))[:3]))
+        far = float(np.linalg.norm(se3.act(own, middle) - se3.act(other, middle)))
+        how = f"{far:.1f} m" + (f" and {turn:.0f}°" if turn > 5.0 else "")
+        return f"{mine} local maps agree on where one session is in the other, but {theirs} say {how} from there, which fits too"
 
     def _joined(self, chosen: list[Loop]) -> JoinedGraph:
         """Both sessions with these encounters."""
@@ -267,6 +275,13 @@ class _Meeting:
         if spread < c.least_spread:
             return f"the encounters that agree lie within {spread:.0f} m of way, {c.least_spread:.0f} m are asked for"
         return None
+
+
+def _rival_of(loop: Loop) -> str | None:
+    """Where else an encounter fits as well: 8.0 m away, or turned by 180°; None where that is not why it was refused."""
+    if loop.refusal is None or not loop.refusal.startswith(_AS_WELL):
+        return None
+    return loop.refusal.removeprefix(_AS_WELL).split(",")[0].strip()
 
 
 def _queries(loops: list[Loop]) -> set[int]:

@@ -13,7 +13,7 @@ from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats
-from boxplus.systems.slam.registration import register
+from boxplus.systems.slam.registration import fitting_share, register
 from boxplus.systems.slam.rivals import rival_shifts, turned_rivals
 
 _AGREEMENT = 0.6  # of density images, against that of the alignment found, for another one to be tried
@@ -21,6 +21,7 @@ _SHIFTS = 3  # tried
 _POINTS = 200_000  # of a session, in its density image
 _PAIRS = 8  # of local maps that are laid over each other for one alignment
 _SAME_TURN = 0.2  # rad
+_TOLERANCE = 2.5  # standard deviations from a plane within which a point fits
 _RMS_FLOOR = 0.02  # m: successive maps that fit better than this say nothing about others
 
 
@@ -40,14 +41,14 @@ def fits_otherwise(place: Places, query: Places, T_place_query: Floats, config: 
         moved = T.copy()
         moved[4:6] += shift
         others.append(moved)
-    wanted = len(_pairs(place, query, T_place_query, config))
+    found = _AsFound(place, query, T_place_query, config)
     for other in others:
         alignment = se3.compose(other, se3.inverse(middle))
         pairs = _pairs(place, query, alignment, config)
-        if len(pairs) < config.rival_share * wanted:
+        if len(pairs) < config.rival_share * len(found.places):
             continue
         tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).round().astype(int))]
-        fitting = sum(_fits(place, query, pair, alignment, T_place_query, config) for pair in tried)
+        fitting = sum(_fits(place, query, pair, alignment, found, config) for pair in tried)
         if fitting >= config.least_confirmed * len(tried):
             xi = se3.log(se3.compose(se3.inverse(T), other))
             turn = np.rad2deg(np.linalg.norm(xi[:3]))
@@ -79,16 +80,53 @@ def _pairs(place: Places, query: Places, T_place_query: Floats, config: Sessions
     return found
 
 
+class _AsFound:
+    """How well local maps of the query session lie where the alignment that was found has them; each looked at once.
+
+    Attributes:
+        T_place_query: (7,) that alignment. places: the local map that each of the query session's lies over, where one is near.
+    """
+
+    def __init__(self, place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> None:
+        self.T_place_query = T_place_query
+        self.places = dict(_pairs(place, query, T_place_query, config))
+        self._sessions, self._config = (place, query), config.slam.registration
+        self._share: dict[int, tuple[float, float]] = {}
+
+    def share(self, number: int) -> tuple[float, float]:
+        """Of the points of a local map, those within a tolerance of a plane, and that tolerance [m]; none where none is near."""
+        if number not in self._share:
+            self._share[number] = self._measured(number)
+        return self._share[number]
+
+    def _measured(self, number: int) -> tuple[float, float]:
+        place, query = self._sessions
+        where = self.places.get(number)
+        if where is None or not (len(query.session.maps[number].points) and len(place.session.maps[where].points)):
+            return 0.0, _TOLERANCE * _RMS_FLOOR
+        own, there = query.surface(number), place.surface(where)
+        T = place.session.T_session_map[where], query.session.T_session_map[number]
+        found = register(own, there, se3.compose(se3.inverse(T[0]), se3.compose(self.T_place_query, T[1])), self._config)
+        if found is None:
+            return 0.0, _TOLERANCE * _RMS_FLOOR
+        tolerance = _TOLERANCE * max(found.rms, _RMS_FLOOR)
+        return fitting_share(own, there, found.T_target_source, tolerance, self._config), tolerance
+
+
 def _fits(
-    place: Places, query: Places, pair: tuple[int, int], T_other: Floats, T_place_query: Floats, config: SessionsConfig
+    place: Places, query: Places, pair: tuple[int, int], T_other: Floats, as_found: _AsFound, config: SessionsConfig
 ) -> bool:
-    """Whether two local maps overlap as they should, and stay where another alignment puts them, not where the first one does."""
+    """Whether two local maps overlap as they should where another alignment puts them, stay there, and fit as well as found.
+
+    Streets cross at right angles, and the ground is the ground: half of a city's points lie on surfaces of another street of it.
+    """
     number, where = pair
     if not (len(query.session.maps[number].points) and len(place.session.maps[where].points)):
         return False
     T = place.session.T_session_map[where], query.session.T_session_map[number]
-    start, first = (se3.compose(se3.inverse(T[0]), se3.compose(A, T[1])) for A in (T_other, T_place_query))
-    found = register(query.surface(number), place.surface(where), start, config.slam.registration)
+    start, first = (se3.compose(se3.inverse(T[0]), se3.compose(A, T[1])) for A in (T_other, as_found.T_place_query))
+    own, there = query.surface(number), place.surface(where)
+    found = register(own, there, start, config.slam.registration)
     if found is None:
         return False
     from_other, from_first = (se3.log(se3.compose(se3.inverse(A), found.T_target_source)) for A in (start, first))
@@ -97,4 +135,8 @@ def _fits(
     if np.linalg.norm(from_first[:3]) < _SAME_TURN and np.linalg.norm(from_first[3:]) < config.slam.rival_distance:
         return False  # it came back
     bound = config.slam.largest_rms * max(query.rms(number), place.rms(where), _RMS_FLOOR)
-    return min(found.overlap) >= config.slam.least_overlap and found.rms <= bound
+    if min(found.overlap) < config.slam.least_overlap or found.rms > bound:
+        return False
+    share, tolerance = as_found.share(number)
+    here = fitting_share(own, there, found.T_target_source, tolerance, config.slam.registration)
+    return here >= config.slam.rival_fit * share

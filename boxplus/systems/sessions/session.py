@@ -74,6 +74,17 @@ class Session:
         mean = quaternion.to_matrix(self.T_session_map[:, :4])[:, :, 2].mean(axis=0)
         return np.asarray(mean / np.linalg.norm(mean))
 
+    @property
+    def start_covariance(self) -> Floats:
+        """(6, 6) of the first map in the session's frame, on its right: what the odometry drifts by on the way there.
+
+        The frame is where the session began; what is known of it goes through the first map. Zero where that stands in it.
+        """
+        way = [local_map.path_m for local_map in self.maps[:2]]
+        if len(way) < 2 or way[0] <= 0.0 or way[1] <= way[0]:
+            return np.zeros((6, 6))
+        return np.asarray(self.maps[0].covariance * (way[0] / (way[1] - way[0])))
+
     def chain(self) -> OdometryChain:
         """What is known between any two maps: poses after loops, covariances of the odometry, which loops only make smaller."""
         chain = OdometryChain()

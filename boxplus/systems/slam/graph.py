@@ -25,6 +25,7 @@ from boxplus.systems.slam.loop import Floats, Loop
 _LOOPS = "loops"
 _INLIER = 0.999  # of true loops within the threshold
 _DAMPING = 1e-9
+_VERTICAL_LENGTH = 100.0  # m of way over which the verticals of local maps are one measurement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,10 +83,24 @@ def open_graph(T_odo: Sequence[Floats], covariances: Sequence[Floats], gravity_s
             RelativePose(measured, covariance=np.stack(covariances)[1:]), x[steps], x[steps + 1], name="odometry"
         )
     # Every map's z axis is its own measurement of the vertical; their mean is that of the odometry's world.
-    vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), mean_up(poses), sigma=gravity_sigma)
+    sigma = vertical_sigmas(poses, gravity_sigma)
+    vertical = GravityDirection(np.tile([0.0, 0.0, 1.0], (len(poses), 1)), mean_up(poses), sigma=sigma)
     problem.add_residuals(vertical, x, name="gravity")
     problem.fix(x[0:1])
     return problem, x
+
+
+def vertical_sigmas(T_odo: Floats, gravity_sigma: float) -> Floats:
+    """(n, 2) standard deviations of the verticals of local maps at poses (n, 7) along an odometry [rad].
+
+    Verticals are the odometry's own, and their errors are its errors: successive maps share them. All maps within 100 m of way,
+    after which a tilt that walks at random (`drift_rotation`) has come to `gravity_sigma`, weigh as much as one that stands
+    alone; each by itself they would make tilts seem known by the root of their number.
+    """
+    step = np.linalg.norm(np.diff(T_odo[:, 4:], axis=0), axis=1)
+    between = 0.5 * (np.append(step, step[-1:]) + np.insert(step, 0, step[:1])) if len(step) else np.full(1, np.inf)
+    sharing = np.maximum(_VERTICAL_LENGTH / np.maximum(between, 1e-3 * _VERTICAL_LENGTH), 1.0)
+    return np.repeat((gravity_sigma * np.sqrt(sharing))[:, None], 2, axis=1)
 
 
 def add_loops(problem: Problem, x: Variables, loops: Sequence[Loop], name: str) -> Group:

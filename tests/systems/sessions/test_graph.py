@@ -83,6 +83,23 @@ def test_the_covariance_of_an_anchor_is_that_of_the_first_pose_in_a_graph_withou
     np.testing.assert_allclose(graph.covariance[1], Ad @ free @ Ad.T, rtol=1e-6, atol=1e-12)
 
 
+def test_the_way_to_the_first_map_is_part_of_what_a_frame_is_off_by() -> None:
+    """A session's frame is where it began; encounters tell where its maps are, and the odometry drifted on the way to these."""
+
+    def later(session: Session, way: float) -> Session:
+        return replace(session, maps=[replace(m, path_m=m.path_m + way) for m in session.maps])
+
+    a, b = drawn("a", A), drawn("b", B)
+    encounters = met(0, 1, [(1, 0), (3, 2), (4, 3)], A, se3.compose(np.broadcast_to(ANCHOR, B.shape), B))
+    start = np.stack([turned(0.0, 0.0, 0.0), ANCHOR])
+    without, with_it = (join([later(a, way), later(b, 2 * way)], encounters, start, 1e4).covariance[1] for way in (0.0, 10.0))
+    own = a.maps[1].covariance / 20.0  # of a metre of way
+    to_b, to_a = se3.adjoint(B[0]), se3.adjoint(se3.compose(se3.inverse(ANCHOR), A[0]))
+    expected = without + 20.0 * to_b @ own @ to_b.T + 10.0 * to_a @ own @ to_a.T
+    np.testing.assert_allclose(with_it, expected, rtol=1e-5, atol=1e-10)
+    assert not Session.of("one", [replace(a.maps[0], path_m=5.0)]).start_covariance.any()
+
+
 def test_own_loops_hold_a_session_together() -> None:
     stiff = np.linalg.inv(np.diag(np.repeat([1e-8, 1e-6], 3)))
     bent = lane(6, 0.1)

@@ -16,7 +16,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.consistency import cycle_error, largest_clique
 from boxplus.systems.slam.correction import Correction
-from boxplus.systems.slam.graph import close_graph
+from boxplus.systems.slam.graph import close_graph, vertical_sigmas
 from boxplus.systems.slam.loop import Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
 
@@ -197,3 +197,17 @@ def test_covariances_of_corrected_poses_are_those_of_their_errors() -> None:
         )
     low, high = chi2(6 * runs).ppf([0.001, 0.999]) / runs
     assert ((low < squares.mean(axis=0)) & (squares.mean(axis=0) < high)).all(), squares.mean(axis=0)
+
+
+@given(st.integers(2, 60), st.floats(0.5, 40.0))
+@settings(max_examples=30, deadline=None)
+def test_verticals_within_a_hundred_metres_weigh_as_one(count: int, spacing: float) -> None:
+    """However finely a way is cut into maps; those farther apart than that stand alone."""
+    poses = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (count, 1))
+    poses[:, 4] = spacing * np.arange(count)
+    weight = (0.005 / vertical_sigmas(poses, 0.005)) ** 2
+    assert weight.shape == (count, 2)
+    np.testing.assert_allclose(weight.sum(axis=0), count * spacing / 100.0)
+    poses[:, 4] = 300.0 * np.arange(count)
+    np.testing.assert_allclose(vertical_sigmas(poses, 0.005), 0.005)
+    np.testing.assert_allclose(vertical_sigmas(poses[:1], 0.005), 0.005)
