@@ -83,8 +83,7 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except BoxplusError as error:
-            typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-            typer.echo(str(error), err=True)
+            print_error(str(error))
             raise typer.Exit(EXIT_BAD_INPUT if isinstance(error, InputError) else EXIT_FAILED) from None
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
@@ -108,16 +107,10 @@ class _LogFormatter(logging.Formatter):
         return printable(super().format(record))
 
 
-def leave(state: str, *, untrusted: bool) -> None:
-    """End a command with the code of a run that was interrupted, or of one that is not to be trusted.
-
-    Raises:
-        typer.Exit: with that code.
-    """
-    if state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if untrusted:
-        raise typer.Exit(EXIT_UNTRUSTED)
+def print_error(text: str) -> None:
+    """On the standard error."""
+    typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
+    typer.echo(text, err=True)
 
 
 def _print_version(wanted: bool) -> None:

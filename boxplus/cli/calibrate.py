@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_FAILED
 from boxplus.cli.cameras.calibrate_cameras import cameras
 from boxplus.cli.help import Command
 from boxplus.cli.model_options import takes_recording_options
+from boxplus.cli.options import RESULTS, JsonOption, QuietOption, RecordingArgument
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
+    from boxplus.cli.terminal import Terminal
     from boxplus.runs.calibration import Quantity
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=True)
@@ -31,11 +32,16 @@ app.command("cameras", cls=Command)(cameras)
 @app.command("lidar-imu", cls=Command)
 @takes_recording_options
 def lidar_imu(
-    recording: Annotated[Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.")],
+    recording: RecordingArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="YAML file for 'boxplus lio --config'; printed when not given.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="YAML file for 'boxplus lio --config'; printed when not given.", rich_help_panel=RESULTS
+        ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.", rich_help_panel=RESULTS)] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     *,
     options: RecordingOptions,
 ) -> None:
@@ -43,31 +49,33 @@ def lidar_imu(
 
     Exit code 1 when the motion does not determine the mounting: the file then holds the rest and says what motion would.
     """
-    from rich.progress import Progress
-
-    from boxplus.cli.console import make_console
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.terminal import Terminal
     from boxplus.errors import InputError
     from boxplus.recordings import open_recording
-    from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
+    from boxplus.runs.calibration import calibrate_lidar_imu, calibration_facts, calibration_yaml
 
-    if output is not None and output.exists() and not overwrite:
-        raise InputError("a new file for the calibration", f"{output} exists", "choose another --output, or give --overwrite")
-    with (
-        open_recording(recording, options) as opened,
-        Progress(console=make_console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task(f"comparing LiDAR and IMU of {recording.name}", total=1.0)
-        found = calibrate_lidar_imu(opened, options, lambda done: progress.update(task, completed=done))
-    _print_table(found.quantities)
-    text = calibration_yaml(found, options, recording.name)
-    if output is None:
-        typer.echo(text, nl=False)
-    else:
-        _write(output, text)
-        typer.echo(str(output))
-    if not found.has_mounting:
-        typer.echo("the motion does not determine T_imu_lidar: not written", err=True)
-        raise typer.Exit(EXIT_FAILED)
+    terminal = Terminal(quiet=quiet, as_json=as_json)
+    with reported(recording, output, as_json=as_json) as outcome:
+        if output is not None and output.exists() and not overwrite:
+            raise InputError("a new file for the calibration", f"{output} exists", "choose another --output, or give --overwrite")
+        with (
+            open_recording(recording, options) as opened,
+            terminal.working(f"comparing LiDAR and IMU of {recording.name}") as show,
+        ):
+            found = calibrate_lidar_imu(opened, options, show)
+        _print_table(terminal, found.quantities)
+        text = calibration_yaml(found, options, recording.name)
+        if output is not None:
+            _write(output, text)
+            terminal.say(str(output))
+        elif not as_json:  # with JSON, the numbers are there
+            typer.echo(text, nl=False)
+        facts = calibration_facts(found)
+        if found.has_mounting:
+            outcome.end(facts)
+        else:
+            outcome.fall_short(facts, "the motion does not determine T_imu_lidar: not written")
 
 
 def _write(path: Path, text: str) -> None:
@@ -78,11 +86,9 @@ def _write(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-def _print_table(quantities: Sequence[Quantity]) -> None:
+def _print_table(terminal: Terminal, quantities: Sequence[Quantity]) -> None:
     from rich.table import Table
     from rich.text import Text
-
-    from boxplus.cli.console import make_console
 
     table = Table(show_lines=False, pad_edge=False)
     for heading in ("", "what", "value", "standard deviation", "advice"):
@@ -90,4 +96,6 @@ def _print_table(quantities: Sequence[Quantity]) -> None:
     for quantity in quantities:
         known = Text("known", style="green") if quantity.determined else Text("open", style="yellow")
         table.add_row(known, quantity.name, Text(quantity.value), Text(quantity.std), Text(quantity.advice))
-    make_console().print(table)
+        if not quantity.determined and terminal.alarms is not terminal.console:
+            terminal.warn(f"{quantity.name} is open: {quantity.advice}")
+    terminal.console.print(table)

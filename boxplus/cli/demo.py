@@ -39,7 +39,8 @@ def demo(
     results = RunFolder(output / f"{name}_results")
     report = not without_report(False)
     threads = {"threads": min(2, os.cpu_count() or 1)}
-    summary = run(recording, results.path, load_run_config(overrides={"odometry": threads}), overwrite=True, report=report)
+    settings = load_run_config(overrides={"odometry": threads})
+    summary, _ = run(recording, results.path, settings, overwrite=True, report=report)
     if summary.state != "finished":
         raise typer.Exit(EXIT_INTERRUPTED)
     truth = output / f"{name}.gt.tum"

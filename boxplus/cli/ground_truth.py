@@ -3,31 +3,55 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from boxplus.errors import BoxplusError
 
 if TYPE_CHECKING:
     from boxplus.evaluation.alignment import AlignmentKind
     from boxplus.formats.trajectory import Trajectory
 
 
-def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment: AlignmentKind) -> str:
-    """Write `evaluation.json`; returns its main line.
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A run beside the ground truth.
+
+    Attributes:
+        line: for the terminal.
+        evaluation: as in `evaluation.json`; None where the two cannot be compared.
+        error: why not, or why that file could not be written.
+    """
+
+    line: str
+    evaluation: Mapping[str, Any] | None = None
+    error: str | None = None
+
+    @property
+    def row(self) -> tuple[str, str]:
+        """Of the results on the terminal."""
+        return "against --gt", self.line
+
+
+def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment: AlignmentKind) -> Comparison:
+    """Write `evaluation.json`. Where that is not possible the run is as good as without it: nothing is raised.
 
     Args:
         estimate: the trajectory that a run wrote.
         evaluation: the file to write.
         alignment: of the estimate onto the ground truth: what the estimator leaves open.
-
-    Raises:
-        InputError: the two do not overlap in time, or their comparison means nothing.
-        OutputError: the file cannot be written.
     """
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.output import atomic_file
     from boxplus.formats.trajectory import read_trajectory
 
-    found = evaluate(read_trajectory(estimate), truth, alignment=alignment, method="interpolate")
-    with atomic_file(evaluation) as file:
-        file.write(f"{json.dumps(found.to_dict(), indent=2)}\n".encode())
-    return f"{found.title}: {found.ate.line('m')}"
+    try:
+        found = evaluate(read_trajectory(estimate), truth, alignment=alignment, method="interpolate")
+        figures = found.to_dict()
+        with atomic_file(evaluation) as file:
+            file.write(f"{json.dumps(figures, indent=2)}\n".encode())
+    except BoxplusError as error:
+        return Comparison("not compared, see the error", error=str(error))
+    return Comparison(f"{found.title}: {found.ate.line('m')}", figures)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -11,6 +12,8 @@ import typer
 from boxplus._extras import has
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from boxplus.runs.lidar_inertial.config import RunConfig
 
 ConfigT = TypeVar("ConfigT", bound="RunConfig")
@@ -74,7 +77,7 @@ JsonOption = Annotated[
     bool,
     typer.Option(
         "--json",
-        help="Print run.json on the standard output, and everything else on the standard error.",
+        help="Print what became of it as a line of JSON on the standard output, and everything else on the standard error.",
         rich_help_panel=PRINTING,
     ),
 ]
@@ -90,21 +93,37 @@ QuietOption = Annotated[
 ]
 
 
-def odometry_overrides(T_imu_lidar: str | None, threads: int | None) -> dict[str, object]:
-    """What `--T-imu-lidar` and `--threads` change of the odometry's settings.
+def default_threads() -> int:
+    """Two, where the machine has them."""
+    return min(2, os.cpu_count() or 1)
+
+
+def lidar_settings(
+    load: Callable[[Path | None, Iterable[str], dict[str, dict[str, object]]], ConfigT],
+    config: Path | None,
+    settings: list[str] | None,
+    options: BaseModel,
+    T_imu_lidar: str | None,
+    threads: int | None,
+    **sections: dict[str, object],
+) -> ConfigT:
+    """The settings of a run with a LiDAR: those of `--config`, then `--set`, then the other options.
+
+    Args:
+        load: of this kind of run.
+        options: how the recording is read.
+        sections: what the command's own options change.
 
     Raises:
-        InputError: no pose, or one whose order nobody can tell.
+        InputError: an unknown setting or value, no pose, or one whose order nobody can tell.
     """
-    from boxplus.runs.transform import parse_transform
+    odometry: dict[str, object] = {} if threads is None else {"threads": threads}
+    if T_imu_lidar is not None:
+        from boxplus.runs.transform import parse_transform
 
-    given: dict[str, object] = {} if threads is None else {"threads": threads}
-    return given if T_imu_lidar is None else {**given, "T_imu_lidar": parse_transform(T_imu_lidar).tolist()}
-
-
-def with_default_threads(config: ConfigT) -> ConfigT:
-    """Two threads for the odometry, where the machine has them and neither an option nor a file says how many."""
-    if "threads" in config.odometry.model_fields_set:
-        return config
-    both = {"threads": min(2, os.cpu_count() or 1)}
-    return config.model_copy(update={"odometry": config.odometry.model_copy(update=both)})
+        odometry["T_imu_lidar"] = parse_transform(T_imu_lidar).tolist()
+    overrides = {"recording": options.model_dump(exclude_defaults=True), "odometry": odometry, **sections}
+    found = load(config, settings or (), overrides)
+    if "threads" in found.odometry.model_fields_set:
+        return found
+    return found.model_copy(update={"odometry": found.odometry.model_copy(update={"threads": default_threads()})})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from boxplus.cli.console import make_console
+from boxplus.cli.terminal import Terminal
 from boxplus.errors import printable
 
 if TYPE_CHECKING:
@@ -28,36 +28,19 @@ _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red", "weak": "yell
 _SHOWN_WARNINGS = 8
 
 
-class RunTerminal:
-    """Prints on the standard output; without a terminal the progress bar is left out.
-
-    Args:
-        quiet: print warnings, and what is not to be trusted or not finished, alone, and on the standard error.
-        as_json: leave the standard output to a summary as JSON, and print on the standard error.
-    """
-
-    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
-        self._console = make_console(stderr=as_json, quiet=quiet)
-        self._alarms = make_console(stderr=True) if quiet else self._console
-
-    def status(self, text: str) -> AbstractContextManager[object]:
-        """A line that stands while something takes its time."""
-        return self._console.status(text)
-
-    def announce_stop(self) -> None:
-        """Say that Ctrl-C was heard."""
-        self._console.print("interrupted: finishing the files; Ctrl-C again stops at once")
+class RunTerminal(Terminal):
+    """Prints a run; without a terminal the progress bar is left out."""
 
     def print_evidence(self, info: RecordingInfo | CameraRecordingInfo, evidence: Iterable[Evidence]) -> None:
         """How the recording is read, and why."""
         facts = f"{info.format}, {info.duration_s:.1f} s, {info.message_count} messages"
-        self._console.print(Text.assemble((printable(info.path.name), "bold"), f": {facts}"))
+        self.console.print(Text.assemble((printable(info.path.name), "bold"), f": {facts}"))
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in ("reading", "found", "", "evidence"):
             table.add_column(heading, overflow="fold")
         for entry in evidence:
             table.add_row(entry.key, Text(entry.value), Text(entry.verdict, _STYLE[entry.verdict]), Text(entry.text))
-        self._console.print(table)
+        self.console.print(table)
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[Progress], None]]:
@@ -72,7 +55,7 @@ class RunTerminal:
             TimeRemainingColumn(),
             TextColumn("to go"),
         )
-        with ProgressBar(*columns, console=self._console, disable=not self._console.is_terminal) as bar:
+        with ProgressBar(*columns, console=self.console, disable=not self.console.is_terminal) as bar:
             task = bar.add_task("odometry", total=1.0, text="")
             rate = _Rate()
             compiling = False
@@ -82,7 +65,7 @@ class RunTerminal:
                 if progress.compiling is not None:
                     if not compiling:
                         compiling = True
-                        self._console.print("compiling kernels (first use only) …")
+                        self.console.print("compiling kernels (first use only) …")
                     bar.update(task, text=f"compiling {progress.compiling}")
                 elif rate.due():
                     text = f"{progress.count} {progress.unit}, {rate(progress.count):.0f}/s, {progress.status}"
@@ -91,16 +74,27 @@ class RunTerminal:
             yield show
             bar.update(task, completed=bar.tasks[0].total if bar.tasks[0].completed > 0.999 else bar.tasks[0].completed)
 
-    def print_results(self, summary: RunFacts, rows: Sequence[tuple[str, str]], folder: Path, files: Sequence[str]) -> None:
+    def print_results(
+        self,
+        summary: RunFacts,
+        rows: Sequence[tuple[str, str]],
+        folder: Path,
+        files: Sequence[str],
+        *,
+        warnings: Iterable[str] = (),
+        doubt: str | None = None,
+    ) -> None:
         """The facts of the run, its warnings and its files.
 
         Args:
+            summary: of the odometry.
             rows: name and value, after the counts and the start.
             files: names of those that may be there.
+            warnings, doubt: of what was made of the odometry, and why that is not to be trusted.
         """
-        console = self._console
+        console = self.console
         good = summary.state == "finished" and summary.contradiction is None
-        (console if good else self._alarms).print(Text(printable(summary.describe_state()), "green" if good else "yellow"))
+        (console if good else self.alarms).print(Text(printable(summary.describe_state()), "green" if good else "yellow"))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")
         table.add_column()
@@ -114,13 +108,14 @@ class RunTerminal:
             table.add_row(name, Text(value))
         console.print(table)
         for warning in summary.warnings[:_SHOWN_WARNINGS]:
-            times = f" ({warning.count} times)" if warning.count > 1 else ""
-            self._alarms.print(Text.assemble(("warning: ", "yellow"), printable(warning.text) + times))
+            self.warn(warning.text + (f" ({warning.count} times)" if warning.count > 1 else ""))
         if len(summary.warnings) > _SHOWN_WARNINGS:
-            self._alarms.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
-        for name in files:
-            if (folder / name).exists():
-                console.print(f"  {folder / name}", soft_wrap=True, markup=False)
+            self.alarms.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
+        for text in warnings:
+            self.warn(text)
+        if doubt is not None and doubt != summary.contradiction:
+            self.doubt(doubt)
+        self.print_files(folder, files)
 
     def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         """A table with a row for each of several things."""
@@ -129,11 +124,7 @@ class RunTerminal:
             table.add_column(heading, overflow="fold")
         for row in rows:
             table.add_row(*(Text(printable(cell)) for cell in row))
-        self._console.print(table)
-
-    def print_failure(self, what: str, error: str) -> None:
-        """That one of several things failed, and why."""
-        self._alarms.print(Text.assemble(("failed: ", "bold red"), printable(f"{what}: {error}")))
+        self.console.print(table)
 
 
 class _Rate:

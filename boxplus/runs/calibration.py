@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.errors import InputError
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog
 from boxplus.runs.inspection.stretches import gather_scans, lively_stretches
+from boxplus.runs.run_loop import versions
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, Calibration, calibrate
 from boxplus.systems.lidar_inertial_agreement.hypotheses import Cause, contradictions, judges_rotation
@@ -114,6 +117,55 @@ def calibrate_lidar_imu(
         )
     given_s = 0.0 if options is None else options.lidar_time_offset_s
     return LidarImuCalibration(estimate, given_s + estimate.offset_s, _quantities(estimate, given_s), len(used))
+
+
+class QuantityFacts(BaseModel):
+    """One quantity for programs: its number or numbers, their standard deviations, and whether the motion showed them."""
+
+    model_config = ConfigDict(frozen=True)
+
+    value: list[float]
+    sigma: list[float]
+    determined: bool
+    advice: str = Field(description="what motion would show it; empty where it is determined")
+
+
+class LidarImuFacts(BaseModel):
+    """A calibration for programs."""
+
+    model_config = ConfigDict(frozen=True)
+
+    program: Literal["boxplus calibrate lidar-imu"] = "boxplus calibrate lidar-imu"
+    versions: dict[str, str]
+    T_imu_lidar: list[list[float]] | None = Field(description="(4, 4): p_imu = T_imu_lidar p_lidar; null: not determined")
+    stretches: int = Field(description="of the recording that were used")
+    quantities: dict[str, QuantityFacts] = Field(description="R_imu_lidar row by row with sigmas about the IMU's axes [rad]; SI")
+
+
+def calibration_facts(found: LidarImuCalibration) -> LidarImuFacts:
+    """The numbers of a calibration."""
+    estimate = found.estimate
+    R, p, std = estimate.T_imu_lidar[:3, :3], estimate.T_imu_lidar[:3, 3], estimate.std
+    numbers: dict[str, tuple[Any, Any]] = {
+        "R_imu_lidar": (R, std[THETA]),
+        "p_imu_lidar": (p, std[ARM]),
+        "lidar_time_offset": (found.lidar_time_offset_s, std[OFFSET]),
+        "gyro_scale": (estimate.gyro_scale, std[SCALE]),
+        "length_ratio": (estimate.slope, std[SLOPE]),
+        "gyro_bias": (estimate.gyro_bias, estimate.gyro_bias_std),
+    }
+    quantities = {}
+    for quantity in found.quantities:
+        value, sigma = (np.atleast_1d(np.asarray(part, np.float64)).ravel().tolist() for part in numbers[quantity.name])
+        quantities[quantity.name] = QuantityFacts(
+            value=value, sigma=sigma, determined=quantity.determined, advice=quantity.advice
+        )
+    return LidarImuFacts(
+        versions=versions(),
+        T_imu_lidar=estimate.T_imu_lidar.tolist() if found.has_mounting else None,
+        stretches=found.stretches,
+        quantities=quantities,
+    )
 
 
 def _quantities(found: Calibration, given_s: float) -> list[Quantity]:

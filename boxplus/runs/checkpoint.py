@@ -94,15 +94,25 @@ def read_checkpoint(folder: OdometryFolder, identity: dict[str, str]) -> Checkpo
             identity["recording"],
             "give that recording, or start a new run in another folder",
         )
-    pairs = zip(saved["config"].splitlines(), identity["config"].splitlines(), strict=False)
-    if saved["config"] != identity["config"]:
-        before, now = next(((a, b) for a, b in pairs if a != b), ("more settings", "fewer"))
-        raise InputError(
-            f"the settings that the run began with ({before.strip()})",
-            now.strip(),
-            f"give --config {folder.config}, or start a new run in another folder",
-        )
+    refuse_other_settings(folder, saved["config"], identity["config"])
     return Checkpoint(**state)
+
+
+def refuse_other_settings(folder: OdometryFolder, before: str, now: str) -> None:
+    """Compare two texts of `config.yaml`: of the run in a folder, and as they would be now.
+
+    Raises:
+        InputError: they differ; the message has the first line that does.
+    """
+    if before == now:
+        return
+    pairs = zip(before.splitlines(), now.splitlines(), strict=False)
+    then, asked = next(((a, b) for a, b in pairs if a != b), ("more settings", "fewer"))
+    raise InputError(
+        f"the settings that the run began with ({then.strip()})",
+        asked.strip(),
+        f"give --config {folder.config}, or start a new run in another folder",
+    )
 
 
 def cut_to_whole_rows(folder: OdometryFolder, log: Path, fewest: int) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings import RecordingOptions, open_recording
-from boxplus.runs.calibration import calibrate_lidar_imu, calibration_yaml
+from boxplus.runs.calibration import calibrate_lidar_imu, calibration_facts, calibration_yaml
 from boxplus.runs.lidar_inertial.config import load_run_config
 from boxplus.simulation import Scenario, Simulation, SpinningLidar, faults, write_recording
 from boxplus.simulation.live_recording import as_recording
@@ -43,10 +44,15 @@ def carried() -> Simulation:
 def test_the_file_is_a_configuration(tmp_path: Path) -> None:
     path = write_recording(swung(), tmp_path / "swung", fault=faults.clock_offset(0.04))
     file = tmp_path / "new" / "calibration.yaml"
-    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "-o", str(file), "--min-range", "0.4"])
+    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "-o", str(file), "--min-range", "0.4", "--json"])
     assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)["run"]
+    assert all(quantity["determined"] and len(quantity["sigma"]) in (1, 3) for quantity in facts["quantities"].values())
+    assert "known" in result.stderr and str(file) in result.stderr
     config = load_run_config(file)
     T = np.array(config.odometry.T_imu_lidar)
+    np.testing.assert_allclose(facts["T_imu_lidar"], T, atol=1e-8)
+    assert facts["quantities"]["R_imu_lidar"]["value"] == pytest.approx(T[:3, :3].ravel().tolist(), abs=1e-8)
     assert np.degrees(np.linalg.norm(so3.log(T[:3, :3] @ T_IMU_LIDAR[:3, :3].T))) < 0.3
     assert np.linalg.norm(T[:3, 3] - T_IMU_LIDAR[:3, 3]) < 0.02
     assert abs(config.recording.lidar_time_offset_s - 0.04) < 2e-3
@@ -63,7 +69,7 @@ def test_the_file_is_a_configuration(tmp_path: Path) -> None:
 
 def test_what_the_motion_does_not_show_is_not_written() -> None:
     found = calibrate_lidar_imu(as_recording(carried()))
-    assert not found.has_mounting
+    assert not found.has_mounting and calibration_facts(found).T_imu_lidar is None
     text = calibration_yaml(found, RecordingOptions(), "carried")
     assert "T_imu_lidar:" not in text.split("# found with")[0]
     assert "NOT DETERMINED: open" in text and "turn the platform" in text

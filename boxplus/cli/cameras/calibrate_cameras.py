@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -10,12 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_FAILED, EXIT_UNTRUSTED
-from boxplus.cli.options import NoReportOption
+from boxplus.cli.options import RESULTS, JsonOption, NoReportOption, OverwriteOption, QuietOption
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
+    from boxplus.cli.terminal import Terminal
     from boxplus.runs.camera_calibration.summary import CalibrationSummary
 
 
@@ -29,7 +28,6 @@ class LensChoice(StrEnum):
 
 
 def cameras(
-    ctx: typer.Context,
     corners: Annotated[
         Path, typer.Argument(help="Corners of the target: Basalt's detected_corners.json, or a CSV of time_ns,camera,corner,u,v.")
     ],
@@ -38,7 +36,10 @@ def cameras(
     ],
     resolution: Annotated[str, typer.Option("--resolution", help="Of the images, such as 752x480; no corner file states it.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; named after the corners when not given.")
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="Folder for the results; named after the corners when not given.", rich_help_panel=RESULTS
+        ),
     ] = None,
     lens: Annotated[
         LensChoice, typer.Option("--lens", help="Lens of the cameras; auto: the simplest that leaves the smallest residuals.")
@@ -55,19 +56,19 @@ def cameras(
     max_views: Annotated[
         int, typer.Option("--max-views", min=8, help="Frames used for lenses and mountings, evenly chosen.")
     ] = 80,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     no_report: NoReportOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier calibration in the folder.")] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Lenses of cameras, how they are mounted to each other and on an IMU, from an AprilGrid that they saw.
 
     Writes camchain.yaml (Kalibr's form, which vio and inspect read), run.json (with covariances) and report.html. Exit codes: 0
     done, 1 the views do not determine a lens (no camchain is written), 2 bad input, 3 done but not to be trusted.
     """
-
-    from rich.progress import Progress
-
-    from boxplus.cli.console import make_console
     from boxplus.cli.optimization.terminal import versions
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.terminal import Terminal
     from boxplus.errors import InputError
     from boxplus.formats.output import atomic_file
     from boxplus.recordings.cameras.calibration import read_camchain
@@ -89,58 +90,54 @@ def cameras(
     from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
     from boxplus.systems.camera_calibration.findings import Finding, judge
 
-    started, console = datetime.now(UTC), make_console()
-    if (imu is None) != (imu_noise is None):
-        raise InputError("both --imu and --imu-noise, or none", "one of them", "give samples and noise densities together")
-    seen, board = read_corner_file(corners, _size(resolution)), read_target(target)
-    inertial = None if imu is None or imu_noise is None else read_imu(imu, imu_noise)
-    other = None if compare is None else (read_camchain(compare), compare.name)
+    started, terminal = datetime.now(UTC), Terminal(quiet=quiet, as_json=as_json)
     folder = output or Path(f"{corners.resolve().name.split('.')[0]}_calibration")
-    own = [folder / name for name in FILES]
-    ctx.with_resource(output_folder(folder, "boxplus calibrate cameras", lambda: own, list, overwrite=overwrite))
-    samples, noise = (None, None) if inertial is None else (inertial.samples, inertial.noise)
-    with Progress(console=make_console(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"calibrating {seen.cameras} cameras from {len(seen.pixels):,} corners", total=1.0)
+    with reported(corners, folder, as_json=as_json) as outcome, ExitStack() as stack:
+        if (imu is None) != (imu_noise is None):
+            raise InputError("both --imu and --imu-noise, or none", "one of them", "give samples and noise densities together")
+        seen, board = read_corner_file(corners, _size(resolution)), read_target(target)
+        inertial = None if imu is None or imu_noise is None else read_imu(imu, imu_noise)
+        other = None if compare is None else (read_camchain(compare), compare.name)
+        own = [folder / name for name in FILES]
+        stack.enter_context(output_folder(folder, "boxplus calibrate cameras", lambda: own, list, overwrite=overwrite))
+        samples, noise = (None, None) if inertial is None else (inertial.samples, inertial.noise)
         config = CameraCalibrationConfig(lens=lens.value, max_views=max_views)
-        found = calibrate_cameras(
-            seen, board, config, imu=samples, noise=noise, on_progress=lambda done: progress.update(task, completed=done)
+        with terminal.working(f"calibrating {seen.cameras} cameras from {len(seen.pixels):,} corners") as show:
+            found = calibrate_cameras(seen, board, config, imu=samples, noise=noise, on_progress=show)
+        left_out = () if inertial is None else inertial.left_out
+        findings = [*judge(found), *(Finding("imu_samples", "remark", text) for text in left_out)]
+        summary = CalibrationSummary(
+            program="boxplus calibrate cameras",
+            versions=versions(),
+            started=started,
+            state=state_of(findings),
+            input=str(corners),
+            target=board.describe(),
+            lens=found.lens,
+            sigma_by_lens=found.sigma_by_lens,
+            sigma_px=found.of_camera(0)[0].sigma_px,
+            cameras=camera_facts(found),
+            imu_input=[] if inertial is None else [*inertial.notes, *inertial.left_out],
+            imu=imu_facts(found),
+            outliers=outliers(found),
+            compared=[] if other is None else compare_with(found, *other),
+            findings=[FindingFacts.model_validate(asdict(finding)) for finding in findings],
         )
-    left_out = () if inertial is None else inertial.left_out
-    findings = [*judge(found), *(Finding("imu_samples", "remark", text) for text in left_out)]
-    summary = CalibrationSummary(
-        program="boxplus calibrate cameras",
-        versions=versions(),
-        started=started,
-        state=state_of(findings),
-        input=str(corners),
-        target=board.describe(),
-        lens=found.lens,
-        sigma_by_lens=found.sigma_by_lens,
-        sigma_px=found.of_camera(0)[0].sigma_px,
-        cameras=camera_facts(found),
-        imu_input=[] if inertial is None else [*inertial.notes, *inertial.left_out],
-        imu=imu_facts(found),
-        outliers=outliers(found),
-        compared=[] if other is None else compare_with(found, *other),
-        findings=[FindingFacts.model_validate(asdict(finding)) for finding in findings],
-    )
-    _print(console, summary)
-    if summary.state != "refused":
-        with atomic_file(folder / "camchain.yaml") as file:
-            file.write(camchain_text(found, summary, noise).encode())
-    if not no_report:
-        from boxplus.report.cameras.calibration_report import write_calibration_report
+        _print(terminal, summary)
+        if summary.state != "refused":
+            with atomic_file(folder / "camchain.yaml") as file:
+                file.write(camchain_text(found, summary, noise).encode())
+        if not no_report:
+            from boxplus.report.cameras.calibration_report import write_calibration_report
 
-        with console.status("drawing the report"):
-            write_calibration_report(folder / "report.html", summary, found)
-    summary.write(folder / "run.json")
-    written = [name for name in FILES if (folder / name).exists()]
-    typer.echo(f"{folder}: {', '.join(written)}")
-    if summary.state == "refused":
-        typer.echo("the views do not determine a lens: no camchain.yaml", err=True)
-        raise typer.Exit(EXIT_FAILED)
-    if summary.state == "doubtful":
-        raise typer.Exit(EXIT_UNTRUSTED)
+            with terminal.status("drawing the report"):
+                write_calibration_report(folder / "report.html", summary, found)
+        summary.write(folder / "run.json")
+        terminal.say(f"{folder}: {', '.join(name for name in FILES if (folder / name).exists())}")
+        if summary.state == "refused":
+            outcome.fall_short(summary, "the views do not determine a lens: no camchain.yaml")
+        else:
+            outcome.end(summary, untrusted=summary.state == "doubtful")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -153,9 +150,11 @@ def _size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _print(terminal: Console, summary: CalibrationSummary) -> None:
+def _print(terminal: Terminal, summary: CalibrationSummary) -> None:
     from rich.table import Table
+    from rich.text import Text
 
+    from boxplus.errors import printable
     from boxplus.runs.camera_calibration.camchain import IMU_MOUNTING_DOUBTS
 
     table = Table(show_lines=False, pad_edge=False)
@@ -174,11 +173,13 @@ def _print(terminal: Console, summary: CalibrationSummary) -> None:
         sigma = f"{1e3 * max(summary.imu.sigma_m):.2g} mm, {max(summary.imu.sigma_deg):.2g} deg"
         is_open = any(finding.code in IMU_MOUNTING_DOUBTS for finding in summary.findings)
         table.add_row("imu", "T_imu_cam0", "not written: see below" if is_open else "in camchain.yaml", sigma)
-    terminal.print(table)
+    terminal.console.print(table)
     rms = ", ".join(f"{facts.name} {facts.rms_px:.3f} px in {facts.views} views" for facts in summary.cameras)
-    terminal.print(f"{summary.lens}, rms {rms}; {len(summary.outliers)} corners left out")
-    for line in summary.compared:
-        terminal.print(line)
+    terminal.say(f"{summary.lens}, rms {rms}; {len(summary.outliers)} corners left out")
+    for text in summary.compared:
+        terminal.say(text)
     for finding in summary.findings:
-        terminal.print(f"[{'red' if finding.severity != 'remark' else 'yellow'}]{finding.severity}[/]: ", end="")
-        terminal.print(finding.text, markup=False)
+        remark = finding.severity == "remark"
+        style = "yellow" if remark else "red"
+        line = Text.assemble((f"{finding.severity}: ", style), printable(finding.text))
+        (terminal.console if remark else terminal.alarms).print(line)

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 if TYPE_CHECKING:
+    from boxplus.cli.outcome import Outcome
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.evaluation.alignment import AlignmentKind
     from boxplus.recordings.cameras.events import CameraRecording
     from boxplus.recordings.cameras.options import CameraRecordingOptions
@@ -42,29 +44,30 @@ def run_cameras(
     rows: Callable[[SummaryT], Sequence[tuple[str, str]]],
     alignment: Callable[[SummaryT], AlignmentKind],
     *,
+    terminal: RunTerminal,
+    outcome: Outcome,
     overwrite: bool,
     resume: bool,
     ground_truth: Path | None,
     report: bool,
-) -> SummaryT:
+) -> None:
     """Run an odometry with everything a terminal shows.
 
     Args:
         odometry: writes into `folder`, which is claimed while it runs.
         rows: name and value of what is shown of its results.
         alignment: what the odometry leaves open, for the comparison with the ground truth.
+        outcome: of the run, to be filled in.
 
     Raises:
         BoxplusError: bad input, or results that cannot be written.
     """
     from boxplus.cli.ground_truth import compare_with
     from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.recordings.cameras.open import open_camera_recording
     from boxplus.runs.cameras.folder import claim_camera_folder
 
-    terminal = RunTerminal()
     truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
@@ -74,16 +77,18 @@ def run_cameras(
         terminal.print_evidence(opened.info, opened.info.evidence)
         with terminal.progress() as progress:
             summary = odometry(opened, resume=resume, progress=progress, should_stop=should_stop)
-        shown, frames = list(rows(summary)), summary.estimates[0]
+        comparison, shown, frames = None, list(rows(summary)), summary.estimates[0]
         if truth is not None and frames:
-            shown.append(("against --gt", compare_with(truth, folder.trajectory, folder.evaluation, alignment(summary))))
+            comparison = compare_with(truth, folder.trajectory, folder.evaluation, alignment(summary))
+            shown.append(comparison.row)
         if report and frames:
             from boxplus.report import write_report
 
             with terminal.status("drawing the report"):
                 write_report(folder.path)
     terminal.print_results(summary, shown, folder.path, FILES)
-    return summary
+    outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)
+    outcome.compare(comparison)
 
 
 def timing_rows(timing: FrameTiming) -> list[tuple[str, str]]:

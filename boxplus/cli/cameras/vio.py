@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.model_options import takes_options
 from boxplus.cli.options import (
     SETTINGS,
     ConfigOption,
     GroundTruthOption,
+    JsonOption,
     NoReportOption,
     OutputOption,
     OverwriteOption,
+    QuietOption,
     ResumeOption,
 )
 from boxplus.cli.viewing import ViewOption, viewing
@@ -46,6 +47,8 @@ def vio(
     ] = False,
     ground_truth: GroundTruthOption = None,
     view: ViewOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
     resume: ResumeOption = False,
@@ -59,6 +62,8 @@ def vio(
     interrupted (results up to there are complete).
     """
     from boxplus.cli.cameras.camera_run import run_cameras
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.runs.cameras.folder import VioFolder
     from boxplus.runs.settings_file import load_settings
     from boxplus.runs.visual_inertial.config import VioRunConfig
@@ -70,20 +75,25 @@ def vio(
     }
     run_config = load_settings(VioRunConfig, config, settings or (), overrides)
     folder = VioFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
-    with viewing("LiveCameraView", recording.name, view) as shown:
-        summary = run_cameras(
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+    with (
+        reported(recording, folder.path, as_json=as_json) as outcome,
+        viewing("LiveCameraView", recording.name, view) as shown,
+    ):
+        run_cameras(
             recording,
             run_config.recording,
             folder,
             partial(run_visual_odometry, folder=folder, config=run_config, view=shown),
             _rows,
             lambda _: "yaw",  # position and yaw are what an estimator with gravity leaves open
+            terminal=terminal,
+            outcome=outcome,
             overwrite=overwrite,
             resume=resume,
             ground_truth=ground_truth,
             report=not no_report,
         )
-    leave(summary.state, untrusted=summary.contradiction is not None)
 
 
 def _rows(summary: VioSummary) -> list[tuple[str, str]]:

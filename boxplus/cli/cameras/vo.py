@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.model_options import takes_options
 from boxplus.cli.options import (
     SETTINGS,
     ConfigOption,
+    JsonOption,
     NoReportOption,
     OutputOption,
     OverwriteOption,
+    QuietOption,
     ResumeOption,
 )
 from boxplus.recordings.cameras.options import CameraRecordingOptions
@@ -41,6 +42,8 @@ def vo(
     ground_truth: Annotated[
         Path | None, typer.Option("--gt", help="Trajectory of the camera to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
     ] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
     resume: ResumeOption = False,
@@ -54,6 +57,8 @@ def vo(
     interrupted (results up to there are complete).
     """
     from boxplus.cli.cameras.camera_run import run_cameras
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.run_terminal import RunTerminal
     from boxplus.runs.cameras.folder import DirectFolder
     from boxplus.runs.direct.config import DirectRunConfig
     from boxplus.runs.direct.direct_run import run_direct_odometry
@@ -65,19 +70,22 @@ def vo(
     }
     run_config = load_settings(DirectRunConfig, config, settings or (), overrides)
     folder = DirectFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
-    summary = run_cameras(
-        recording,
-        run_config.recording,
-        folder,
-        partial(run_direct_odometry, folder=folder, config=run_config),
-        _rows,
-        lambda summary: "se3" if summary.scale == "metric" else "sim3",
-        overwrite=overwrite,
-        resume=resume,
-        ground_truth=ground_truth,
-        report=not no_report,
-    )
-    leave(summary.state, untrusted=summary.contradiction is not None)
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+    with reported(recording, folder.path, as_json=as_json) as outcome:
+        run_cameras(
+            recording,
+            run_config.recording,
+            folder,
+            partial(run_direct_odometry, folder=folder, config=run_config),
+            _rows,
+            lambda summary: "se3" if summary.scale == "metric" else "sim3",
+            terminal=terminal,
+            outcome=outcome,
+            overwrite=overwrite,
+            resume=resume,
+            ground_truth=ground_truth,
+            report=not no_report,
+        )
 
 
 def _rows(summary: DirectSummary) -> list[tuple[str, str]]:

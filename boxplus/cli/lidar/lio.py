@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -22,17 +23,18 @@ from boxplus.cli.options import (
     ResumeOption,
     SettingsOption,
     ThreadsOption,
-    odometry_overrides,
-    with_default_threads,
+    lidar_settings,
 )
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.errors import InputError
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
+    from boxplus.cli.ground_truth import Comparison
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.lidar_inertial.config import RunConfig
+    from boxplus.runs.lidar_inertial.earlier_run import Standing
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
 
@@ -76,21 +78,24 @@ def lio(
     recordings, one failed or is not to be trusted), 130 interrupted (results up to there are complete).
     """
     from boxplus.cli.lidar.several import run_several, several_recordings
+    from boxplus.cli.outcome import Outcome, reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config
 
-    overrides: dict[str, dict[str, object]] = {
-        "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry_overrides(T_imu_lidar, threads),
-        "map": {"save": False} if no_map else {},
-    }
-    run_config = with_default_threads(load_run_config(config, settings or (), overrides))
-    truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+    kept: dict[str, object] = {"save": False} if no_map else {}
+    run_config = lidar_settings(load_run_config, config, settings, options, T_imu_lidar, threads, map=kept)
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
 
-    def run_one(recording: Path, folder: Path) -> RunSummary:
-        return run(
+    def run_one(
+        recording: Path,
+        folder: Path,
+        outcome: Outcome,
+        should_stop: Callable[[], bool] | None = None,
+        standing: Standing | None = None,
+    ) -> None:
+        truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+        summary, comparison = run(
             recording,
             folder,
             run_config,
@@ -98,20 +103,23 @@ def lio(
             ground_truth=truth,
             overwrite=overwrite,
             resume=resume,
+            standing=standing,
             view=view,
             report=not no_report,
+            should_stop=should_stop,
         )
+        outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)
+        outcome.compare(comparison)
 
     several = several_recordings(recordings)
     if several is not None:
-        if view is not None or truth is not None:
+        if len(several) > 1 and (view is not None or ground_truth is not None):
             raise InputError("one recording with --view or --gt", f"{len(several)}", "run them one by one, or leave it out")
-        raise typer.Exit(run_several(several, output, run_one, terminal, as_json=as_json))
+        raise typer.Exit(run_several(several, output, run_one, terminal, resume=resume, as_json=as_json))
     recording = recordings[0]
-    summary = run_one(recording, output or Path(f"{recording.resolve().stem}_boxplus"))
-    if as_json:
-        typer.echo(summary.model_dump_json(indent=2))
-    leave(summary.state, untrusted=summary.contradiction is not None)
+    folder = output or Path(f"{recording.resolve().stem}_boxplus")
+    with reported(recording, folder, as_json=as_json) as outcome:
+        run_one(recording, folder, outcome)
 
 
 def run(
@@ -123,65 +131,75 @@ def run(
     ground_truth: Trajectory | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    standing: Standing | None = None,
     view: str | None = None,
     report: bool = True,
-) -> RunSummary:
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[RunSummary, Comparison | None]:
     """Run the odometry with everything a terminal shows: evidence, progress, results.
 
+    Args:
+        standing: how far an earlier run came in `folder`, which decides in place of `overwrite` and `resume`.
+        should_stop: None lets Ctrl-C end the run in good order.
+
     Raises:
-        BoxplusError: bad input, or results that cannot be written; after everything else, a ground truth that the trajectory
-            cannot be compared with.
+        BoxplusError: bad input, or results that cannot be written.
     """
     from boxplus.cli.ground_truth import compare_with
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.recordings.info import Evidence
+    from boxplus.runs.lidar_inertial.earlier_run import finished_run
     from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
     from boxplus.runs.lidar_inertial.odometry_run import run_odometry
-    from boxplus.runs.run_folder import claim_run_folder
+    from boxplus.runs.run_folder import RunFolder, claim_run_folder
 
     terminal = terminal or RunTerminal()
-    with (
-        viewing("LiveView", recording.name, view) as shown,
-        stop_on_interrupt(terminal.announce_stop) as should_stop,
-        open_recording(recording, config.recording) as opened,
-        claim_run_folder(folder, overwrite=overwrite, resume=resume) as claimed,
-    ):
+    if standing is not None:
+        resume = standing == "stopped"
+        overwrite = standing == "stopped before its first checkpoint"
+    with ExitStack() as stack:
+        shown = stack.enter_context(viewing("LiveView", recording.name, view))
+        asked = should_stop or stack.enter_context(stop_on_interrupt(terminal.announce_stop))
+        opened = stack.enter_context(open_recording(recording, config.recording))
+        own = RunFolder(folder)
+        if standing != "finished":
+            own = stack.enter_context(claim_run_folder(folder, overwrite=overwrite, resume=resume))
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
             extrinsic = choose_extrinsic(opened, config.odometry)
-        mounting = Evidence(
-            "T_imu_lidar", extrinsic.source, "warning" if extrinsic.warning else "ok", extrinsic.warning or extrinsic.text
-        )
-        found = [entry for entry in opened.info.evidence if entry.key != "T_imu_lidar"]
-        terminal.print_evidence(opened.info, [*found, mounting])
-        with terminal.progress() as progress:
-            summary = run_odometry(
-                opened,
-                claimed,
-                config,
-                extrinsic=extrinsic,
-                resume=resume,
-                progress=progress,
-                view=shown,
-                should_stop=should_stop,
+        if standing == "finished":
+            summary = finished_run(own, opened, config, extrinsic)
+            terminal.say(f"{folder.name}: finished before, and left as it is")
+        else:
+            mounting = Evidence(
+                "T_imu_lidar", extrinsic.source, "warning" if extrinsic.warning else "ok", extrinsic.warning or extrinsic.text
             )
-        if report and summary.scans:
-            from boxplus.report import write_report
+            found = [entry for entry in opened.info.evidence if entry.key != "T_imu_lidar"]
+            terminal.print_evidence(opened.info, [*found, mounting])
+            with terminal.progress() as progress:
+                summary = run_odometry(
+                    opened,
+                    own,
+                    config,
+                    extrinsic=extrinsic,
+                    resume=resume,
+                    progress=progress,
+                    view=shown,
+                    should_stop=asked,
+                )
+            if report and summary.scans:
+                from boxplus.report import write_report
 
-            with terminal.status("drawing the report"):
-                write_report(folder)
-        rows, incomparable = _rows(summary), None
+                with terminal.status("drawing the report"):
+                    write_report(folder)
+        comparison, rows = None, _rows(summary)
         if ground_truth is not None and summary.scans:
-            try:
-                rows.append(("against --gt", compare_with(ground_truth, claimed.trajectory, claimed.evaluation, "se3")))
-            except InputError as error:  # the run is as good as without it
-                incomparable = error
+            comparison = compare_with(ground_truth, own.trajectory, own.evaluation, "se3")
+            rows.append(comparison.row)
     files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "evaluation.json", "run.json")
     terminal.print_results(summary, rows, folder, files)
-    if incomparable is not None:
-        raise incomparable
-    return summary
+    return summary, comparison
 
 
 def _rows(summary: RunSummary) -> list[tuple[str, str]]:

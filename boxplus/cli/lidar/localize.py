@@ -11,14 +11,15 @@ from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
     ConfigOption,
+    JsonOption,
     MountingOption,
     NoReportOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
     SettingsOption,
     ThreadsOption,
-    odometry_overrides,
-    with_default_threads,
+    lidar_settings,
 )
 from boxplus.recordings.options import RecordingOptions
 
@@ -44,6 +45,8 @@ def localize(
     threads: ThreadsOption = None,
     keep_map: Annotated[bool, typer.Option("--keep-map", help="Write the odometry's own map too.")] = False,
     no_report: NoReportOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     overwrite: OverwriteOption = False,
     *,
     options: RecordingOptions,
@@ -55,41 +58,40 @@ def localize(
     """
     from boxplus.runs.localization.config import load_localization_config
 
-    overrides: dict[str, dict[str, object]] = {
-        "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry_overrides(T_imu_lidar, threads),
-        "map": {"save": keep_map},
-    }
-    run_config = with_default_threads(load_localization_config(config, settings or (), overrides))
+    run_config = lidar_settings(load_localization_config, config, settings, options, T_imu_lidar, threads, map={"save": keep_map})
     folder = output or Path(f"{recording.resolve().stem}_localized")
 
-    from boxplus.cli import leave
     from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.localization.folder import claim_localization_folder
     from boxplus.runs.localization.localization_run import run_localization
     from boxplus.runs.saved_map.saved_map import open_saved_map
 
-    terminal = RunTerminal()
-    with (
-        stop_on_interrupt(terminal.announce_stop) as should_stop,
-        open_recording(recording, run_config.recording) as opened,
-        claim_localization_folder(folder, overwrite=overwrite) as claimed,
-    ):
-        with terminal.status("opening the map"):
-            opened_map = open_saved_map(saved, run_config.local_maps)
-        terminal.print_evidence(opened.info, opened.info.evidence)
-        with terminal.progress() as progress:
-            result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
-        if not no_report:
-            from boxplus.report.localization_page import write_localization_report
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+    with reported(recording, folder, as_json=as_json) as outcome:
+        with (
+            stop_on_interrupt(terminal.announce_stop) as should_stop,
+            open_recording(recording, run_config.recording) as opened,
+            claim_localization_folder(folder, overwrite=overwrite) as claimed,
+        ):
+            with terminal.status("opening the map"):
+                opened_map = open_saved_map(saved, run_config.local_maps)
+            terminal.print_evidence(opened.info, opened.info.evidence)
+            with terminal.progress() as progress:
+                result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
+            if not no_report:
+                from boxplus.report.localization_page import write_localization_report
 
-            with terminal.status("drawing the report"):
-                write_localization_report(folder, result)
-    files = ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
-    terminal.print_results(result.odometry, _rows(result), folder, files)
-    leave(result.summary.state, untrusted=result.summary.contradiction is not None or result.summary.found_after_s is None)
+                with terminal.status("drawing the report"):
+                    write_localization_report(folder, result)
+        summary, files = result.summary, ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
+        doubt = summary.contradiction
+        if summary.found_after_s is None:
+            doubt = "; ".join(["no place was found", *summary.best_candidates, *([] if doubt is None else [doubt])])
+        terminal.print_results(result.odometry, _rows(result), folder, files, warnings=summary.warnings, doubt=doubt)
+        outcome.end(summary, summary.state, untrusted=doubt is not None)
 
 
 def _rows(result: LocalizationResult) -> list[tuple[str, str]]:
@@ -99,6 +101,4 @@ def _rows(result: LocalizationResult) -> list[tuple[str, str]]:
     found = "never found" if summary.found_after_s is None else f"found after {summary.found_after_s:.1f} s"
     rows = [("map", f"{summary.map}, {summary.places} places"), ("in the map", f"{found}; scans: {counts}")]
     rows += [("map", text) for text in summary.map_report]
-    rows += [("lost", text) for text in summary.losses]
-    rows += [("warning", text) for text in summary.warnings]
-    return rows + [("candidate", text) for text in summary.best_candidates]
+    return rows + [("lost", text) for text in summary.losses]

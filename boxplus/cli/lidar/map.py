@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import EXIT_UNTRUSTED
 from boxplus.cli.help import Command
 from boxplus.cli.lidar.map_grid import grid, height
+from boxplus.cli.options import RESULTS, ConfigOption, JsonOption, OverwriteOption, QuietOption, SettingsOption
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
+    from boxplus.cli.terminal import Terminal
     from boxplus.runs.sessions.summary import MergeSummary
 
 map_app = typer.Typer(
@@ -86,66 +87,85 @@ map_app.command("height", cls=Command)(height)
 @map_app.command("merge", cls=Command)
 def merge_command(
     runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', in the order of time.", metavar="RUN…")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the joint map.")] = Path("merged"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the joint map.", rich_help_panel=RESULTS)] = Path(
+        "merged"
+    ),
     remove_dynamic: Annotated[
         bool, typer.Option("--remove-dynamic", help="Leave out what was seen through, and report what changed.")
     ] = False,
-    config: Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="One setting, e.g. sessions.least_encounters=5; may be repeated.", metavar="KEY=VALUE"),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier merge there.")] = False,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Join runs whose start poses nobody knows into one map, and say which of them did not meet.
 
     Exit code 3: no two of the runs met, and there is no joint map.
     """
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.terminal import Terminal
     from boxplus.runs.sessions.config import MergeConfig
     from boxplus.runs.sessions.merge_run import merge_runs
     from boxplus.runs.settings_file import load_settings
 
-    chosen = load_settings(MergeConfig, config, settings or ())
-    result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite)
-    _show(result.summary)
-    if not result.summary.joined:
-        typer.echo(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
-        raise typer.Exit(EXIT_UNTRUSTED)
-    typer.echo(f"{_counts(result.summary)} → {output}")
+    terminal = Terminal(quiet=quiet, as_json=as_json)
+    with reported(_given(runs), output, as_json=as_json) as outcome:
+        chosen = load_settings(MergeConfig, config, settings or ())
+        result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite)
+        _show(terminal, result.summary)
+        met = bool(result.summary.joined)
+        if met:
+            terminal.say(f"{_counts(result.summary)} → {output}")
+        else:
+            terminal.doubt(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
+        outcome.end(result.summary, untrusted=not met)
 
 
 @map_app.command("update", cls=Command)
 def update_command(
     merged: Annotated[Path, typer.Argument(help="Output folder of 'boxplus map merge'.", metavar="MAP")],
     runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', later ones.", metavar="RUN…")],
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Go on with a joint map: join further runs with it, in its frame and with its settings.
 
     Exit code 3: none of the runs met the map, which stays as it was.
     """
+    from boxplus.cli.outcome import reported
+    from boxplus.cli.terminal import Terminal
     from boxplus.runs.sessions.update_run import update_map
 
-    result, alignment = update_map(merged, runs)
-    if result is None:
-        for number, session in enumerate(alignment.sessions):
-            if number >= len(alignment.sessions) - len(runs):
-                typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
-        typer.echo(f"none of the runs met the map: {merged} stays as it was")
-        raise typer.Exit(EXIT_UNTRUSTED)
-    _show(result.summary)
-    typer.echo(f"{_counts(result.summary)} → {merged}")
+    terminal = Terminal(quiet=quiet, as_json=as_json)
+    with reported(_given(runs), merged, as_json=as_json) as outcome:
+        result, alignment = update_map(merged, runs)
+        if result is None:
+            for number, session in enumerate(alignment.sessions):
+                if number >= len(alignment.sessions) - len(runs):
+                    terminal.say(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
+            terminal.doubt(f"none of the runs met the map: {merged} stays as it was")
+            outcome.end(None, untrusted=True)
+            return
+        _show(terminal, result.summary)
+        terminal.say(f"{_counts(result.summary)} → {merged}")
+        outcome.end(result.summary)
 
 
-def _show(summary: MergeSummary) -> None:
+def _given(runs: list[Path]) -> str:
+    return " ".join(map(str, runs))
+
+
+def _show(terminal: Terminal, summary: MergeSummary) -> None:
     """Where each session is, or why it is apart."""
     for session in summary.sessions:
         if session.T_world_session is not None and session.sigma is not None:
             x, y, z = session.T_world_session[4:]
-            typer.echo(f"{session.name}: joined, at ({x:.2f}, {y:.2f}, {z:.2f}) m ± {100.0 * max(session.sigma[3:]):.0f} cm")
+            terminal.say(f"{session.name}: joined, at ({x:.2f}, {y:.2f}, {z:.2f}) m ± {100.0 * max(session.sigma[3:]):.0f} cm")
         else:
-            typer.echo(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
+            terminal.say(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
     for text in summary.warnings:
-        typer.echo(f"warning: {text}", err=True)
+        terminal.warn(text)
 
 
 def _counts(summary: MergeSummary) -> str:

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.text import Text
 
-from boxplus.cli import EXIT_INTERRUPTED
-from boxplus.cli.options import NoReportOption
+from boxplus.cli.options import (
+    RESULTS,
+    SETTINGS,
+    ConfigOption,
+    GroundTruthOption,
+    JsonOption,
+    NoMapOption,
+    NoReportOption,
+    OverwriteOption,
+    QuietOption,
+    SettingsOption,
+    ThreadsOption,
+    default_threads,
+)
 
 if TYPE_CHECKING:
+    from boxplus.cli.ground_truth import Comparison
+    from boxplus.cli.terminal import Terminal
+    from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.refinement.refine_run import RefineResult
     from boxplus.runs.refinement.summary import RefineSummary
 
@@ -19,25 +34,22 @@ if TYPE_CHECKING:
 def refine_command(
     run: Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio', or of 'boxplus slam'.", metavar="RUN")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the results; default: RUN_refined beside it.")
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for the results; default: RUN_refined beside it.", rich_help_panel=RESULTS),
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="The recording, if it is not where it was when RUN was made.")
+        Path | None,
+        typer.Option("--recording", help="The recording, if it is not where it was when RUN was made.", rich_help_panel=SETTINGS),
     ] = None,
-    gt: Annotated[Path | None, typer.Option("--gt", help="Ground truth: the errors before and after are reported.")] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with settings, e.g. the config.yaml of a refined run.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="One setting, e.g. refinement.rounds=5; may be repeated.", metavar="KEY=VALUE"),
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads; default 2. The result does not depend on it.")
-    ] = None,
-    no_map: Annotated[bool, typer.Option("--no-map", help="Write no map.")] = False,
+    config: ConfigOption = None,
+    settings: SettingsOption = None,
+    threads: ThreadsOption = None,
+    ground_truth: GroundTruthOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+    no_map: NoMapOption = False,
     no_report: NoReportOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run.")] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Refine a finished run: all its poses, the planes they see and the IMU samples between them, at once.
 
@@ -48,75 +60,88 @@ def refine_command(
     from boxplus.runs.refinement.config import load_refine_config
 
     overrides: dict[str, dict[str, object]] = {
-        "refinement": {"threads": threads if threads is not None else min(2, os.cpu_count() or 1)},
+        "refinement": {} if threads is None else {"threads": threads},
         "map": {"save": False} if no_map else {},
     }
     run_config = load_refine_config(config, settings or (), overrides)
+    if "threads" not in run_config.refinement.model_fields_set:
+        both = {"threads": default_threads()}
+        run_config = run_config.model_copy(update={"refinement": run_config.refinement.model_copy(update=both)})
     folder = output or Path(f"{run.resolve()}_refined")
 
     from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.refinement.folder import claim_refine_folder
     from boxplus.runs.refinement.refine_run import read_odometry_run, refine_run
     from boxplus.runs.run_loop import Progress
 
-    terminal = RunTerminal()
-    truth = read_trajectory(gt) if gt is not None else None
-    odometry = read_odometry_run(run)  # before a folder is made
-    with (
-        stop_on_interrupt(terminal.announce_stop) as should_stop,
-        claim_refine_folder(folder, run, overwrite=overwrite) as claimed,
-    ):
-        with terminal.progress() as progress:
-            result = refine_run(
-                odometry,
-                claimed,
-                run_config,
-                recording=recording,
-                progress=lambda stage, share: progress(Progress(share, odometry.summary.scans, "scans", stage, stage=stage)),
-                should_stop=should_stop,
-            )
-        summary = result.summary
-        if truth is not None and summary.state == "finished":
-            from boxplus.evaluation.evaluation import evaluate
-            from boxplus.formats.trajectory import Trajectory
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+    with reported(run, folder, as_json=as_json) as outcome:
+        truth = None if ground_truth is None else read_trajectory(ground_truth)
+        odometry = read_odometry_run(run)  # before a folder is made
+        with (
+            stop_on_interrupt(terminal.announce_stop) as should_stop,
+            claim_refine_folder(folder, run, overwrite=overwrite) as claimed,
+        ):
+            with terminal.progress() as progress:
+                result = refine_run(
+                    odometry,
+                    claimed,
+                    run_config,
+                    recording=recording,
+                    progress=lambda stage, share: progress(Progress(share, odometry.summary.scans, "scans", stage, stage=stage)),
+                    should_stop=should_stop,
+                )
+            summary, comparison = result.summary, None
+            if truth is not None and summary.state == "finished":
+                summary, comparison = _compared(result, truth)
+                summary.write(claimed.summary)
+            if not no_report and summary.state == "finished":
+                from boxplus.report.refinement_page import write_refinement_report
 
-            errors = []
-            for T in (result.T_before, result.T_after):
-                found = evaluate(Trajectory(result.time_ns, T[:, 4:], T[:, :4]), truth)
-                errors.append(float((found.translation_error_m**2).mean() ** 0.5))
-            summary = summary.model_copy(update={"ate_before_m": errors[0], "ate_after_m": errors[1]})
-            summary.write(claimed.summary)
-        if not no_report and summary.state == "finished":
-            from boxplus.report.refinement_page import write_refinement_report
-
-            with terminal.status("drawing the report"):
-                write_refinement_report(folder, summary, result)
-    _print(summary, result, folder)
-    if summary.state == "interrupted":
-        raise typer.Exit(EXIT_INTERRUPTED)
+                with terminal.status("drawing the report"):
+                    write_refinement_report(folder, summary, result)
+        _print(terminal, summary, comparison, folder)
+        outcome.end(summary, summary.state)
+        outcome.compare(comparison)
 
 
-def _print(summary: RefineSummary, result: RefineResult, folder: Path) -> None:
+def _compared(result: RefineResult, truth: Trajectory) -> tuple[RefineSummary, Comparison]:
+    """Both trajectories with the ground truth; the run is as good where that is not possible."""
+    from boxplus.cli.ground_truth import Comparison
+    from boxplus.errors import InputError
+    from boxplus.evaluation.evaluation import evaluate
+    from boxplus.formats.trajectory import Trajectory
+
+    try:
+        before, after = (
+            evaluate(Trajectory(result.time_ns, T[:, 4:], T[:, :4]), truth, method="interpolate")
+            for T in (result.T_before, result.T_after)
+        )
+    except InputError as error:
+        return result.summary, Comparison("not compared, see the error", error=str(error))
+    errors = {"ate_before_m": before.ate.rmse, "ate_after_m": after.ate.rmse}
+    ratio = after.ate.rmse / before.ate.rmse if before.ate.rmse else float("nan")
+    line = f"ATE {1e3 * before.ate.rmse:.2f} → {1e3 * after.ate.rmse:.2f} mm ({ratio:.2f}) as it was refined"
+    return result.summary.model_copy(update=errors), Comparison(line, after.to_dict())
+
+
+def _print(terminal: Terminal, summary: RefineSummary, comparison: Comparison | None, folder: Path) -> None:
     """The facts, the warnings and the files."""
-    typer.secho(summary.verdict(), fg="green" if summary.accepted else "yellow")
+    good = summary.accepted and summary.state == "finished"
+    (terminal.console if good else terminal.alarms).print(Text(summary.verdict(), "green" if good else "yellow"))
+    rows = []
     if summary.state == "finished":
         rows = [
             ("scans", f"{summary.scans}, in {summary.keyframes} keyframes, on {summary.planes} planes"),
             ("moved", f"{1e3 * summary.largest_shift_m:.1f} mm and {summary.largest_turn_deg:.3f} deg at most"),
             ("mounting", summary.extrinsic),
+            *([] if comparison is None else [comparison.row]),
+            ("time", ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())),
         ]
-        if summary.ate_before_m is not None and summary.ate_after_m is not None:
-            ratio = summary.ate_after_m / summary.ate_before_m if summary.ate_before_m else float("nan")
-            rows.append(
-                ("ATE", f"{1e3 * summary.ate_before_m:.2f} → {1e3 * summary.ate_after_m:.2f} mm ({ratio:.2f}) as it was refined")
-            )
-        rows.append(("time", ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())))
-        for name, text in rows:
-            typer.echo(f"{name:10s}{text}")
+    terminal.print_rows(rows)
     for warning in summary.warnings:
-        typer.secho(f"warning: {warning}", fg="yellow")
-    for name in ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"):
-        if (folder / name).exists():
-            typer.echo(f"  {folder / name}")
+        terminal.warn(warning)
+    terminal.print_files(folder, ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"))

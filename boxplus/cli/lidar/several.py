@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import typer
+from typing import TYPE_CHECKING, cast
 
 from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
+from boxplus.cli.interrupt import stop_on_interrupt
+from boxplus.cli.outcome import Outcome
 from boxplus.errors import BoxplusError, InputError
 
 if TYPE_CHECKING:
     from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.runs.lidar_inertial.earlier_run import Standing
     from boxplus.runs.lidar_inertial.summary import RunSummary
+
+    RunOne = Callable[[Path, Path, Outcome, Callable[[], bool], Standing | None], None]
 
 _HEADINGS = ("recording", "came out", "scans", "weak or lost", "path length", "duration", "× real time", "folder")
 
@@ -39,9 +43,10 @@ def several_recordings(given: Sequence[Path]) -> dict[str, Path] | None:
 def run_several(
     recordings: dict[str, Path],
     output: Path | None,
-    run_one: Callable[[Path, Path], RunSummary],
+    run_one: RunOne,
     terminal: RunTerminal,
     *,
+    resume: bool,
     as_json: bool,
 ) -> int:
     """Run them and print the table; returns the exit code.
@@ -49,47 +54,70 @@ def run_several(
     Args:
         recordings: by name.
         output: each gets a folder with its name in it; None for NAME_boxplus here.
-        run_one: runs a recording into a folder.
-        as_json: print a list with the name, folder, `run.json` and error of each, too.
+        run_one: runs a recording into a folder and says what became of it; it asks whether to stop, and is told how far the run
+            had come where it is to go on.
+        resume: go on with those that were stopped, leave those that are finished, and begin the others.
+        as_json: print a line for each as it ends, and for those that were not begun.
     """
-    rows: list[tuple[str, ...]] = []
-    results: list[dict[str, object]] = []
-    failures: dict[str, str] = {}
-    interrupted = doubted = False
-    for name, recording in recordings.items():
-        folder = Path(f"{name}_boxplus") if output is None else output / name
-        if interrupted:
-            rows.append((name, "not begun", *[""] * 6))
-            continue
-        result: dict[str, object] = {"recording": str(recording), "folder": str(folder), "run": None, "error": None}
-        results.append(result)
-        try:
-            summary = run_one(recording, folder)
-        except BoxplusError as error:
-            failures[name] = result["error"] = str(error)
-            rows.append((name, "failed", *[""] * 6))
-            continue
-        result["run"] = summary.model_dump(mode="json")
-        interrupted = summary.state == "interrupted"
-        doubted = doubted or summary.contradiction is not None
-        rows.append((name, *_row(summary), str(folder)))
-    terminal.print_table(_HEADINGS, rows)
-    for name, text in failures.items():
-        terminal.print_failure(name, text)
-    if as_json:
-        typer.echo(json.dumps(results, indent=2))
-    if interrupted:
+    outcomes: dict[str, Outcome] = {}
+    with stop_on_interrupt(terminal.announce_stop) as should_stop:
+        for name, recording in recordings.items():
+            folder = Path(f"{name}_boxplus") if output is None else output / name
+            outcome = outcomes[name] = Outcome(input=str(recording), output=str(folder))
+            if not should_stop():
+                _run(recording, folder, run_one, outcome, should_stop, resume=resume)
+            if as_json:
+                outcome.print_json()
+        stopped = should_stop()
+    terminal.print_table(_HEADINGS, [(name, *_row(outcome)) for name, outcome in outcomes.items()])
+    for name, outcome in outcomes.items():
+        if outcome.error is not None:
+            terminal.print_failure(name, outcome.error)
+    if stopped:
         return EXIT_INTERRUPTED
-    return EXIT_UNTRUSTED if failures or doubted else 0
+    return EXIT_UNTRUSTED if any(outcome.exit_code for outcome in outcomes.values()) else 0
 
 
-def _row(summary: RunSummary) -> tuple[str, ...]:
+def _run(
+    recording: Path,
+    folder: Path,
+    run_one: RunOne,
+    outcome: Outcome,
+    should_stop: Callable[[], bool],
+    *,
+    resume: bool,
+) -> None:
+    """One of them, whatever becomes of it."""
+    from boxplus.runs.lidar_inertial.earlier_run import standing
+    from boxplus.runs.run_folder import RunFolder
+
+    log = folder.with_name(f"{folder.name}.traceback.txt")
+    try:
+        log.unlink(missing_ok=True)  # of an earlier run
+        run_one(recording, folder, outcome, should_stop, standing(RunFolder(folder)) if resume else None)
+    except (BoxplusError, KeyboardInterrupt) as error:
+        outcome.stop(error)
+    except Exception as error:  # noqa: BLE001 - nobody foresaw it: the others have nothing to do with it
+        outcome.stop(error)
+        where = "its traceback could not be written"
+        with suppress(OSError):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            log.write_text(traceback.format_exc(), encoding="utf-8")
+            where = f"{log} says where"
+        outcome.error = f"{outcome.error} (an error of boxplus: {where})"
+
+
+def _row(outcome: Outcome) -> tuple[str, ...]:
+    if outcome.run is None:
+        return outcome.outcome, *[""] * 6
+    summary = cast("RunSummary", outcome.run)
     bad = sum(count for status, count in summary.status.items() if status != "ok")
     return (
-        "not to be trusted" if summary.contradiction is not None else summary.state,
+        outcome.outcome,
         str(summary.scans),
         str(bad),
         f"{summary.path_length_m:.1f} {summary.length_unit}",
         f"{summary.duration_s:.1f} s",
         f"{summary.timing.real_time_factor:.1f}",
+        str(outcome.output),
     )

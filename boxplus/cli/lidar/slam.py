@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
     ConfigOption,
+    JsonOption,
     MountingOption,
     NoMapOption,
     NoReportOption,
     OverwriteOption,
+    QuietOption,
     RecordingArgument,
     ResumeOption,
     SettingsOption,
     ThreadsOption,
-    odometry_overrides,
-    with_default_threads,
+    lidar_settings,
 )
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
@@ -53,6 +53,8 @@ def slam(
     no_map: NoMapOption = False,
     no_report: NoReportOption = False,
     view: ViewOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
     overwrite: OverwriteOption = False,
     resume: ResumeOption = False,
     *,
@@ -71,50 +73,50 @@ def slam(
     gnss: dict[str, object] = {"utm": True} if utm else {}
     if gnss_lever_arm is not None:
         gnss["lever_arm"] = antenna_offset(gnss_lever_arm).tolist()
-    overrides: dict[str, dict[str, object]] = {
-        "recording": options.model_dump(exclude_defaults=True),
-        "odometry": odometry_overrides(T_imu_lidar, threads),
-        "gnss": gnss,
-        "map": {"save": False} if no_map else {},
-    }
-    run_config = with_default_threads(load_slam_config(config, settings or (), overrides))
+    kept: dict[str, object] = {"save": False} if no_map else {}
+    run_config = lidar_settings(load_slam_config, config, settings, options, T_imu_lidar, threads, gnss=gnss, map=kept)
     forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
     folder = output or Path(f"{recording.resolve().stem}_slam")
 
     from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
 
-    terminal = RunTerminal()
-    with (
-        viewing("LiveView", recording.name, view) as shown,
-        stop_on_interrupt(terminal.announce_stop) as should_stop,
-        open_recording(recording, run_config.recording) as opened,
-        claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
-    ):
-        terminal.print_evidence(opened.info, opened.info.evidence)
-        with terminal.progress() as progress:
-            result = run_slam(
-                opened,
-                claimed,
-                run_config,
-                forbidden=forbidden,
-                forced=forced,
-                resume=resume,
-                progress=progress,
-                view=shown,
-                loop_view=shown,
-                should_stop=should_stop,
-            )
-        if not no_report:
-            from boxplus.report import write_report
+    terminal = RunTerminal(quiet=quiet, as_json=as_json)
+    with reported(recording, folder, as_json=as_json) as outcome:
+        with (
+            viewing("LiveView", recording.name, view) as shown,
+            stop_on_interrupt(terminal.announce_stop) as should_stop,
+            open_recording(recording, run_config.recording) as opened,
+            claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
+        ):
+            terminal.print_evidence(opened.info, opened.info.evidence)
+            with terminal.progress() as progress:
+                result = run_slam(
+                    opened,
+                    claimed,
+                    run_config,
+                    forbidden=forbidden,
+                    forced=forced,
+                    resume=resume,
+                    progress=progress,
+                    view=shown,
+                    loop_view=shown,
+                    should_stop=should_stop,
+                )
+            if not no_report:
+                from boxplus.report import write_report
 
-            with terminal.status("drawing the report"):
-                write_report(result)
-    terminal.print_results(result.odometry, _rows(result), folder, ("report.html", "trajectory.tum", "loops.csv", "map.ply"))
-    leave(result.summary.state, untrusted=result.summary.contradiction is not None)
+                with terminal.status("drawing the report"):
+                    write_report(result)
+        summary, files = result.summary, ("report.html", "trajectory.tum", "loops.csv", "map.ply")
+        terminal.print_results(
+            result.odometry, _rows(result), folder, files, warnings=summary.warnings, doubt=summary.contradiction
+        )
+        outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)
 
 
 def _rows(result: SlamResult) -> list[tuple[str, str]]:
@@ -131,9 +133,7 @@ def _rows(result: SlamResult) -> list[tuple[str, str]]:
     ]
     if summary.gnss is not None:
         rows.insert(2, ("on the Earth", _earth(summary.gnss)))
-    if summary.contradiction is not None:
-        rows.append(("not to be trusted", summary.contradiction))
-    return rows + [("warning", text) for text in summary.warnings]
+    return rows
 
 
 def _earth(facts: GnssFacts) -> str:

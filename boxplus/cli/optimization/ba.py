@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -49,7 +49,6 @@ _POINT_FORMATS: dict[FormatChoice, ReconstructionFormat] = {
 
 
 def ba(
-    ctx: typer.Context,
     file: Annotated[
         Path, typer.Argument(help="BAL file (plain or .bz2), the folder of a COLMAP model or of a line set (*.P, *.lines).")
     ],
@@ -93,6 +92,7 @@ def ba(
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
     from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+    from boxplus.cli.outcome import reported
     from boxplus.errors import InputError
     from boxplus.formats.reconstructions.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
     from boxplus.report.optimization.bundle_scene import camera_centers
@@ -114,7 +114,11 @@ def ba(
             line_config = line_config.model_copy(update={"sigma_px": sigma, "sigma_point_px": sigma})
         solver = solver_options(line_config.solver, method, linear_solver, max_iterations, time_limit, threads)
         line_config = line_config.model_copy(update={"solver": solver})
-        adjust_line_set(ctx, terminal, file, output, line_config, robust, method, no_report=no_report, overwrite=overwrite)
+        folder = output or Path(f"{file.resolve().name}_boxplus")
+        with reported(file, folder, as_json=as_json) as outcome:
+            adjust_line_set(
+                outcome, terminal, file, folder, line_config, robust, method, no_report=no_report, overwrite=overwrite
+            )
         return
     if triangulate or not points:
         raise InputError("--triangulate and --no-points with a line set", f"{file}", "leave them out")
@@ -128,33 +132,31 @@ def ba(
             ),
         }
     )
-    with terminal.console.status("reading"):
-        start = read_reconstruction(file, _POINT_FORMATS[format])
     folder = output or Path(f"{file.resolve().name.removesuffix('.bz2').removesuffix('.txt')}_boxplus")
-    files, folders = _own_files(folder)
-    held = output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite)
-    ctx.with_resource(held)  # to the end of the command
-    name = reconstruction_file_name(start, file, "adjusted")
-    terminal.facts(file.name, {"input": _describe(start), "loss": "none" if robust is None else repr(robust)})
-    shown = ctx.with_resource(viewing("ProblemView", file.name, view))
-    if shown is not None:
-        shown.show_scene(False, start.points, camera_centers(start))
-    with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
-        result = adjust_bundle(start, config, loss=robust, callback=show)
-        stopped = should_stop()
-    if shown is not None:
-        shown.show_scene(True, result.reconstruction.points, camera_centers(result.reconstruction))
-    summary = _summary(file, name, started, start, result, config, robust, stopped)
-    write_reconstruction(folder / name, result.reconstruction)
-    _write_scene(folder / "scene.ply", result.reconstruction)
-    if not no_report:
-        from boxplus.report.optimization.bundle_report import write_bundle_report
+    with reported(file, folder, as_json=as_json) as outcome, ExitStack() as stack:
+        with terminal.status("reading"):
+            start = read_reconstruction(file, _POINT_FORMATS[format])
+        files, folders = _own_files(folder)
+        stack.enter_context(output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite))
+        name = reconstruction_file_name(start, file, "adjusted")
+        terminal.facts(file.name, _describe(start), robust)
+        shown = stack.enter_context(viewing("ProblemView", file.name, view))
+        if shown is not None:
+            shown.show_scene(False, start.points, camera_centers(start))
+        with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
+            result = adjust_bundle(start, config, loss=robust, callback=show)
+            stopped = should_stop()
+        if shown is not None:
+            shown.show_scene(True, result.reconstruction.points, camera_centers(result.reconstruction))
+        summary = _summary(file, name, started, start, result, config, robust, stopped)
+        write_reconstruction(folder / name, result.reconstruction)
+        _write_scene(folder / "scene.ply", result.reconstruction)
+        if not no_report:
+            from boxplus.report.optimization.bundle_report import write_bundle_report
 
-        with terminal.console.status("drawing the report"):
-            write_bundle_report(folder, summary, start, result)
-    summary.write(folder / "run.json")
-    terminal.results(summary, "px", folder, ["report.html", name, "scene.ply", "run.json"])
-    leave(summary.state, untrusted=summary.doubt is not None)
+            with terminal.status("drawing the report"):
+                write_bundle_report(folder, summary, start, result)
+        terminal.conclude(summary, "px", folder, ["report.html", name, "scene.ply"], outcome)
 
 
 def _own_files(folder: Path) -> tuple[list[Path], list[Path]]:

@@ -6,12 +6,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
-from boxplus.cli import leave
-
 if TYPE_CHECKING:
     from boxplus.cli.optimization.terminal import MethodChoice, OptimizationTerminal
+    from boxplus.cli.outcome import Outcome
     from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
@@ -26,10 +23,10 @@ def is_line_set(file: Path) -> bool:
 
 
 def adjust_line_set(
-    ctx: typer.Context,
+    outcome: Outcome,
     terminal: OptimizationTerminal,
     file: Path,
-    output: Path | None,
+    folder: Path,
     config: LineAdjustmentConfig,
     robust: Loss | None,
     method: MethodChoice,
@@ -37,7 +34,7 @@ def adjust_line_set(
     no_report: bool,
     overwrite: bool,
 ) -> None:
-    """Read, adjust, write and report; exit codes as those of the command."""
+    """Read, adjust, write into `folder` and report, with what became of it in `outcome`."""
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
     from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
@@ -46,27 +43,22 @@ def adjust_line_set(
 
     started = datetime.now(UTC)
     start = read_vgg_lines(file)
-    folder = output or Path(f"{file.resolve().name}_boxplus")
     files, folders = _own_files(folder, start)
-    held = output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite)
-    ctx.with_resource(held)  # to the end of the command
-    sizes = _sizes(start)
-    described = "line set; " + ", ".join(f"{count:,} {name}" for name, count in sizes.items())
-    terminal.facts(file.name, {"input": described, "loss": "none" if robust is None else repr(robust)})
-    with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
-        result = adjust_lines(start, config, loss=robust, callback=show)
-        stopped = should_stop()
-    summary = _summary(file, started, sizes, result, config, robust, stopped)
-    write_vgg_lines(folder / _ADJUSTED, result.data)
-    _write_scene(folder / "scene.ply", result)
-    if not no_report:
-        from boxplus.report.optimization.line_report import write_line_report
+    with output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite):
+        sizes = _sizes(start)
+        terminal.facts(file.name, "line set; " + ", ".join(f"{count:,} {name}" for name, count in sizes.items()), robust)
+        with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
+            result = adjust_lines(start, config, loss=robust, callback=show)
+            stopped = should_stop()
+        summary = _summary(file, started, sizes, result, config, robust, stopped)
+        write_vgg_lines(folder / _ADJUSTED, result.data)
+        _write_scene(folder / "scene.ply", result)
+        if not no_report:
+            from boxplus.report.optimization.line_report import write_line_report
 
-        with terminal.console.status("drawing the report"):
-            write_line_report(folder, summary, start, result)
-    summary.write(folder / "run.json")
-    terminal.results(summary, "px", folder, ["report.html", _ADJUSTED, "scene.ply", "run.json"])
-    leave(summary.state, untrusted=summary.doubt is not None)
+            with terminal.status("drawing the report"):
+                write_line_report(folder, summary, start, result)
+        terminal.conclude(summary, "px", folder, ["report.html", _ADJUSTED, "scene.ply"], outcome)
 
 
 def _sizes(data: VggLines) -> dict[str, int]:

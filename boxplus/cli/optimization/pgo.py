@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli import leave
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -71,7 +71,6 @@ class CrossBlockChoice(StrEnum):
 
 
 def pgo(
-    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
     output: OutputOption = None,
     start: Annotated[
@@ -121,6 +120,7 @@ def pgo(
     """
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+    from boxplus.cli.outcome import reported
     from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
     from boxplus.runs.storage.output_folder import output_folder
     from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
@@ -139,44 +139,44 @@ def pgo(
             "solver": solver_options(config.solver, method, linear_solver, max_iterations, time_limit, threads),
         }
     )
-    with terminal.console.status("reading"):
-        if file.is_dir():
-            raise InputError("a pose graph file, g2o or TORO", f"the folder {file}", "give a file in it")
-        kind = graph_format(file)
-        graph = read_pose_graph(
-            file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
-        )
     folder = output or Path(f"{file.resolve().stem}_boxplus")
-    files, folders = _own_files(folder)
-    held = output_folder(folder, "boxplus pgo", lambda: files, lambda: folders, overwrite=overwrite)
-    ctx.with_resource(held)  # to the end of the command
-    name = "optimized.g2o" if kind == "g2o" else "optimized.graph"
-    described = f"{'g2o' if kind == 'g2o' else 'TORO'}, {graph.dimension}D; {len(graph.ids):,} poses, {len(graph.edges):,} edges"
-    terminal.facts(file.name, {"input": described, "loss": "none" if robust is None else repr(robust)})
-    for warning in graph.warnings:
-        terminal.warn(warning)
-    shown = ctx.with_resource(viewing("ProblemView", file.name, view))
-    if shown is not None and graph.poses is not None:
-        shown.show_graph(False, positions(graph, graph.poses), graph.edges)
-    with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
-        result = optimize_pose_graph(graph, config, loss=robust, callback=show)
-        stopped = should_stop()
-    if shown is not None and result.graph.poses is not None:
-        shown.show_graph(True, positions(graph, result.graph.poses), graph.edges)
-    reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
-    summary = _summary(file, name, started, graph, result, config, robust, reading, stopped)
-    write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
-    _write_graph_ply(folder / "graph.ply", result.graph)
-    if not no_report:
-        from boxplus.report.optimization.graph_report import write_graph_report
+    with reported(file, folder, as_json=as_json) as outcome, ExitStack() as stack:
+        with terminal.status("reading"):
+            if file.is_dir():
+                raise InputError("a pose graph file, g2o or TORO", f"the folder {file}", "give a file in it")
+            kind = graph_format(file)
+            graph = read_pose_graph(
+                file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
+            )
+        files, folders = _own_files(folder)
+        stack.enter_context(output_folder(folder, "boxplus pgo", lambda: files, lambda: folders, overwrite=overwrite))
+        name = "optimized.g2o" if kind == "g2o" else "optimized.graph"
+        described = (
+            f"{'g2o' if kind == 'g2o' else 'TORO'}, {graph.dimension}D; {len(graph.ids):,} poses, {len(graph.edges):,} edges"
+        )
+        terminal.facts(file.name, described, robust)
+        for warning in graph.warnings:
+            terminal.warn(warning)
+        shown = stack.enter_context(viewing("ProblemView", file.name, view))
+        if shown is not None and graph.poses is not None:
+            shown.show_graph(False, positions(graph, graph.poses), graph.edges)
+        with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:
+            result = optimize_pose_graph(graph, config, loss=robust, callback=show)
+            stopped = should_stop()
+        if shown is not None and result.graph.poses is not None:
+            shown.show_graph(True, positions(graph, result.graph.poses), graph.edges)
+        reading = {"rotation_error": rotation_error.value, "cross_block": cross_block.value} if graph.dimension == 3 else {}
+        summary = _summary(file, name, started, graph, result, config, robust, reading, stopped)
+        write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
+        _write_graph_ply(folder / "graph.ply", result.graph)
+        if not no_report:
+            from boxplus.report.optimization.graph_report import write_graph_report
 
-        with terminal.console.status("drawing the report"):
-            write_graph_report(folder, summary, graph, result)
-    if result.loops is not None or robust is not None:
-        _write_edges(folder / "edges.csv", graph, result)
-    summary.write(folder / "run.json")
-    terminal.results(summary, "σ", folder, ["report.html", name, "graph.ply", "edges.csv", "run.json"])
-    leave(summary.state, untrusted=summary.doubt is not None)
+            with terminal.status("drawing the report"):
+                write_graph_report(folder, summary, graph, result)
+        if result.loops is not None or robust is not None:
+            _write_edges(folder / "edges.csv", graph, result)
+        terminal.conclude(summary, "σ", folder, ["report.html", name, "graph.ply", "edges.csv"], outcome)
 
 
 def _check_choices(objective: ObjectiveChoice, robust: RobustChoice, loss: str | None, *, certify: bool) -> None:
@@ -238,17 +238,12 @@ def _summary(
         config,
         loss,
         stopped,
+        reading,
         program="boxplus pgo",
         started=started,
         input=str(file),
         output=output,
         sizes={"poses": len(graph.ids), "edges": len(graph.edges), "held": len(result.held)},
-        settings={
-            **config.model_dump(exclude={"solver"}),
-            **config.solver.model_dump(),
-            **reading,
-            "loss": repr(loss) if loss else "none",
-        },
         convention=_convention(graph, config, loss, reading),
         start=result.start_reason,
         chi2_initial=float((result.errors_before**2).sum()),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -16,11 +16,12 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from boxplus.cli.console import make_console
-from boxplus.cli.options import RESULTS
+from boxplus.cli.options import RESULTS, default_threads
+from boxplus.cli.terminal import Terminal
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
+    from boxplus.cli.outcome import Outcome
     from boxplus.optimization.losses import Loss
     from boxplus.optimization.solution import Iteration, Solution
     from boxplus.optimization.solver_options import SolverOptions
@@ -107,7 +108,7 @@ def solver_options(
     given = {
         "method": method.value,
         "linear_solver": linear_solver.value,
-        "threads": threads if threads is not None else min(2, os.cpu_count() or 1),
+        "threads": threads if threads is not None else default_threads(),
         "max_iterations": max_iterations,
         "time_limit_s": time_limit_s,
     }
@@ -122,18 +123,26 @@ def versions() -> dict[str, str]:
     return {"boxplus": boxplus.__version__, "python": platform.python_version(), **libraries}
 
 
-def summary_of(solution: Solution, config: Any, loss: Loss | None, stopped: bool, **own: Any) -> OptimizationSummary:
+def summary_of(
+    solution: Solution,
+    config: Any,
+    loss: Loss | None,
+    stopped: bool,
+    reading: Mapping[str, object] = MappingProxyType({}),
+    **own: Any,
+) -> OptimizationSummary:
     """The summary of a run: what a solution and its settings say, and what is the command's own.
 
     Args:
         config: a model of settings with those of the solver in `solver`.
         stopped: by the user.
+        reading: settings of how the file was read.
         own: the other fields; they win.
     """
     from boxplus.runs.optimization_summary import OptimizationSummary, iteration_facts
 
     state, reason = state_and_reason(solution, stopped)
-    settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump()}
+    settings = {**config.model_dump(exclude={"solver"}), **config.solver.model_dump(), **reading}
     facts = {
         "versions": versions(),
         "state": state,
@@ -151,33 +160,19 @@ def summary_of(solution: Solution, config: Any, loss: Loss | None, stopped: bool
     return OptimizationSummary(**{**facts, **own})
 
 
-class OptimizationTerminal:
-    """Prints on the standard output, the same on a terminal and in a pipe but for the colours and the wrapping.
+class OptimizationTerminal(Terminal):
+    """Prints the same on a terminal and in a pipe but for the colours and the wrapping."""
 
-    Args:
-        quiet: print warnings, and what is not to be trusted or did not converge, alone, and on the standard error.
-        as_json: leave the standard output to a summary as JSON, and print on the standard error.
-    """
+    stopping = "stopping after this step"
 
     def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
-        self.console = make_console(stderr=as_json, quiet=quiet)
-        self._alarms = make_console(stderr=True) if quiet else self.console
-        self._as_json = as_json
+        super().__init__(quiet=quiet, as_json=as_json)
         self._last: float | None = None
 
-    def facts(self, title: str, rows: Mapping[str, str]) -> None:
-        """A bold title, and rows of a name and what it is."""
+    def facts(self, title: str, described: str, loss: Loss | None) -> None:
+        """The name of the file in bold, what is in it, and the loss."""
         self.console.print(Text(title, "bold"), soft_wrap=True)
-        table = Table(box=None, show_header=False, pad_edge=False)
-        table.add_column(style="bold")
-        table.add_column(overflow="fold")
-        for name, text in rows.items():
-            table.add_row(name, Text(text))
-        self.console.print(table)
-
-    def warn(self, text: str) -> None:
-        """A warning."""
-        self._alarms.print(Text.assemble(("warning: ", "yellow"), text), soft_wrap=True)
+        self.print_rows([("input", described), ("loss", "none" if loss is None else repr(loss))])
 
     @contextmanager
     def steps(self, method: MethodChoice, should_stop: Callable[[], bool]) -> Iterator[Callable[[Iteration], bool]]:
@@ -217,15 +212,18 @@ class OptimizationTerminal:
         line = " ".join(cell.rjust(width) for cell, width in zip(cells, _WIDTHS, strict=True))
         self.console.print(Text(line, style), soft_wrap=True)
 
-    def announce_stop(self) -> None:
-        """Say that Ctrl-C was heard."""
-        self.console.print("interrupted: stopping after this step; Ctrl-C again stops at once")
+    def conclude(self, summary: OptimizationSummary, unit: str, folder: Path, files: list[str], outcome: Outcome) -> None:
+        """Write `run.json`, and say why it stopped, errors before and after, notes and files.
 
-    def results(self, summary: OptimizationSummary, unit: str, folder: Path, files: list[str]) -> None:
-        """Why it stopped, errors before and after, notes and files; all of it once more where JSON is asked for."""
+        Args:
+            unit: of the errors.
+            folder: of the results. files: in it, those that may be there.
+            outcome: to be filled in.
+        """
+        summary.write(folder / "run.json")
         good = summary.status == "converged" and summary.state == "finished" and summary.doubt is None
         ended = Text(f"{summary.status}: {summary.reason}", "green" if good else "yellow")
-        (self.console if good else self._alarms).print(ended, soft_wrap=True)
+        (self.console if good else self.alarms).print(ended, soft_wrap=True)
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for heading in (f"error [{unit}]", "rms", "median", "99th perc.", "largest", "not valid"):
             table.add_column(Text(heading), justify="left" if heading.startswith("error") else "right")
@@ -243,21 +241,13 @@ class OptimizationTerminal:
             "summed": summary.convention,
         }
         rows |= {name: text for name, text in (("loop closures", summary.loops), ("optimality", summary.certificate)) if text}
-        table = Table(box=None, show_header=False, pad_edge=False)
-        table.add_column(style="bold", no_wrap=True)
-        table.add_column(overflow="fold")
-        for name, text in rows.items():
-            table.add_row(name, Text(text))
-        self.console.print(table)
+        self.print_rows(rows.items())
         for note in summary.notes:
             self.warn(note)
         if summary.doubt is not None:
-            self._alarms.print(Text.assemble(("not to be trusted: ", "bold red"), summary.doubt), soft_wrap=True)
-        for name in files:
-            if (folder / name).exists():
-                self.console.print(f"  {folder / name}", soft_wrap=True, markup=False)
-        if self._as_json:
-            typer.echo(summary.model_dump_json(indent=2))
+            self.doubt(summary.doubt)
+        self.print_files(folder, [*files, "run.json"])
+        outcome.end(summary, summary.state, untrusted=summary.doubt is not None)
 
 
 def state_and_reason(solution: Solution, stopped: bool) -> tuple[Literal["finished", "interrupted"], str]:

@@ -35,7 +35,8 @@ def test_json_is_all_of_the_standard_output_and_the_ground_truth_is_compared_wit
     out = tmp_path / "out"
     result = call("lio", folder / "monday.bag", "-o", out, *FAST, "--json", "--gt", folder / "monday.gt.tum")
     assert result.exit_code == 0, result.stderr
-    assert json.loads(result.stdout) == json.loads((out / "run.json").read_text())
+    (line,) = result.stdout.splitlines()
+    assert json.loads(line)["run"] == json.loads((out / "run.json").read_text())
     assert "finished: 39 scans" in result.stderr and "against --gt" in result.stderr
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["ate_translation_m"]["rmse"] < 0.1
@@ -59,7 +60,7 @@ def test_a_ground_truth_of_another_day_does_not_cost_the_run(folder: Path, tmp_p
 def test_of_a_folder_the_failed_one_is_listed_and_the_other_unharmed(folder: Path, tmp_path: Path) -> None:
     result = call("lio", folder, "-o", tmp_path / "runs", *FAST, "--json")
     assert result.exit_code == 3
-    found = {Path(entry["recording"]).name: entry for entry in json.loads(result.stdout)}
+    found = {Path(entry["input"]).name: entry for entry in map(json.loads, result.stdout.splitlines())}
     assert set(found) == {"monday.bag", "tuesday.bag"}
     assert found["monday.bag"]["error"] is None and found["monday.bag"]["run"]["scans"] == 39
     assert found["tuesday.bag"]["run"] is None and "expected" in found["tuesday.bag"]["error"]

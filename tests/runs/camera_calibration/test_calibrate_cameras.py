@@ -84,15 +84,19 @@ def test_a_rig_with_an_imu_is_calibrated_written_read_back_and_reported(tmp_path
 
 
 def test_frontal_views_end_with_exit_code_1_and_no_camchain(tmp_path: Path) -> None:
-    done = call(*write(tmp_path, session(RADTAN, tilt_deg=0.0, frames=10)), "-o", tmp_path / "out", "--lens", "pinhole-radtan")
-    assert done.exit_code == 1 and "do not determine the focal length" in " ".join(done.output.split())
+    done = call(
+        *write(tmp_path, session(RADTAN, tilt_deg=0.0, frames=10)), "-o", tmp_path / "out", "--lens", "pinhole-radtan", "--quiet"
+    )
+    assert done.exit_code == 1 and "do not determine the focal length" in " ".join(done.stderr.split())
+    assert done.stdout == "" and "error: the views do not determine a lens: no camchain.yaml" in done.stderr
     assert not (tmp_path / "out" / "camchain.yaml").exists() and (tmp_path / "out" / "report.html").exists()
 
 
 def test_a_doubtful_rig_ends_with_exit_code_3_and_lenses_without_mounting(tmp_path: Path) -> None:
     seen = session(RADTAN, RADTAN, late_s=(0.0, 0.02), frames=10)
-    done = call(*write(tmp_path, seen), "-o", tmp_path / "out", "--lens", "pinhole-radtan", "--no-report")
-    assert done.exit_code == 3
+    done = call(*write(tmp_path, seen), "-o", tmp_path / "out", "--lens", "pinhole-radtan", "--no-report", "--json")
+    assert done.exit_code == 3 and json.loads(done.stdout)["outcome"] == "not to be trusted"
+    assert json.loads(done.stdout)["run"] == json.loads((tmp_path / "out" / "run.json").read_text())
     text = (tmp_path / "out" / "camchain.yaml").read_text()
     assert "# NOT TO BE TRUSTED: the cameras together" in text and "T_cn_cnm1" not in text
 

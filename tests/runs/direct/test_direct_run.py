@@ -98,8 +98,8 @@ def test_a_run_writes_what_it_found(recorded: Path, tmp_path: Path) -> None:
         assert shown in page
     assert {path.name for path in (out / "plots").iterdir()} == {"trajectory.png", "residuals.png"}
     assert "12 ok" in text and "SE(3) alignment" in " ".join(text.split())
-    code, text = run(str(recorded), "-o", str(out))
-    assert code == 2 and "--overwrite" in text
+    again = CliRunner().invoke(app, ["vo", str(recorded), "-o", str(out), "--json"])
+    assert again.exit_code == 2 and "--overwrite" in again.stderr and json.loads(again.stdout)["exit_code"] == 2
     assert CliRunner().invoke(app, ["report", str(out)]).exit_code == 0
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.formats.clouds.ply import read_ply, write_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
@@ -21,11 +23,13 @@ from boxplus.runs.localization.config import LocalizationRunConfig, load_localiz
 from boxplus.runs.localization.folder import LocalizationFolder, claim_localization_folder
 from boxplus.runs.localization.localization_run import LocalizationResult, run_localization
 from boxplus.runs.localization.logs import LOG_COLUMNS, SEARCH_COLUMNS
+from boxplus.runs.localization.summary import LocalizationSummary
 from boxplus.runs.saved_map.saved_map import open_saved_map
 from boxplus.runs.storage.row_log import read_row_log
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import trajectories
+from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import Scenario
 from boxplus.simulation.simulation import Simulation
 from boxplus.simulation.worlds.worlds import yard
@@ -79,9 +83,15 @@ def draw(folder: Path, result: LocalizationResult) -> str:
 
 def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_path: Path) -> None:
     simulation = drive(((15.0, 2.0), (-14.0, 2.0)), seed=2)
-    result = run(as_recording(simulation), tmp_path / "out", mapped)
-    own, summary = LocalizationFolder(tmp_path / "out"), result.summary
-    assert json.loads(own.summary.read_text())["program"] == "boxplus localize" and summary.map_kind == "boxplus lio"
+    bag = write_recording(simulation, tmp_path / "tuesday", "ros1")
+    words = ["localize", str(bag), "--map", str(mapped), "-o", str(tmp_path / "out"), "--json"]
+    called = CliRunner().invoke(app, [*words, *(f"--set={text}" for text in SETTINGS)])
+    assert called.exit_code == 0, called.stderr
+    own, found = LocalizationFolder(tmp_path / "out"), json.loads(called.stdout)
+    assert found["outcome"] == "finished" and found["run"] == json.loads(own.summary.read_text())
+    summary = LocalizationSummary.model_validate(found["run"])
+    assert "found after" in called.stderr and str(own.trajectory.with_suffix(".tum")) in called.stderr
+    assert summary.program == "boxplus localize" and summary.map_kind == "boxplus lio"
     assert summary.found_after_s is not None and summary.found_after_s <= 7.0 and not summary.losses
     trajectory, log = read_trajectory(own.trajectory), read_row_log(own.log, LOG_COLUMNS)
     assert len(log) == summary.scans == sum(summary.status.values())
@@ -98,7 +108,7 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     np.testing.assert_allclose(se3.compose(np.array(summary.T_map_world), T_last)[4:], trajectory.p[-1], atol=1e-6)
     searches = read_row_log(own.searches, SEARCH_COLUMNS)
     assert "" in searches.texts["verdict"] and "passes" in searches.status
-    page = draw(own.path, result)
+    page = (own.path / "report.html").read_text(encoding="utf-8")
     assert "until the place was found" in page and "local maps were computed" in page
     with pytest.raises(InputError, match="earlier run"), claim_localization_folder(own.path):
         pass

@@ -42,9 +42,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def refined(folders: tuple[Path, Path]) -> tuple[Path, str]:
     run, bag = folders
-    code, out, err = call("refine", run, "--gt", bag.with_suffix(".gt.tum"))
+    code, out, err = call("refine", run, "--gt", bag.with_suffix(".gt.tum"), "--json")
     assert code == 0, err
-    return run.with_name("run_refined"), out
+    found = json.loads(out)
+    assert found["run"] == json.loads((run.with_name("run_refined") / "run.json").read_text())
+    assert found["evaluation"]["ate_translation_m"]["rmse"] == pytest.approx(found["run"]["ate_after_m"])
+    return run.with_name("run_refined"), err
 
 
 def test_folder_holds_everything(folders: tuple[Path, Path], refined: tuple[Path, str]) -> None:
@@ -71,8 +74,10 @@ def test_a_run_that_was_not_accepted_keeps_its_trajectory(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(refine_run.Refinement, "refusal", property(lambda self: "because"))
-    code, out, err = call("refine", folders[0], "-o", tmp_path / "out", "--no-report", "--set", "refinement.rounds=1")
-    assert code == 0, err
+    (tmp_path / "other.tum").write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    once = ("--no-report", "--set", "refinement.rounds=1", "--gt", tmp_path / "other.tum")
+    code, out, err = call("refine", folders[0], "-o", tmp_path / "out", *once)
+    assert code == 2 and "error: expected" in err  # of the ground truth; everything else is there
     assert "NOT accepted, the trajectory is that of the run: because" in out
     summary = json.loads((tmp_path / "out" / "run.json").read_text())
     assert summary["accepted"] is False and summary["refusal"] == "because"

@@ -104,9 +104,14 @@ def test_the_van_that_left_is_kept_apart_and_reported(
 
 def test_runs_that_did_not_meet_are_left_as_they_are(runs: tuple[list[Path], list[DriftingDrive]], tmp_path: Path) -> None:
     arguments = ["merge", str(runs[0][0]), str(runs[0][2]), "-o", str(tmp_path / "out"), *(f"--set={text}" for text in QUICK)]
-    result = CliRunner().invoke(map_app, arguments)
+    result = CliRunner().invoke(map_app, [*arguments, "--json", "--quiet"])
     assert result.exit_code == 3
-    assert "no two of the runs met" in result.output and "elsewhere: apart" in result.output
+    found = json.loads(result.stdout)
+    assert found["outcome"] == "not to be trusted" and found["output"] == str(tmp_path / "out")
+    assert found["run"] == json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [session["name"] for session in found["run"]["sessions"]] == ["monday", "elsewhere"]
+    assert all("apart_because" in session for session in found["run"]["sessions"])
+    assert result.stderr.count("\n") == 1 and "no two of the runs met" in result.stderr  # quiet
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.yaml", "encounters.csv", "run.json"]
 
 

@@ -230,11 +230,13 @@ def test_no_start_in_the_whole_recording_is_an_error_with_its_number(tmp_path: P
 def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     truth = recorded.with_name("room.gt.tum")
-    arguments = ["vio", str(recorded), "-o", str(out), "--gt", str(truth), "--set", "cell_size=12", "--mono"]
+    arguments = ["vio", str(recorded), "-o", str(out), "--gt", str(truth), "--set", "cell_size=12", "--mono", "--json"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
-    assert "frames" in done.output and "at rest" in done.output and "yaw alignment" in " ".join(done.output.split())
-    assert json.loads((out / "evaluation.json").read_text())["alignment"]["kind"] == "yaw"
+    assert "frames" in done.stderr and "at rest" in done.stderr and "yaw alignment" in " ".join(done.stderr.split())
+    found, evaluation = json.loads(done.stdout), json.loads((out / "evaluation.json").read_text())
+    assert found["evaluation"] == evaluation and evaluation["alignment"]["kind"] == "yaw"
+    assert found["run"] == json.loads((out / "run.json").read_text()) and found["outcome"] == "finished"
     assert len(read_vio_summary(out / "run.json").cameras) == 1
     assert "ATE" in (out / "report.html").read_text(encoding="utf-8")
     assert CliRunner().invoke(app, ["report", str(out)]).exit_code == 0
@@ -248,9 +250,11 @@ def test_cameras_that_are_swapped_end_with_exit_code_3(tmp_path: Path) -> None:
     simulation = simulate_cameras("room", 2, duration_s=5.5, rig=make_rig("stereo", None, 0.3, 10.0))
     swapped = write_camera_recording(simulation, tmp_path / "swapped", "euroc", make_camera_fault("swapped_cameras"))
     out = tmp_path / "out"
-    arguments = ["vio", str(swapped), "-o", str(out), "--no-report", "--set", "cell_size=12"]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 3, done.output
+    (tmp_path / "other.tum").write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    arguments = ["vio", str(swapped), "-o", str(out), "--no-report", "--set", "cell_size=12", "--quiet"]
+    done = CliRunner().invoke(app, [*arguments, "--gt", str(tmp_path / "other.tum")])
+    assert done.exit_code == 3, done.output  # of the run, before that of a ground truth that does not fit
+    assert done.stdout == "" and "not to be trusted: " in done.stderr and "error: expected" in done.stderr
     contradiction = read_vio_summary(out / "run.json").contradiction
     assert contradiction is not None and "which camera is which" in contradiction
     said = " ".join(warning.text for warning in read_vio_summary(out / "run.json").warnings)
