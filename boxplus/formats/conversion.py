@@ -12,11 +12,12 @@ from boxplus.formats.graphs.pose_graph_file import read_pose_graph, write_pose_g
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.reconstruction import read_reconstruction, write_reconstruction
 from boxplus.formats.trajectory import read_trajectory, write_csv, write_kitti, write_tum
+from boxplus.formats.trajectory_rows import detect_format
 
 Target = Literal["tum", "kitti", "csv", "cloud", "g2o", "toro", "colmap-text", "colmap-binary", "bal"]
 
 _TRAJECTORIES = {"tum": write_tum, "kitti": write_kitti, "csv": write_csv}
-_LOST = {"tum": ("covariances",), "kitti": ("stamps", "covariances"), "csv": ()}
+_LOST = {"tum": ("covariances", "status"), "kitti": ("stamps", "covariances", "status"), "csv": ()}
 _OF_ENDINGS: dict[str, Target] = {
     ".tum": "tum",
     ".csv": "csv",
@@ -54,18 +55,24 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
     if to in _TRAJECTORIES:
         trajectory = read_trajectory(path)
         _TRAJECTORIES[to](target, trajectory)
-        held = {"stamps": trajectory.time_ns, "covariances": trajectory.covariance}
-        lost = [name for name in _LOST[to] if held[name] is not None]
+        has = {
+            "stamps": trajectory.time_ns is not None,
+            "covariances": trajectory.covariance is not None,
+            "status": any(trajectory.status or ()),
+        }
+        lost = [name for name in _LOST[to] if has[name]] + _columns_beside_poses(path)
         return _sentence(f"{len(trajectory):,} poses", lost, trajectory.warnings)
     if to == "cloud":
-        cloud = read_cloud(path)
+        cloud = read_cloud(path, everything=True)
         with cloud_writer(target) as writer:
-            writer.append(cloud.points, cloud.intensity)
-        return _sentence(f"{len(cloud):,} points", [], ())
+            held = writer.holds(cloud.columns)
+            writer.append(cloud.points, cloud.intensity, {name: cloud.columns[name] for name in cloud.columns if name in held})
+        return _sentence(f"{len(cloud):,} points", [*(set(cloud.columns) - held), *cloud.left_out], ())
     if to in ("g2o", "toro"):
         graph = read_pose_graph(path)
         write_pose_graph(target, graph, "g2o" if to == "g2o" else "toro")
-        return _sentence(f"{len(graph.ids):,} poses, {len(graph.edges):,} edges", [], graph.warnings)
+        lost = [f"{len(graph.fixed)} FIX"] if to == "toro" and len(graph.fixed) else []
+        return _sentence(f"{len(graph.ids):,} poses, {len(graph.edges):,} edges", lost, graph.warnings)
     found = read_reconstruction(path)
     if isinstance(found, ColmapModel) != to.startswith("colmap"):
         raise InputError(
@@ -76,9 +83,21 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
     if isinstance(found, ColmapModel):
         found = replace(found, format="text" if to == "colmap-text" else "binary")
     write_reconstruction(target, found)
-    return _sentence(f"{len(found.points):,} points, {len(found.pixels):,} observations", [], ())
+    folder = path if path.is_dir() else path.parent
+    lost = [name for name in ("rigs", "frames") if any((folder / f"{name}.{ending}").exists() for ending in ("bin", "txt"))]
+    lost = lost if isinstance(found, ColmapModel) else []
+    return _sentence(f"{len(found.points):,} points, {len(found.pixels):,} observations", lost, ())
+
+
+def _columns_beside_poses(path: Path) -> list[str]:
+    """What a file of EuRoC's ground truth has beside poses: velocities and biases, which no other format holds."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        first = next((line for line in file if line.strip() and not line.startswith("#")), "")
+    count = len(first.split(","))
+    return [f"{count - 8} columns beside the poses"] if count > 8 and detect_format(first, str(path)) == "euroc" else []
 
 
 def _sentence(what: str, lost: list[str], warnings: tuple[str, ...]) -> str:
-    without = f", without the {' and '.join(lost)} of the source" if lost else ""
+    *before, last = sorted(lost, key=str.lower) or [""]
+    without = f", without the {', '.join(before)}{' and ' if before else ''}{last} of the source" if last else ""
     return what + without + "".join(f"; {warning}" for warning in warnings)

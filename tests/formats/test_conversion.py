@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.errors import InputError
-from boxplus.formats.clouds.cloud_file import read_cloud
+from boxplus.formats.clouds.cloud_file import cloud_writer, read_cloud
 from boxplus.formats.clouds.ply import write_ply
 from boxplus.formats.conversion import convert
 from boxplus.formats.graphs.g2o import read_g2o
@@ -50,6 +50,96 @@ def test_clouds(tmp_path: Path) -> None:
     back = read_cloud(tmp_path / "c.pcd")
     np.testing.assert_allclose(back.points, points, atol=0.51e-4)
     np.testing.assert_array_equal(back.intensity, points[:, 0])
+
+
+def test_the_verdict_on_each_pose_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    write_csv(tmp_path / "a.csv", Trajectory(10**9 * np.arange(3), np.eye(3), q, status=("ok", "weak", "lost")))
+    assert convert(tmp_path / "a.csv", tmp_path / "b.csv") == "3 poses"
+    assert read_trajectory(tmp_path / "b.csv").status == ("ok", "weak", "lost")
+    assert convert(tmp_path / "a.csv", tmp_path / "a.tum") == "3 poses, without the status of the source"
+    told = convert(tmp_path / "a.csv", tmp_path / "a.txt", "kitti")
+    assert told == "3 poses, without the stamps and status of the source"
+    row = ",".join(["1403636580838555648", *(["0"] * 3), "1", *(["0"] * 12)])
+    (tmp_path / "euroc.csv").write_text(f"#timestamp, …\n{row}\n")
+    assert convert(tmp_path / "euroc.csv", tmp_path / "e.tum") == "1 poses, without the 9 columns beside the poses of the source"
+
+
+def cloud(count: int = 60) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    random = np.random.default_rng(1)
+    columns = {
+        **{color: random.integers(0, 256, count).astype(np.uint8) for color in ("red", "green", "blue")},
+        "ring": random.integers(0, 64, count).astype(np.uint16),
+        "time": random.uniform(0.0, 0.1, count),
+        "curvature": random.normal(size=count).astype(np.float32),
+    }
+    return random.normal(size=(count, 3)).astype(np.float32), random.uniform(0, 255, count).astype(np.float32), columns
+
+
+@pytest.mark.parametrize("ending", ["ply", "pcd", "las", "laz", "e57"])
+def test_columns_of_a_cloud_go_along_where_they_can(tmp_path: Path, ending: str) -> None:
+    """There and back: what a format holds comes back bit by bit, and what it does not is named."""
+    points, intensity, columns = cloud()
+    with cloud_writer(tmp_path / "a.ply") as writer:
+        writer.append(points[:20], intensity[:20], {name: values[:20] for name, values in columns.items()})
+        writer.append(points[20:], intensity[20:], {name: values[20:] for name, values in columns.items()})
+    target = tmp_path / f"b.{ending}"
+    told = convert(tmp_path / "a.ply", target)
+    lost = ", without the curvature, ring and time of the source" if ending == "e57" else ""
+    assert told == f"60 points{lost}"
+    assert convert(target, tmp_path / "c.ply") == "60 points"
+    back = read_cloud(tmp_path / "c.ply", everything=True)
+    assert back.left_out == () and set(back.columns) == set(columns) - ({"curvature", "ring", "time"} if lost else set())
+    for name, values in back.columns.items():
+        assert values.dtype == columns[name].dtype
+        np.testing.assert_array_equal(values, columns[name])
+    np.testing.assert_allclose(back.points, points, atol=0.51e-4)
+    np.testing.assert_array_equal(back.intensity, intensity)
+    assert not read_cloud(target).columns  # only where they are asked for
+
+
+def test_what_a_cloud_has_beside_its_points_is_named(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {name}\n" for name in "xyz")
+    mesh = f"{head}element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n3 0 1 0\n"
+    (tmp_path / "mesh.ply").write_text(mesh)
+    assert convert(tmp_path / "mesh.ply", tmp_path / "mesh.pcd") == "2 points, without the 1 face elements of the source"
+    lines = ["VERSION 0.7", "FIELDS x y z rgb fpfh label", "SIZE 4 4 4 4 4 8", "TYPE F F F F F I", "COUNT 1 1 1 1 3 1"]
+    lines += ["WIDTH 2", "HEIGHT 1", "VIEWPOINT 0 0 1 1 0 0 0", "POINTS 2", "DATA ascii"]
+    packed = np.array([0x00FF8001, 0x00000102], np.uint32).view(np.float32)
+    lines += [f"{k} 0 0 {value!r} 1 2 3 {2**53 - k}" for k, value in enumerate(packed.tolist())]
+    (tmp_path / "a.pcd").write_text("\n".join(lines) + "\n")
+    told = convert(tmp_path / "a.pcd", tmp_path / "a.ply")
+    assert told == "2 points, without the fpfh, label and the viewpoint of the source"
+    back = read_cloud(tmp_path / "a.ply", everything=True).columns
+    assert [back[color].tolist() for color in ("red", "green", "blue")] == [[255, 0], [128, 1], [1, 2]]
+    convert(tmp_path / "a.pcd", tmp_path / "b.pcd")
+    assert read_cloud(tmp_path / "b.pcd", everything=True).columns["label"].tolist() == [2**53, 2**53 - 1]
+
+
+def test_fields_of_las_stay_its_own(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    points, _, columns = cloud(8)
+    made = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
+    made.xyz = points.astype(np.float64)
+    made.classification, made.gps_time = np.arange(8, dtype=np.uint8), columns["time"]
+    made.return_number[:] = made.number_of_returns[:] = 2
+    made.red = made.green = made.blue = np.arange(1, 9, dtype=np.uint16) * 1001  # 16 bits of them
+    made.write(tmp_path / "a.las")
+    assert convert(tmp_path / "a.las", tmp_path / "b.laz") == "8 points"
+    again = laspy.read(tmp_path / "b.laz")
+    for name in ("classification", "gps_time", "return_number", "number_of_returns", "red", "blue"):
+        np.testing.assert_array_equal(again[name], made[name])
+    assert "blue, classification" in convert(tmp_path / "b.laz", tmp_path / "c.e57")
+
+
+def test_columns_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    points, _, columns = cloud(4)
+    with pytest.raises(InputError, match="the same columns in every block"), cloud_writer(tmp_path / "a.ply") as writer:
+        writer.append(points, None, {"ring": columns["ring"]})
+        writer.append(points)
+    with pytest.raises(InputError, match=r"columns of shape \(4,\)"), cloud_writer(tmp_path / "a.ply") as writer:
+        writer.append(points, None, {"ring": columns["ring"][:3]})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_graphs_and_reconstructions(tmp_path: Path) -> None:

@@ -32,14 +32,17 @@ def cloud_writer(path: str | Path) -> CloudWriter:
     return cast(CloudWriter, getattr(importlib.import_module(f"{_ROOM}.{module}"), writer)(path))
 
 
-def read_cloud(path: str | Path) -> PointCloud:
+def read_cloud(path: str | Path, *, everything: bool = False) -> PointCloud:
     """Read a PLY, PCD, LAS, LAZ or E57 file.
+
+    Args:
+        everything: read what it says of each point beside its intensity, too, and name what of it is left out.
 
     Raises:
         InputError: another ending, or as the reader of the format.
     """
     module, _, read = _kind(Path(path))
-    return cast(PointCloud, getattr(importlib.import_module(f"{_ROOM}.{module}"), read)(path))
+    return cast(PointCloud, getattr(importlib.import_module(f"{_ROOM}.{module}"), read)(path, everything=everything))
 
 
 def _kind(path: Path) -> tuple[str, str, str]:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Self
+from types import MappingProxyType, TracebackType
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError, OutputError
-from boxplus.formats.clouds.point_cloud import as_records
+from boxplus.formats.clouds.point_cloud import Columns, as_records
 from boxplus.formats.output import TEMPORARY_SUFFIX, output_error
 
 
@@ -37,6 +37,7 @@ class CloudWriter(ABC):
         """Points written so far."""
         self._temporary = self.path.with_name(self.path.name + TEMPORARY_SUFFIX)
         self._with_intensity: bool | None = None
+        self._others: tuple[tuple[str, np.dtype[np.generic]], ...] = ()
         self._file: BinaryIO | None
         try:
             self._file = self._temporary.open("wb")
@@ -48,22 +49,27 @@ class CloudWriter(ABC):
         """Before the first block, which may not come before the end."""
 
     @abstractmethod
-    def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
-        """Write (N, 3) or (N, 4) records: x, y, z and, where there is one, the intensity."""
+    def _write(self, file: BinaryIO, records: NDArray[np.float32], columns: Columns) -> None:
+        """Write (N, 3) or (N, 4) records: x, y, z and, where there is one, the intensity; and the other columns of them."""
 
     @abstractmethod
     def _finish(self, file: BinaryIO) -> None:
         """After the last block: complete what the file says about itself."""
 
-    def append(self, points: ArrayLike, intensity: ArrayLike | None = None) -> None:
+    @abstractmethod
+    def holds(self, columns: Columns) -> set[str]:
+        """Names of those that the format can hold as they are."""
+
+    def append(self, points: ArrayLike, intensity: ArrayLike | None = None, columns: Columns = MappingProxyType({})) -> None:
         """Write a block of points.
 
         Args:
             points: (N, 3) [m], as float32.
             intensity: (N,) or None; in every block or in none.
+            columns: others that the format `holds`, (N,) each; the same in every block.
 
         Raises:
-            InputError: shapes that do not match, or intensities in some blocks only.
+            InputError: shapes that do not match, intensities or other columns in some blocks only.
             OutputError: the disk is full or the file cannot be written; also after `close`.
         """
         records = as_records(points, intensity)
@@ -73,12 +79,17 @@ class CloudWriter(ABC):
                 "a block with them after one without" if intensity is not None else "a block without them after one with",
                 "give all blocks the same columns",
             )
+        others = tuple((name, values.dtype) for name, values in columns.items())
+        if self._with_intensity is not None and others != self._others:
+            raise InputError("the same columns in every block", f"{dict(others)} after {dict(self._others)}", "give all the same")
+        if wrong := [name for name, values in columns.items() if values.shape != (len(records),)]:
+            raise InputError(f"columns of shape ({len(records)},)", f"another of {wrong[0]!r}", "give one value per point")
         file = self._open_file()
         try:
             if self._with_intensity is None:
-                self._with_intensity = intensity is not None
+                self._with_intensity, self._others = intensity is not None, others
                 self._begin(file, self._with_intensity)
-            self._write(file, records)
+            self._write(file, records, columns)
         except OSError as error:
             self.abort()
             raise output_error(self.path, error) from error
@@ -144,15 +155,32 @@ class RecordWriter(CloudWriter):
 
     @staticmethod
     @abstractmethod
-    def header(count: int, with_intensity: bool) -> bytes:
-        """The header for `count` points; its length must not depend on `count`."""
+    def header(count: int, fields: Sequence[tuple[str, np.dtype[np.generic]]]) -> bytes:
+        """The header for `count` points with these columns; its length must not depend on `count`."""
+
+    def packed(self, columns: Columns) -> Columns:
+        """The columns as the file has them."""
+        return columns
 
     def _begin(self, file: BinaryIO, with_intensity: bool) -> None:
-        file.write(self.header(0, with_intensity))
+        self._fields: list[tuple[str, np.dtype[Any]]] = [
+            (name, np.dtype("<f4")) for name in ("x", "y", "z", "intensity")[: 3 + with_intensity]
+        ]
+        empty = {name: np.empty(0, kind) for name, kind in self._others}
+        self._fields += [(name, values.dtype.newbyteorder("<")) for name, values in self.packed(empty).items()]
+        file.write(self.header(0, self._fields))
 
-    def _write(self, file: BinaryIO, records: NDArray[np.float32]) -> None:
-        file.write(records.data)
+    def _write(self, file: BinaryIO, records: NDArray[np.float32], columns: Columns) -> None:
+        if not columns:
+            file.write(records.data)
+            return
+        table = np.empty(len(records), np.dtype(self._fields))
+        for number, (name, _) in enumerate(self._fields[: records.shape[1]]):
+            table[name] = records[:, number]
+        for name, values in self.packed(columns).items():
+            table[name] = values
+        file.write(table.tobytes())
 
     def _finish(self, file: BinaryIO) -> None:
         file.seek(0)
-        file.write(self.header(self.count, bool(self._with_intensity)))
+        file.write(self.header(self.count, self._fields))

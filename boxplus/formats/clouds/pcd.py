@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -10,27 +11,50 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import RecordWriter
-from boxplus.formats.clouds.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
+from boxplus.formats.clouds.point_cloud import (
+    COLORS,
+    Columns,
+    PointCloud,
+    cloud_from_columns,
+    opened,
+    read_header,
+    read_records,
+    read_text_table,
+)
 
 _KNOWN = {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 class PcdWriter(RecordWriter):
-    """Streams points (float32 x, y, z and optionally intensity) to a binary PCD file."""
+    """Streams points (float32 x, y, z, optionally intensity and other columns) to a binary PCD file.
+
+    Colours of 8 bits become PCL's `rgb`.
+    """
+
+    def holds(self, columns: Columns) -> set[str]:
+        """All of them."""
+        return set(columns)
+
+    def packed(self, columns: Columns) -> Columns:
+        """See `RecordWriter.packed`."""
+        if not all(name in columns and columns[name].dtype == np.uint8 for name in COLORS):
+            return columns
+        red, green, blue = (columns[name].astype(np.uint32) for name in COLORS)
+        others = {name: values for name, values in columns.items() if name not in COLORS}
+        return {**others, "rgb": red << 16 | green << 8 | blue}
 
     @staticmethod
-    def header(count: int, with_intensity: bool) -> bytes:
+    def header(count: int, fields: Sequence[tuple[str, np.dtype[np.generic]]]) -> bytes:
         """The header, padded in its comment so that its length does not depend on `count`."""
         number = str(count)
-        n = 4 if with_intensity else 3
         lines = [
             "# .PCD v0.7 - Point Cloud Data file format" + " " * 2 * (20 - len(number)),
             "VERSION 0.7",
-            "FIELDS x y z" + (" intensity" if with_intensity else ""),
-            "SIZE" + " 4" * n,
-            "TYPE" + " F" * n,
-            "COUNT" + " 1" * n,
+            " ".join(["FIELDS", *(name for name, _ in fields)]),
+            " ".join(["SIZE", *(str(kind.itemsize) for _, kind in fields)]),
+            " ".join(["TYPE", *(kind.kind.upper() for _, kind in fields)]),
+            "COUNT" + " 1" * len(fields),
             f"WIDTH {number}",
             "HEIGHT 1",
             "VIEWPOINT 0 0 0 1 0 0 0",
@@ -56,8 +80,11 @@ def write_pcd(path: str | Path, points: ArrayLike, intensity: ArrayLike | None =
         writer.append(points, intensity)
 
 
-def read_pcd(path: str | Path) -> PointCloud:
-    """Read a PCD file; fields other than x, y, z and intensity are passed over, points that are NaN are kept.
+def read_pcd(path: str | Path, *, everything: bool = False) -> PointCloud:
+    """Read a PCD file; points that are NaN are kept.
+
+    Args:
+        everything: read other fields than x, y, z and intensity, too, those of one number.
 
     Raises:
         InputError: the file is missing, cut, compressed or malformed; the message names file and line.
@@ -69,10 +96,10 @@ def read_pcd(path: str | Path) -> PointCloud:
     """
     source = Path(path)
     with opened(source, "PCD") as file:
-        return _read(file, source)
+        return _read(file, source, everything)
 
 
-def _read(file: BinaryIO, path: Path) -> PointCloud:
+def _read(file: BinaryIO, path: Path, everything: bool) -> PointCloud:
     lines = read_header(file, path, "DATA")
     header: dict[str, list[str]] = {}
     at: dict[str, int] = {}
@@ -118,7 +145,27 @@ def _read(file: BinaryIO, path: Path) -> PointCloud:
             f"DATA {layout} ({path}, line {len(lines)})",
             "convert the file, e.g. with pcl_convert_pcd_ascii_binary",
         )
-    return cloud_from_columns(columns, path)
+    if not everything:
+        return cloud_from_columns(columns, path)
+    several = [name for name, repeat in zip(names, repeats, strict=True) if int(repeat) != 1 and name != "_"]
+    left_out = [*several, *(["the viewpoint"] if header.get("VIEWPOINT", [])[:6] not in ([], list("000100")) else [])]
+    if header.get("HEIGHT", ["1"]) != ["1"]:
+        left_out.append(f"the order in rows of {' '.join(header.get('WIDTH', []))}")
+    others = {name: values for name, values in columns.items() if name not in (*several, "_")}
+    with np.errstate(invalid="ignore"):  # text is read as float64: as the types that the header names
+        kept = {name: values if name in "xyz" else values.astype(dtype[name].base) for name, values in others.items()}
+    return cloud_from_columns(_unpacked(kept), path, everything=True, left_out=left_out)
+
+
+def _unpacked(columns: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """Colours that PCL packs into one number, which it may call a float, as three."""
+    name = next((name for name in ("rgb", "rgba") if name in columns and columns[name].dtype.itemsize == 4), None)
+    if name is None or set(COLORS) & columns.keys():
+        return columns
+    packed = columns.pop(name)
+    bits = np.ascontiguousarray(packed).view(np.uint32)
+    shifts = {"red": 16, "green": 8, "blue": 0, **({"alpha": 24} if name == "rgba" else {})}
+    return {**columns, **{color: (bits >> shift & 255).astype(np.uint8) for color, shift in shifts.items()}}
 
 
 def _integer(header: dict[str, list[str]], at: dict[str, int], key: str, path: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -11,7 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_writer import RecordWriter
-from boxplus.formats.clouds.point_cloud import PointCloud, cloud_from_columns, opened, read_header, read_records, read_text_table
+from boxplus.formats.clouds.point_cloud import (
+    Columns,
+    PointCloud,
+    cloud_from_columns,
+    opened,
+    read_header,
+    read_records,
+    read_text_table,
+)
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
@@ -26,6 +35,7 @@ _TYPES = {
         "float64": "f8",
     },
 }
+_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -38,19 +48,22 @@ class _Element:
 
 
 class PlyWriter(RecordWriter):
-    """Streams points (float32 x, y, z and optionally intensity) to a binary little-endian PLY file."""
+    """Streams points (float32 x, y, z, optionally intensity and other columns) to a binary little-endian PLY file."""
+
+    def holds(self, columns: Columns) -> set[str]:
+        """All but those of whole numbers of 64 bits."""
+        return {name for name, values in columns.items() if values.dtype.str[1:] in _NAMES}
 
     @staticmethod
-    def header(count: int, with_intensity: bool) -> bytes:
+    def header(count: int, fields: Sequence[tuple[str, np.dtype[np.generic]]]) -> bytes:
         """The header, padded in a comment so that its length does not depend on `count`."""
         number = str(count)
-        properties = ["x", "y", "z", *(["intensity"] if with_intensity else [])]
         lines = [
             "ply",
             "format binary_little_endian 1.0",
             "comment written by boxplus" + " " * (20 - len(number)),
             f"element vertex {number}",
-            *(f"property float {name}" for name in properties),
+            *(f"property {_NAMES[kind.str[1:]]} {name}" for name, kind in fields),
             "end_header",
         ]
         return ("\n".join(lines) + "\n").encode()
@@ -72,8 +85,11 @@ def write_ply(path: str | Path, points: ArrayLike, intensity: ArrayLike | None =
         writer.append(points, intensity)
 
 
-def read_ply(path: str | Path) -> PointCloud:
-    """Read the vertices of a PLY file; other elements and properties are passed over.
+def read_ply(path: str | Path, *, everything: bool = False) -> PointCloud:
+    """Read the vertices of a PLY file; other elements are passed over.
+
+    Args:
+        everything: read their other properties, too.
 
     Raises:
         InputError: the file is missing, cut or malformed; the message names file and line.
@@ -85,7 +101,7 @@ def read_ply(path: str | Path) -> PointCloud:
     """
     source = Path(path)
     with opened(source, "PLY") as file:
-        return _read(file, source)
+        return _read(file, source, everything)
 
 
 def ply_vertex_count(path: str | Path) -> int:
@@ -105,7 +121,7 @@ def ply_vertex_count(path: str | Path) -> int:
     return vertex.count
 
 
-def _read(file: BinaryIO, path: Path) -> PointCloud:
+def _read(file: BinaryIO, path: Path, everything: bool) -> PointCloud:
     layout, elements, header_lines = _parse_header(file, path)
     vertex = _skip_to_vertices(file, path, layout, elements)
     names = [name for name, _ in vertex.fields]
@@ -118,7 +134,8 @@ def _read(file: BinaryIO, path: Path) -> PointCloud:
         dtype = np.dtype([(name, _BYTE_ORDER[layout] + kind) for name, kind in vertex.fields])
         records = read_records(file, path, dtype, vertex.count)
         columns = {name: records[name] for name in names}
-    return cloud_from_columns(columns, path)
+    left_out = [f"{other.count:,} {other.name} elements" for other in elements if other is not vertex and other.count]
+    return cloud_from_columns(columns, path, everything=everything, left_out=left_out)
 
 
 def _skip_to_vertices(file: BinaryIO, path: Path, layout: str, elements: list[_Element]) -> _Element:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,6 +20,13 @@ HEADER_LIMIT = 64 * 1024
 """A point cloud header is shorter than this [bytes]; what is longer is no header."""
 
 
+Columns = Mapping[str, NDArray[np.generic]]
+"""Values of points by name, (N,) each."""
+
+COLORS = ("red", "green", "blue")
+"""Columns of colours, uint8, or uint16 where a file has more than 8 bits of them."""
+
+
 @dataclass(frozen=True, slots=True)
 class PointCloud:
     """N points.
@@ -27,6 +34,8 @@ class PointCloud:
     Attributes:
         points: (N, 3) float32, in the file's frame [m].
         intensity: (N,) float32 in the sensor's unit, or None.
+        columns: what else a file says of each point, by name, (N,) each; only where it was asked for.
+        left_out: what it says beside that, and was not read; only where it was asked for.
 
     Example:
         >>> cloud = bp.formats.PointCloud(np.zeros((2, 3), np.float32), None)
@@ -36,6 +45,8 @@ class PointCloud:
 
     points: NDArray[np.float32]
     intensity: NDArray[np.float32] | None
+    columns: Columns = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -159,8 +170,11 @@ def as_points(columns: Sequence[NDArray[np.generic]], path: Path) -> NDArray[np.
     return np.stack([values.astype(np.float32) for values in columns], axis=1)
 
 
-def cloud_from_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> PointCloud:
+def cloud_from_columns(columns: Columns, path: Path, *, everything: bool = False, left_out: Sequence[str] = ()) -> PointCloud:
     """Pick x, y, z and intensity out of a file's columns.
+
+    Args:
+        everything: keep the other columns, too, and what was `left_out` of the file.
 
     Raises:
         InputError: no x, y and z.
@@ -169,7 +183,9 @@ def cloud_from_columns(columns: dict[str, NDArray[np.generic]], path: Path) -> P
     if not {"x", "y", "z"} <= lower.keys():
         raise InputError("points with x, y and z", f"{', '.join(columns) or 'nothing'} ({path})", "name the coordinates x, y, z")
     points = as_points([lower[axis] for axis in "xyz"], path)
-    for name in ("intensity", "scalar_intensity", "reflectivity", "i"):
-        if name in lower:
-            return PointCloud(points, np.ascontiguousarray(lower[name], dtype=np.float32))
-    return PointCloud(points, None)
+    found = next((name for name in ("intensity", "scalar_intensity", "reflectivity", "i") if name in lower), None)
+    intensity = None if found is None else np.ascontiguousarray(lower[found], dtype=np.float32)
+    if not everything:
+        return PointCloud(points, intensity)
+    others = {name: values for name, values in columns.items() if name.lower() not in ("x", "y", "z", found)}
+    return PointCloud(points, intensity, others, tuple(left_out))

@@ -19,6 +19,7 @@ from boxplus.formats.clouds.pcd import PcdWriter, read_pcd, write_pcd
 from boxplus.formats.clouds.ply import PlyWriter, ply_vertex_count, read_ply, write_ply
 from boxplus.formats.clouds.point_cloud import PointCloud
 
+FIELDS = [(name, np.dtype("<f4")) for name in ("x", "y", "z", "intensity")]
 KINDS = [pytest.param((PlyWriter, read_ply), id="ply"), pytest.param((PcdWriter, read_pcd), id="pcd")]
 Kind = tuple[type[RecordWriter], Callable[[Path], PointCloud]]
 blocks = st.lists(arrays(np.float32, st.tuples(st.integers(0, 5), st.just(4))), max_size=4)
@@ -44,8 +45,8 @@ def test_blocks_round_trip(tmp_path_factory: pytest.TempPathFactory, kind: Kind,
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_header_length_does_not_depend_on_the_count(kind: Kind) -> None:
-    for with_intensity in (False, True):
-        assert len({len(kind[0].header(count, with_intensity)) for count in (0, 7, 10**6, 10**12)}) == 1
+    for fields in (FIELDS[:3], FIELDS):
+        assert len({len(kind[0].header(count, fields)) for count in (0, 7, 10**6, 10**12)}) == 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -218,12 +219,13 @@ def test_malformed_pcd(tmp_path: Path, old: str, new: str, message: str) -> None
 @settings(max_examples=200, deadline=None)
 def test_any_bytes_give_points_or_an_input_error(tmp_path_factory: pytest.TempPathFactory, data: bytes, kind: str) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzz"
-    beginning = {"ply": PlyWriter, "pcd": PcdWriter}[kind].header(3, True)
+    beginning = {"ply": PlyWriter, "pcd": PcdWriter}[kind].header(3, FIELDS)
     cut = data[0] if data else 0
     path.write_bytes(beginning[: len(beginning) * cut // 200] + data)
     try:
-        cloud = {"ply": read_ply, "pcd": read_pcd}[kind](path)
-        assert cloud.points.ndim == 2
+        for everything in (False, True):
+            cloud = {"ply": read_ply, "pcd": read_pcd}[kind](path, everything=everything)
+            assert cloud.points.ndim == 2
     except InputError as error:
         assert "expected" in str(error)
 
