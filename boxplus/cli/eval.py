@@ -75,8 +75,8 @@ def evaluate_command(
     transform_right: Annotated[
         str | None,
         typer.Option(
-            help="Ground truth of another body frame: pose of the estimate's body in it, x,y,z or x,y,z,qx,qy,qz,qw [m], or a "
-            "file with these as JSON or with a matrix.",
+            help="Ground truth of another body frame: pose of the estimate's body in it, in the forms of --T-imu-lidar of "
+            "'boxplus lio', such as 'xyz: 0 0.3 1.2', or a JSON file of evo.",
             metavar="POSE",
         ),
     ] = None,
@@ -118,9 +118,10 @@ def evaluate_command(
     """
     from boxplus.evaluation.comparison import compare, short_names
     from boxplus.evaluation.evaluation import evaluate
-    from boxplus.evaluation.frames import projected, read_transform, transformed
+    from boxplus.evaluation.frames import projected, transformed
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.recordings.gnss_source import holds_fixes
+    from boxplus.runs.transform import parse_transform
 
     paths = [_trajectory_file(path) for path in estimates]
     if holds_fixes(ground_truth):
@@ -138,8 +139,8 @@ def evaluate_command(
         return
     truth = transformed(
         read_trajectory(ground_truth, ground_truth_format.value),
-        left=None if transform_left is None else read_transform(transform_left),
-        right=None if transform_right is None else read_transform(transform_right),
+        left=None if transform_left is None else parse_transform(transform_left, "--transform-left"),
+        right=None if transform_right is None else parse_transform(transform_right, "--transform-right"),
     )
     plane: Plane | None = None if project_to_plane is None else project_to_plane.value
     one = functools.partial(

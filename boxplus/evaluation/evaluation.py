@@ -340,6 +340,6 @@ def _alignment_doubts(alignment: Alignment, translation: NDArray[np.float64], ro
         doubts.append(
             f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
             "and the rotation error and the relative errors contain that; the pose of the one body in the other's frame can be "
-            f"given, for this rotation with --transform-right 0,0,0,{x:.5f},{y:.5f},{z:.5f},{w:.5f}"
+            f"given, for this rotation with --transform-right 'xyz_qxyzw: 0 0 0 {x:.5f} {y:.5f} {z:.5f} {w:.5f}'"
         )
     return doubts

@@ -14,19 +14,21 @@ from boxplus.filtering.nav_state import check_transform
 from boxplus.manifolds import quaternion
 
 _FORMS = (
-    "16 numbers row by row, or with a tag 'xyz_qwxyz: x y z qw qx qy qz', 'xyz_qxyzw: x y z qx qy qz qw' or "
-    "'xyz_rpy_deg: x y z roll pitch yaw'"
+    "16 numbers row by row, or with a tag 'xyz_qwxyz: x y z qw qx qy qz', 'xyz_qxyzw: x y z qx qy qz qw', "
+    "'xyz_rpy_deg: x y z roll pitch yaw' or 'xyz: x y z'"
 )
-_TAGS = {"matrix": 16, "xyz_qwxyz": 7, "xyz_qxyzw": 7, "xyz_rpy_deg": 6}
+_TAGS = {"matrix": (12, 16), "xyz_qwxyz": (7,), "xyz_qxyzw": (7,), "xyz_rpy_deg": (6,), "xyz": (3,)}
+_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Of the JSON files in which evo keeps a transform."""
 
 
 def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]:
     """Read a rigid transform; for `T_imu_lidar` it maps LiDAR coordinates to IMU coordinates (p_imu = T p_lidar).
 
     Args:
-        text: 16 numbers (row-major), tagged numbers (`xyz_qwxyz: …`, `xyz_qxyzw: …`, `xyz_rpy_deg: …` with
-            R = Rz(yaw) Ry(pitch) Rx(roll)), or a file with one of these, or a YAML or JSON file with the key
-            `T_imu_lidar`, or with `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`).
+        text: 16 numbers (row-major), or the first 12; tagged numbers (`xyz_qwxyz: …`, `xyz_qxyzw: …`, `xyz_rpy_deg: …` with
+            R = Rz(yaw) Ry(pitch) Rx(roll), `xyz: …` without a turn), or a file with one of these, or a YAML or JSON file with the
+            key `T_imu_lidar`, or with `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`), or with x, y, z, qx, qy, qz and qw.
         name: of the transform, for the messages.
 
     Returns:
@@ -34,10 +36,18 @@ def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]
 
     Raises:
         InputError: not one of these forms, or not a rotation.
+
+    Example:
+        >>> parse_transform("xyz_rpy_deg: 0 0 1.5 0 0 90")[:3, 3].tolist()
+        [0.0, 0.0, 1.5]
     """
     stripped = text.strip()
     tag, body = _split_tag(stripped)
-    if tag is None and re.search(r"[^\s,;\[\]()0-9eE+.-]", body):
+    if stripped.startswith("{"):
+        mapping = _mapping(stripped)
+        if mapping is not None:
+            return _from_mapping(mapping, name)
+    elif tag is None and re.search(r"[^\s,;\[\]()0-9eE+.-]", body):
         stripped = _read_file(stripped, name)
         mapping = _mapping(stripped)
         if mapping is not None:
@@ -79,6 +89,10 @@ def _from_mapping(content: dict[str, object], name: str) -> NDArray[np.float64]:
             return _from_numbers(None, np.array(content[name], dtype=np.float64).ravel(), name)
         suffix = name.removeprefix("T_")
         position = content.get(f"p_{suffix}", content.get(f"t_{suffix}"))
+        if set(_KEYS) <= set(content):
+            if content.get("scale", 1.0) != 1.0:
+                raise InputError(f"{name} as a rigid transform", f"one with the scale {content['scale']}", "leave the scale out")
+            return _from_numbers("xyz_qxyzw", np.array([content[key] for key in _KEYS], dtype=np.float64), name)
         if f"R_{suffix}" in content and position is not None:
             T = np.eye(4)
             T[:3, :3] = np.array(content[f"R_{suffix}"], dtype=np.float64).reshape(3, 3)
@@ -89,7 +103,7 @@ def _from_mapping(content: dict[str, object], name: str) -> NDArray[np.float64]:
             raise
         raise InputError(f"numbers for {name}", str(error), "correct the file") from error
     raise InputError(
-        f"the key {name}, or R_{suffix} and p_{suffix}",
+        f"the key {name}, or R_{suffix} and p_{suffix}, or {', '.join(_KEYS)}",
         f"the keys {', '.join(map(str, content))}",
         "rename the keys; the name says the direction",
     )
@@ -101,13 +115,19 @@ def _from_numbers(tag: str | None, numbers: NDArray[np.float64], name: str) -> N
             raise InputError(
                 f"{name} as {_FORMS}", "7 numbers without a tag", "say in which order the quaternion is: xyz_qwxyz: or xyz_qxyzw:"
             )
+        if numbers.size == 3:
+            raise InputError(
+                f"{name} as {_FORMS}", "3 numbers without a tag", "check that all were copied; without a turn: 'xyz: x y z'"
+            )
         tag = "matrix"
-    if numbers.size != _TAGS[tag]:
+    if numbers.size not in _TAGS[tag]:
         raise InputError(f"{name} as {_FORMS}", f"{numbers.size} numbers", "check that all were copied")
     if tag == "matrix":
-        return check_transform(name, numbers.reshape(4, 4))
+        return check_transform(name, np.vstack([numbers.reshape(-1, 4), np.eye(4)[numbers.size // 4 :]]))
     T = np.eye(4)
     T[:3, 3] = numbers[:3]
+    if tag == "xyz":
+        return check_transform(name, T)
     if tag == "xyz_rpy_deg":
         roll, pitch, yaw = np.radians(numbers[3:])
         cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)

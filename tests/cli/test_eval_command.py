@@ -96,7 +96,7 @@ def test_aligned_trajectories_are_saved_as_they_were_compared(files: tuple[str, 
     right[:3, 3] = [0.0, 0.3, 1.2]
     late = transformed(read_trajectory(files[0]), left=left, right=right)
     write_tum(tmp_path / "late.tum", Trajectory(late.times - 500_000_000, late.p, late.q_wxyz))
-    arguments = [str(tmp_path / "late.tum"), files[1], "--offset", "0.5", "--transform-right", "0,0.3,1.2", "--json"]
+    arguments = [str(tmp_path / "late.tum"), files[1], "--offset", "0.5", "--transform-right", "xyz: 0 0.3 1.2", "--json"]
     result = CliRunner().invoke(app, [*arguments, "--save-aligned", str(tmp_path / "saved")])
     assert result.exit_code == 0
     assert json.loads(result.stdout)["ate_translation_m"]["rmse"] == pytest.approx(0.0173, rel=0.1)

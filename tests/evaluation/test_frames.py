@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
 from boxplus.evaluation.evaluation import evaluate
-from boxplus.evaluation.frames import projected, read_transform, transformed
+from boxplus.evaluation.frames import projected, transformed
 from boxplus.formats.trajectory import Trajectory
+from boxplus.runs.transform import parse_transform
 from tests.evaluation.smooth_paths import SmoothPath, disturbed, moved
 
 T = np.arange(0.0, 20.0, 0.1)
@@ -58,7 +56,9 @@ def test_the_rotation_that_a_warning_proposes_explains_the_difference() -> None:
     turn[:3, :3] = Rotation.from_rotvec([0.3, -1.0, 0.6]).as_matrix()
     estimate = transformed(disturbed(truth, 1), right=turn)
     (warning,) = (text for text in evaluate(estimate, truth).warnings if "--transform-right" in text)
-    found = evaluate(estimate, transformed(truth, right=read_transform(warning.rpartition(" ")[2])))
+    found = evaluate(
+        estimate, transformed(truth, right=parse_transform(warning.partition("--transform-right '")[2].removesuffix("'")))
+    )
     assert found.ate_rotation.rmse < 2.0
     assert not found.warnings
 
@@ -101,33 +101,3 @@ def test_alignment_by_the_first_poses_and_by_the_first_pose() -> None:
     assert "by the first 90 poses" in evaluate(turned, truth, align_by_first=90).summary()
     with pytest.raises(InputError, match="3 to 200 matched poses to align by – got 2"):
         evaluate(turned, truth, align_by_first=2)
-
-
-def test_transforms_are_read_in_every_form(tmp_path: Path) -> None:
-    q, p = Rotation.from_rotvec([0.3, -1.0, 0.6]).as_quat(), [1.0, -2.0, 3.5]
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(q).as_matrix(), p
-    (tmp_path / "t.json").write_text(json.dumps(dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*p, *q], strict=True))))
-    np.savetxt(tmp_path / "four.txt", matrix)
-    np.savetxt(tmp_path / "three.txt", matrix[:3], delimiter=",")
-    for form in (",".join(f"{value:.12f}" for value in [*p, *q]), *(str(path) for path in tmp_path.iterdir())):
-        np.testing.assert_allclose(read_transform(form), matrix, atol=1e-9)
-    assert read_transform("1, -2, 3.5")[:3].tolist() == [[1, 0, 0, 1], [0, 1, 0, -2], [0, 0, 1, 3.5]]
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ("1,2", "a transform: 'x,y,z' or"),
-        ("nowhere.json", "a transform: 'x,y,z' or"),
-        ("1,2,nan", "a transform: 'x,y,z' or"),
-        ("0,0,0,1,1,1,1", "a unit quaternion qx,qy,qz,qw – got length 2"),
-        ("1,0,0,0,0,1,0,0,0,0,-1,0", "a rigid transform, a rotation matrix in it"),
-        ("2,0,0,0,0,1,0,0,0,0,1,0", "a rigid transform, a rotation matrix in it – got one that is 3 off"),
-        ('{"x": 0, "y": 0, "z": 0}', "a transform: 'x,y,z' or"),
-        ('{"x": 0, "y": 0, "z": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1, "scale": 2}', "got one with the scale 2"),
-    ],
-)  # fmt: skip
-def test_what_is_no_transform_is_refused(given: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_transform(given)

@@ -28,6 +28,10 @@ class MapConfig(BaseModel):
     ply: bool = Field(True, description="merge the tiles to map.ply at the end")
     pcd: bool = Field(True, description="merge the tiles to map.pcd at the end")
 
+    def merged_files(self, ply: Path, pcd: Path) -> list[Path]:
+        """Those of the two that the tiles are to be merged to."""
+        return [path for path, wanted in ((ply, self.ply), (pcd, self.pcd)) if wanted]
+
 
 class RunConfig(BaseModel):
     """Settings of an odometry run; this is what `config.yaml` holds. None has to be given."""

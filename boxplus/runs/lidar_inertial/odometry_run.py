@@ -213,13 +213,13 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
 
     def finish(self) -> None:
         """Merge the map."""
-        settings = self._config.map
-        if self._tiles is None or not (settings.ply or settings.pcd) or not self._statistics.count:
+        outputs = self._config.map.merged_files(self._folder.map_ply, self._folder.map_pcd)
+        if self._tiles is None or not outputs or not self._statistics.count:
             return
         self.stage = "merging the map"
         self.show_progress()
         began = time.perf_counter()
-        self._merged = merge(self._folder.tiles, [self._folder.map_ply] * settings.ply + [self._folder.map_pcd] * settings.pcd)
+        self._merged = merge(self._folder.tiles, outputs)
         self.seconds["merging"] = time.perf_counter() - began
 
     def nothing_found(self) -> InputError:

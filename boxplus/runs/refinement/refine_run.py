@@ -227,12 +227,8 @@ class _RefineRun:
                     tiles.append(points.astype(np.float64) @ R[k].T + T[k, 4:])
                 self._tell("writing the map", (k + 1) / len(finished))
             stored = tiles.stored
-        if settings.ply or settings.pcd:
-            folder = self._folder
-            merge(
-                folder.tiles,
-                [folder.map_ply] * settings.ply + [folder.map_pcd] * settings.pcd,
-            )
+        if outputs := settings.merged_files(self._folder.map_ply, self._folder.map_pcd):
+            merge(self._folder.tiles, outputs)
         return stored
 
     def _tell(self, stage: str, share: float) -> None:

@@ -82,6 +82,6 @@ def write_corrected_map(folder: SlamFolder, settings: MapConfig, spool: ScanSpoo
     ):
         for scan, T in zip(spool.scans(), T_map_body, strict=True):
             tiles.append(se3.act(T, scan.p_body.astype(np.float64)), scan.intensity)
-    if settings.ply or settings.pcd:
-        merge(folder.tiles, [folder.map_ply] * settings.ply + [folder.map_pcd] * settings.pcd)
+    if outputs := settings.merged_files(folder.map_ply, folder.map_pcd):
+        merge(folder.tiles, outputs)
     return tiles.stored

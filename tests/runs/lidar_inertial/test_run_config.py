@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,8 @@ def test_all_forms_of_a_transform_agree(rpy: tuple[float, float, float], p: tupl
         f"xyz_qwxyz: {position} {float(w)!r} {float(x)!r} {float(y)!r} {float(z)!r}",
         f"xyz_qxyzw: {position} {float(x)!r} {float(y)!r} {float(z)!r} {float(w)!r}",
         f"xyz_rpy_deg: {position} {' '.join(map(repr, rpy))}",
+        " ".join(map(repr, T[:3].ravel().tolist())),
+        json.dumps(dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*p, *rotation.as_quat().tolist()], strict=True))),
     ]
     for form in forms:
         np.testing.assert_allclose(parse_transform(form), T, atol=1e-9)
@@ -103,6 +106,9 @@ def test_all_forms_of_a_transform_agree(rpy: tuple[float, float, float], p: tupl
         "xyz_qwxyz: 0.1 0.2 0.3 1 0 0 0",
         "T_imu_lidar: [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]",
         '{"R_imu_lidar": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t_imu_lidar": [0.1, 0.2, 0.3]}',
+        '{"x": 0.1, "y": 0.2, "z": 0.3, "qx": 0, "qy": 0, "qz": 0, "qw": 1, "scale": 1.0}',
+        "xyz: 0.1, 0.2, 0.3",
+        "1,0,0,0.1\n0,1,0,0.2\n0,0,1,0.3\n",
     ],
 )
 def test_transform_from_a_file(tmp_path: Path, content: str) -> None:
@@ -116,7 +122,11 @@ def test_transform_from_a_file(tmp_path: Path, content: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3", "got 3 numbers – check that all were copied"),
+        ("1 2 3", "got 3 numbers without a tag – check that all were copied; without a turn: 'xyz: x y z'"),
+        ("1 2", "got 2 numbers – check that all were copied"),
+        ("xyz: 1 2 nan", "determinant nan"),
+        ('{"x": 0, "y": 0, "z": 0}', "got the keys x, y, z"),
+        ('{"x": 0, "y": 0, "z": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1, "scale": 2}', "got one with the scale 2"),
         ("0 0 0 1 0 0 0", "got 7 numbers without a tag – say in which order the quaternion is"),
         ("xyz_qwxyz: 0 0 0 1 1 0 0", "expected a unit quaternion in T_imu_lidar – got one of norm 1.414"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1", "orthonormal rotation of determinant .1 .*got .*determinant -1"),
@@ -134,7 +144,7 @@ def test_wrong_keys_in_a_file(tmp_path: Path) -> None:
     file = tmp_path / "T.yaml"
     file.write_text("T_lidar_imu: [1, 2]\n")
     with pytest.raises(
-        InputError, match="expected the key T_imu_lidar, or R_imu_lidar and p_imu_lidar – got the keys T_lidar_imu"
+        InputError, match=r"expected the key T_imu_lidar, or R_imu_lidar and p_imu_lidar, or x, y, .* – got the keys T_lidar_imu"
     ):
         parse_transform(str(file))
 
