@@ -80,6 +80,7 @@ class OptimizationSummary(_Part):
     cost: float
     chi2_initial: float | None = Field(None, description="of a pose graph: the objective without ½ and without robust loss")
     chi2: float | None = None
+    fit: str | None = Field(None, description="of a pose graph: χ² against what the information matrices promise")
     errors_initial: ErrorFacts
     errors: ErrorFacts
     invalid: dict[str, int] = Field(description="residuals that could not be evaluated at the end, by group")

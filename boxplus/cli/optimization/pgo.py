@@ -115,8 +115,9 @@ def pgo(
     """Find the poses that agree best with the relative poses measured between them.
 
     The result is written in the format of the input, and as graph.ply (poses and edges). Exit codes: 0 done, 1 the problem does
-    not determine its variables or the results could not be written, 2 bad input, 3 done but not to be trusted (not the global
-    minimum, or odometry and the loop closures kept contradict each other), 130 interrupted (results up to there are complete).
+    not determine its variables or the results could not be written, 2 bad input, 3 done but not to be trusted (likely not
+    the global minimum, edges that contradict each other, a file that means something else), 130 interrupted (results up to there
+    are complete).
     """
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
@@ -248,6 +249,7 @@ def _summary(
         start=result.start_reason,
         chi2_initial=float((result.errors_before**2).sum()),
         chi2=result.chi2,
+        fit=result.fit.sentence if config.objective == "logarithm" else None,
         errors_initial=ErrorFacts.of(result.errors_before),
         errors=ErrorFacts.of(result.errors),
         loops=None if result.loops is None else result.loops.report.sentence("loop closures"),

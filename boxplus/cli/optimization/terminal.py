@@ -240,7 +240,8 @@ class OptimizationTerminal(Terminal):
             "linear solver": summary.linear_solver,
             "summed": summary.convention,
         }
-        rows |= {name: text for name, text in (("loop closures", summary.loops), ("optimality", summary.certificate)) if text}
+        own = (("fit", summary.fit), ("loop closures", summary.loops), ("optimality", summary.certificate))
+        rows |= {name: text for name, text in own if text}
         self.print_rows(rows.items())
         for note in summary.notes:
             self.warn(note)

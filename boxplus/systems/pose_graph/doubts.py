@@ -16,6 +16,8 @@ from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start
 
 _DOUBTFUL, _POOR, _CONTRADICTION = 2.6, 3.5, 6.0  # standard deviations of χ² above its mean
+_SLACK, _SURE = 0.25, 1e-6  # share of its mean up to which standard deviations are twice too large, and the chance of it
+_STRANGE = 1e-6  # chance that an edge of a sound graph, the worst of all, stands out
 _LEAST = 1.1  # times its mean: noise is never so well known that less contradicts it
 _SAME = 1e-3  # relative difference up to which two minima are one
 _WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an information matrix says nothing along some direction
@@ -55,6 +57,21 @@ class Fit:
         return self.excess > _POOR
 
     @property
+    def is_slack(self) -> bool:
+        """Whether the information promises far more noise than there is."""
+        from scipy.stats import chi2
+
+        return self.chi2 < _SLACK * self.dof and float(chi2.cdf(self.chi2, self.dof)) < _SURE
+
+    @property
+    def sentence(self) -> str:
+        """χ² and what the information promises of it."""
+        if self.dof == 0:
+            return "no redundancy: nothing checks the measurements"
+        ratio = self.chi2 / self.dof
+        return f"χ² {self.chi2:.6g} for {self.dof:,} degrees of freedom, {ratio:.3g} times what the information promises"
+
+    @property
     def is_contradiction(self) -> bool:
         """Whether nothing explains χ² but that edges contradict each other: six standard deviations, and a tenth."""
         return self.excess > _CONTRADICTION and self.chi2 > _LEAST * self.dof
@@ -73,16 +90,41 @@ def misfit(fit: Fit) -> str:
     return f"χ² is {fit.chi2 / fit.dof:.3g} times what the information matrices promise ({promise})"
 
 
-def poor_fit_sentence(fit: Fit, minima: Mapping[Start, float]) -> str:
-    """What a poor fit may mean, with the χ² that every start ended at."""
+def slack_sentence(fit: Fit) -> str:
+    """What a fit that is too good means."""
+    return (
+        f"{misfit(fit)}: the information is too small, standard deviations computed from it are too large by a factor of "
+        f"{math.sqrt(fit.dof / max(fit.chi2, 1e-300)):.2g}, and false edges as large as these stay unnoticed"
+    )
+
+
+def standing_out(squared: NDArray[np.float64], dim: int) -> NDArray[np.bool_]:
+    """(k,) which of these squared errors no noise explains, judged by the typical one where that is larger than promised."""
+    from scipy.stats import chi2
+
+    if not len(squared):
+        return np.zeros(0, dtype=np.bool_)
+    scale = max(float(np.median(squared)) / float(chi2.median(dim)), 1.0)
+    return np.asarray(squared > scale * float(chi2.isf(_STRANGE / len(squared), dim)))
+
+
+def disagree(minima: Mapping[Start, float]) -> bool:
+    """Whether starts ended in different minima."""
+    return max(minima.values()) > (1.0 + _SAME) * min(minima.values())
+
+
+def poor_fit_sentence(fit: Fit, minima: Mapping[Start, float], fixed: int) -> str:
+    """What a poor fit may mean, with the χ² that every start ended at and the number of poses that the file fixes."""
     found = np.array(list(minima.values()))
     ends = ", ".join(f"{name.replace('_', ' ')} {value:.6g}" for name, value in minima.items())
-    if len(found) > 1 and found.max() > (1.0 + _SAME) * found.min():
+    if disagree(minima):
         why = f"starts end in different minima ({ends}; the lowest is taken), so this one is likely local too"
     elif len(found) > 1:
         why = f"all starts end in the same minimum ({ends}), so the information is likely too optimistic, or edges are false"
     else:
         why = "a local minimum, false edges, or information that is too optimistic; `--start auto` tries further starts"
+    if fixed > 1:
+        why += f"; or the {fixed} poses that the file fixes contradict the edges"
     return f"{misfit(fit)}: {why}; --robust gnc tells false loop closures from true ones"
 
 
@@ -128,6 +170,21 @@ def structure_notes(graph: PoseGraph, held: NDArray[np.int64]) -> list[str]:
     if len(alone):
         notes.append(f"{len(alone)} poses have no edge and stay where they are: {pose_names(graph, alone)}")
     return notes
+
+
+def repetition_notes(graph: PoseGraph) -> list[str]:
+    """A sentence on edges that are there twice, measurement and all."""
+    i, j = graph.edges.T
+    order = np.lexsort((graph.measurements[:, -1], i * len(graph.ids) + j))
+    same = (graph.edges[order][1:] == graph.edges[order][:-1]).all(axis=1)
+    same &= (graph.measurements[order][1:] == graph.measurements[order][:-1]).all(axis=1)
+    repeated = np.sort(order[1:][same])
+    if not len(repeated):
+        return []
+    return [
+        f"{len(repeated)} of {len(order)} edges are there before with the same measurement and count again, as if measured "
+        f"independently; standard deviations come out too small: {edge_names(graph, repeated)}"
+    ]
 
 
 def undetermined_notes(graph: PoseGraph, solution: Solution) -> list[str]:

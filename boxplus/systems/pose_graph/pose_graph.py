@@ -23,22 +23,29 @@ from boxplus.optimization.outliers.convex_start import convex_cost
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.certificate import Certificate, certify
+from boxplus.systems.pose_graph.contradictions import contradictions
 from boxplus.systems.pose_graph.doubts import (
     Fit,
+    disagree,
     misfit,
     poor_fit_sentence,
+    repetition_notes,
     silent_notes,
+    slack_sentence,
+    standing_out,
     structure_notes,
     undetermined_notes,
     without_information,
 )
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
-from boxplus.systems.pose_graph.problem import Objective, pose_graph_problem, squared_errors, with_edges
+from boxplus.systems.pose_graph.problem import Objective, pose_graph_problem, squared_errors, turns, with_edges
+from boxplus.systems.pose_graph.readings import misreading
 from boxplus.systems.pose_graph.start import held_poses
 from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
 
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
 _DAMPING = 1e-9
+_LOUD = 0.2  # [rad] root mean square of the errors in rotation from which on local minima fit their information, too
 _COUNTS = 0.5  # weight from which on an edge is expected to fit its information
 
 
@@ -88,8 +95,9 @@ class PoseGraphResult:
         certificate: with `certify`; None otherwise.
         held: indices of the poses that were held: those the file fixes, and the first of every component without any.
         notes: what a user should know of structure and result, one sentence each.
-        doubt: why the result is not to be trusted, where it is known not to be what it claims: not certified though that was
-            asked for, or odometry and the loops that were kept contradict each other; None otherwise.
+        doubt: why the result is not to be trusted, where it is known not to be what it claims: a file that means something else
+            than it was read as, edges that contradict each other or a minimum that is likely local, not certified though that was
+            asked for, or what speaks against the verdict on the loops; None otherwise.
         solution: with history, covariance, and why it stopped.
         timing_s: seconds of checking and building the problem, of the initialisation, and of the optimisation.
 
@@ -167,8 +175,10 @@ def optimize_pose_graph(
         minima = {chosen: 2.0 * solution.cost}
         squared = squared_errors(residual, graph, solution.values[0])
         first = _fit(graph, squared, None, config, len(held))
-        if loss is None and config.start == "auto" and first.is_doubtful:
-            chosen, solution = starts.further(problem, chosen, solution, known, minima, first.enough)
+        is_loud = config.objective == "logarithm" and turns(residual, graph, solution.values[0]) > _LOUD
+        if loss is None and config.start == "auto" and (first.is_doubtful or is_loud):
+            enough = first.enough if first.is_doubtful else None
+            chosen, solution = starts.further(problem, chosen, solution, known, minima, enough)
             squared = squared_errors(residual, graph, solution.values[0])
         weights = np.ones(len(squared)) if loss is None else problem.groups[0].loss_weights(solution.values)
     solved = time.perf_counter()
@@ -177,9 +187,19 @@ def optimize_pose_graph(
     squared_before = squared_start if graph.poses is None else squared_errors(residual, graph, graph.poses)
     fit = _fit(graph, squared, weights, config, len(held))
     certificate = certify(replace(graph, poses=poses_end)) if config.certify else None
-    notes = [*silent_notes(whole, silent), *structure_notes(graph, held), *solution.notes, *undetermined_notes(graph, solution)]
-    if fit.is_poor and verdict is None:
-        notes.append(poor_fit_sentence(fit, minima))
+    notes = [*silent_notes(whole, silent), *repetition_notes(graph), *structure_notes(graph, held), *solution.notes]
+    notes += undetermined_notes(graph, solution)
+    if fit.is_slack:
+        notes.append(slack_sentence(fit))
+    reasons = [text for text in (misreading(graph),) if text]
+    if verdict is not None:
+        reasons += _verdict_doubts(fit, verdict) + contradictions(graph, verdict, starts.bridges)
+    elif fit.is_poor:
+        told = poor_fit_sentence(fit, minima, len(graph.fixed))
+        bent = fit.is_contradiction and (disagree(minima) or standing_out(squared, graph.information.shape[1]).any())
+        (reasons if bent else notes).append(told)
+    if certificate is not None and not certificate.is_certified:
+        reasons.append(certificate.sentence)
     return PoseGraphResult(
         graph=replace(whole, poses=poses_end),
         start=chosen,
@@ -198,7 +218,7 @@ def optimize_pose_graph(
         certificate=certificate,
         held=held,
         notes=tuple(notes),
-        doubt=_doubt(fit, verdict, certificate),
+        doubt="; ".join(reasons) or None,
         solution=solution,
         timing_s={"set-up": built - begin, "start": prepared - built, "optimisation": solved - prepared},
     )
@@ -225,13 +245,13 @@ def _check(graph: PoseGraph, config: PoseGraphConfig, loss: Loss | None) -> None
         )
 
 
-def _doubt(fit: Fit, verdict: LoopVerdict | None, certificate: Certificate | None) -> str | None:
-    if verdict is not None and fit.is_contradiction:
-        return (
-            f"odometry and the loop closures that were kept contradict each other: {misfit(fit)}; the odometry claims more than "
-            "it can, or false loop closures were kept"
-        )
-    return certificate.sentence if certificate is not None and not certificate.is_certified else None
+def _verdict_doubts(fit: Fit, verdict: LoopVerdict) -> list[str]:
+    if not fit.is_contradiction:
+        return []
+    return [
+        f"odometry and the loop closures that were kept contradict each other: {misfit(fit)}; the odometry claims more than "
+        "it can, or false loop closures were kept"
+    ]
 
 
 def _fit(
@@ -256,7 +276,7 @@ def _reason(wanted: str, chosen: Start, costs: dict[Start, float], minima: dict[
         first = next(iter(minima))
         ends = ", ".join(f"{value:.6g} ({other.replace('_', ' ')})" for other, value in minima.items())
         why = _reason(wanted, first, costs, {first: minima[first]}) if chosen == first else f"{name}, which ends lowest"
-        return f"{why}; further starts were followed, as the residuals did not fit their information: χ² {ends}"
+        return f"{why}; further starts were followed, as residuals do not fit their information or rotations are noisy: χ² {ends}"
     if chosen == "graduated":
         return "graduated: the minimum over the loop closures that graduated non-convexity believes, as the loss forgets"
     if wanted != "auto":

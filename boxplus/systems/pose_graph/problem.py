@@ -77,11 +77,25 @@ def with_edges(graph: PoseGraph, rows: NDArray[np.bool_]) -> PoseGraph:
 
 
 def consecutive_edges(graph: PoseGraph) -> NDArray[np.bool_]:
-    """(m,) edges between poses that follow each other in the order of their names: what robots call odometry."""
-    rank = np.empty(len(graph.ids), dtype=np.int64)
-    rank[np.argsort(graph.ids, kind="stable")] = np.arange(len(graph.ids))
-    i, j = rank[graph.edges].T
-    return np.asarray(np.abs(i - j) == 1)
+    """(m,) edges between poses that follow each other (`odometry_order`): what robots call odometry.
+
+    None where less than half of the poses are joined to the next: the edges that are then were drawn as any others.
+    """
+    i, j = odometry_order(graph)[graph.edges].T
+    follow = np.asarray(np.abs(i - j) == 1)
+    known = len(np.unique(np.minimum(i, j)[follow]))
+    return follow if 2 * known >= len(graph.ids) - 1 else np.zeros(len(follow), dtype=np.bool_)
+
+
+def odometry_order(graph: PoseGraph) -> NDArray[np.int64]:
+    """(n,) place of every pose in the order of names or in that of the file, whichever joins more poses to the next."""
+    by_name, by_file = np.empty(len(graph.ids), dtype=np.int64), np.arange(len(graph.ids))
+    by_name[np.argsort(graph.ids, kind="stable")] = by_file
+    joined = []
+    for rank in (by_name, by_file):
+        i, j = rank[graph.edges].T
+        joined.append(len(np.unique(np.minimum(i, j)[np.abs(i - j) == 1])))
+    return by_file if joined[1] > joined[0] else by_name
 
 
 def squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -89,6 +103,13 @@ def squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float
     i, j = graph.edges.T
     whitened = np.einsum("nab,nb->na", residual.whitening.factors, residual.evaluate(poses[i], poses[j]))
     return np.asarray((whitened * whitened).sum(axis=1))
+
+
+def turns(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> float:
+    """Root mean square of the errors of all edges in rotation [rad]."""
+    i, j = graph.edges.T
+    e = residual.evaluate(poses[i], poses[j])[:, : 3 if graph.dimension == 3 else 1]
+    return float(np.sqrt((e * e).sum(axis=1).mean()))
 
 
 def chi2(graph: PoseGraph, poses: NDArray[np.float64], objective: Objective = "logarithm") -> float:

@@ -14,6 +14,7 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.systems.pose_graph.bridges import Bridge, bridge_pieces
 from boxplus.systems.pose_graph.loops import judge_loops
 from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
@@ -28,7 +29,8 @@ class Starts:
 
     Attributes:
         is_loop: (m,) edges that graduated non-convexity may refuse: all that do not join successive poses, or all where nothing
-            else is there.
+            else is there. Bridges, once sought, are none.
+        bridges: loop closures that join pieces of odometry, believed for the company they keep.
     """
 
     def __init__(self, graph: PoseGraph, wanted: Wanted, options: SolverOptions, callback: Callback | None) -> None:
@@ -38,6 +40,7 @@ class Starts:
             )
         self.is_loop = ~consecutive_edges(graph)
         self._graph, self._wanted, self._options, self._callback = graph, wanted, options, callback
+        self.bridges: list[Bridge] = []
         self._stopped = False
 
     def candidates(self, loss: Loss | None, *, is_robust: bool) -> dict[Start, NDArray[np.float64]]:
@@ -49,6 +52,8 @@ class Starts:
         """
         graph, wanted = self._graph, self._wanted
         forgets = loss is not None and loss.is_redescending
+        if is_robust or forgets:
+            self._bridge()
         if (is_robust or forgets) and wanted == "auto":
             found: dict[Start, NDArray[np.float64]] = {"spanning_tree": self._dead_reckoning()}
         else:
@@ -71,7 +76,7 @@ class Starts:
         solution: Solution,
         known: dict[Start, NDArray[np.float64]],
         minima: dict[Start, float],
-        enough: float,
+        enough: float | None,
     ) -> tuple[Start, Solution]:
         """The lowest minimum of all starts there are, or the first that is low enough.
 
@@ -79,12 +84,13 @@ class Starts:
             first, solution: the start that was followed, and where it led.
             known: starts by name; receives those that are tried.
             minima: the objective at the end of every start; receives those that are tried.
-            enough: objective below which nothing further is tried.
+            enough: objective below which nothing further is tried; None where the first one was low enough, and a better
+                minimum is looked for by smooth means alone.
         """
         best = (first, solution)
         names: list[Start] = ["chordal_objective", "file", "chordal", "spanning_tree", "graduated"]
-        for name in names:
-            if min(minima.values()) <= enough:
+        for name in names if enough is not None else names[:2]:
+            if enough is not None and min(minima.values()) <= enough:
                 break
             if name in minima or (name == "file" and self._graph.poses is None) or self._stopped:
                 continue
@@ -103,12 +109,18 @@ class Starts:
 
     def _make(self, name: Start) -> NDArray[np.float64]:
         if name == "graduated":
+            self._bridge()
             return self._graduated(self._dead_reckoning())
         if name == "chordal_objective":
             # Smooth where the logarithm jumps at half a turn, and with far fewer minima.
             smooth, _ = pose_graph_problem(self._graph, objective="chordal")
             return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=self._watch).values[0]
         return chordal_start(self._graph) if name == "chordal" else spanning_tree_start(self._graph)
+
+    def _bridge(self) -> None:
+        if not self.is_loop.all():
+            self.bridges = bridge_pieces(self._graph, self.is_loop, self._options, self._watch)
+            self.is_loop[[bridge.edge for bridge in self.bridges]] = False
 
     def _watch(self, iteration: Iteration) -> bool:
         self._stopped = self._stopped or (self._callback is not None and bool(self._callback(iteration)))

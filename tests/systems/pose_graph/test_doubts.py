@@ -9,6 +9,7 @@ import pytest
 
 from boxplus import InputError, PoseGraphConfig, optimize_pose_graph
 from boxplus.simulation.pose_graphs import simulate_pose_graph
+from boxplus.systems.pose_graph.readings import misreading
 
 STARTS = ("auto", "file", "chordal", "spanning_tree")
 
@@ -36,7 +37,8 @@ def test_further_starts_are_tried_where_the_first_ends_badly():
         result = optimize_pose_graph(graph)
         if len(result.minima) > 1:
             assert min(result.minima.values()) == pytest.approx(result.chi2, rel=1e-9)
-            assert result.start == min(result.minima, key=result.minima.get) and "ends lowest" in result.start_reason
+            assert result.start == min(result.minima, key=result.minima.get)
+            assert ("ends lowest" in result.start_reason) == (result.start != "chordal")
             lowered += result.chi2 < 0.95 * result.minima["chordal"]
             asked = optimize_pose_graph(graph, PoseGraphConfig(start="chordal"))
             assert asked.chi2 == pytest.approx(result.minima["chordal"], rel=1e-9) and len(asked.minima) == 1
@@ -48,9 +50,59 @@ def test_a_poor_fit_from_the_start_that_was_asked_for_is_told():
     graph = simulate_pose_graph(poses=1000, loops=860, seed=2, sigma_rotation=0.4, sigma_translation=0.1).graph
     result = optimize_pose_graph(graph, PoseGraphConfig(start="file"))
     assert result.fit.is_poor and len(result.minima) == 1
-    note = next(note for note in result.notes if "promise" in note)
+    note = next(note for note in (*result.notes, result.doubt or "") if "promise" in note)
     assert f"times what the information matrices promise ({result.chi2:.6g} for 2,580 degrees of freedom)" in note
     assert "a local minimum, false edges, or information that is too optimistic" in note
+
+
+def test_information_that_promises_more_noise_than_there_is_is_told():
+    graph = simulate_pose_graph(poses=200, seed=1).graph
+    shy = optimize_pose_graph(replace(graph, information=0.01 * graph.information))
+    assert shy.fit.is_slack and shy.doubt is None
+    assert any("too large by a factor of 10" in note for note in shy.notes)
+    assert f"{shy.chi2 / shy.fit.dof:.3g} times what the information promises" in shy.fit.sentence
+    assert not optimize_pose_graph(graph).fit.is_slack
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_edges_that_are_there_twice_are_told(dimension):
+    graph = simulate_pose_graph(dimension=dimension, poses=200, seed=1).graph
+    rows = np.r_[np.arange(len(graph.edges)), 5, 250]
+    twice = replace(graph, edges=graph.edges[rows], measurements=graph.measurements[rows], information=graph.information[rows])
+    assert any(note.startswith(f"2 of {len(rows)} edges are there before") for note in optimize_pose_graph(twice).notes)
+    assert not any("there before" in note for note in optimize_pose_graph(graph).notes)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_false_edges_that_bend_everything_are_a_doubt(dimension):
+    simulated = simulate_pose_graph(dimension=dimension, poses=200, seed=1, false_share=0.1)
+    result = optimize_pose_graph(simulated.graph)
+    assert result.doubt is not None and "--robust gnc" in result.doubt
+    proud = replace(simulated.graph, information=400.0 * simulated.graph.information)
+    rows = ~simulated.is_false
+    proud = replace(proud, edges=proud.edges[rows], measurements=proud.measurements[rows], information=proud.information[rows])
+    sound = optimize_pose_graph(proud)  # wrong sigmas alone bend nothing
+    assert sound.doubt is None and any("too optimistic" in note for note in sound.notes)
+
+
+def test_a_file_that_means_something_else_than_it_was_read_as_is_told():
+    plane, space = (simulate_pose_graph(dimension=d, poses=200, seed=1).graph for d in (2, 3))
+    degrees = [np.column_stack([np.degrees(x[:, 0]), x[:, 1:]]) for x in (plane.poses, plane.measurements)]
+    swapped = [np.column_stack([x[:, [3, 0, 1, 2]], x[:, 4:]]) for x in (space.poses, space.measurements)]
+    cases = (
+        (replace(plane, poses=degrees[0], measurements=degrees[1]), "taken for degrees"),
+        (replace(space, poses=swapped[0], measurements=swapped[1]), "taken for qw qx qy qz"),
+        (replace(plane, edges=plane.edges[:, ::-1]), "from their second pose to their first"),
+        (replace(space, edges=space.edges[:, ::-1]), "from their second pose to their first"),
+    )
+    for graph, cause in cases:
+        assert cause in optimize_pose_graph(graph).doubt
+    for graph in (plane, space):
+        assert misreading(graph) is None
+        rng = np.random.default_rng(0)
+        start = graph.poses + 3.0 * rng.standard_normal(graph.poses.shape) * (np.arange(graph.poses.shape[1]) >= graph.dimension)
+        start[:, :4] /= np.linalg.norm(start[:, :4], axis=1, keepdims=True) if graph.dimension == 3 else 1.0
+        assert misreading(replace(graph, poses=start)) is None  # a bad start is none
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

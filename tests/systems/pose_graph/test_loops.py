@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from boxplus import InputError, PoseGraphConfig, losses, optimize_pose_graph
+from boxplus.manifolds import se2, se3
+from boxplus.manifolds.se2 import SE2
+from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph, without_false_loops
-from boxplus.systems.pose_graph.problem import positions
+from boxplus.systems.pose_graph.problem import consecutive_edges, positions, with_edges
 
 GNC = PoseGraphConfig(robust="gnc")
 
@@ -67,6 +72,56 @@ def test_a_lie_that_odometry_contradicts_is_flagged():
     graph.information[~simulated.is_loop] *= 100.0
     result = optimize_pose_graph(graph, GNC)
     assert result.fit.is_poor and "times what the information matrices promise" in result.doubt
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", ["random", "clustered"])
+def test_robots_without_odometry_between_them_are_joined_by_the_loops_that_agree(dimension, kind):
+    """The walk cut in two; every robot has a letter in the names of its poses."""
+    simulated = simulate_pose_graph(dimension=dimension, poses=300, seed=1, false_share=0.4, false_kind=kind)
+    rows = np.arange(len(simulated.graph.edges)) != 149
+    graph = with_edges(simulated.graph, rows)
+    names = np.where(np.arange(300) < 150, (97 << 56) + np.arange(300), (98 << 56) + np.arange(300) - 150)
+    result = optimize_pose_graph(replace(graph, ids=names), GNC)
+    kept, true = result.loops.is_kept & simulated.is_loop[rows], (simulated.is_loop & ~simulated.is_false)[rows]
+    assert (kept & true).sum() >= 0.98 * kept.sum() and (kept & true).sum() >= 0.98 * true.sum()
+    known = optimize_pose_graph(with_edges(graph, ~simulated.is_false[rows]))
+    assert rms(simulated, result) < 1.2 * rms(simulated, known) + 0.02
+    assert result.doubt is None
+
+
+@pytest.mark.parametrize(("dimension", "slip"), [(2, 1.0), (2, 3.0), (3, 3.0)])
+def test_odometry_that_slipped_is_a_doubt_that_names_it(dimension, slip):
+    for seed in (1, 3):
+        simulated = simulate_pose_graph(dimension=dimension, poses=300, seed=seed, false_share=0.2)
+        graph = simulated.graph
+        group, manifold = (se3, SE3) if dimension == 3 else (se2, SE2)
+        moved = np.zeros((1, manifold.dof))
+        moved[0, -dimension:] = slip
+        graph.measurements[140] = group.compose(graph.measurements[140], manifold.boxplus(manifold.identity()[None], moved)[0])
+        result = optimize_pose_graph(graph, GNC)
+        assert result.doubt is not None and ("140" in result.doubt or "slipped" in result.doubt)
+
+
+def test_names_in_no_order_leave_the_order_of_the_file():
+    simulated = simulate_pose_graph(poses=300, seed=1, false_share=0.3)
+    graph = replace(simulated.graph, ids=np.random.default_rng(0).permutation(300) * 7 + 3)
+    np.testing.assert_array_equal(consecutive_edges(graph), np.abs(np.diff(graph.edges, axis=1))[:, 0] == 1)
+    result = optimize_pose_graph(graph, GNC)
+    assert result.doubt is None and result.loops.is_kept[~simulated.is_loop].all()
+
+
+def test_edges_that_leave_poses_tied_to_nothing_are_a_doubt():
+    simulated = simulate_pose_graph(poses=100, loops=60, block=2, seed=1)
+    graph = simulated.graph
+    order = np.random.default_rng(0).permutation(100)
+    mixed = replace(graph, ids=np.argsort(order), poses=graph.poses[order], edges=np.argsort(order)[graph.edges])
+    assert not consecutive_edges(mixed)[:99].all()
+    touching = (graph.edges == 99).any(axis=1)
+    mixed.measurements[touching, 1:] += 40.0 * np.arange(touching.sum())[:, None]
+    result = optimize_pose_graph(mixed, GNC)
+    if result.weights[touching].max() == 0.0:
+        assert "tied to nothing" in result.doubt
 
 
 def test_a_graph_of_loops_alone_and_one_of_odometry_alone():

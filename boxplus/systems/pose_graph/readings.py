@@ -1,0 +1,60 @@
+"""Whether a file means what it was read as: its poses and its edges, which say the same of every step in two ways, tell."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds import quaternion
+from boxplus.systems.pose_graph.problem import consecutive_edges
+
+_FAR, _NEAR = 0.2, 0.02  # of a step's length, by which poses and edges contradict each other as read, and agree otherwise
+_LEAST = 10  # steps
+_LIMIT = 20_000  # steps looked at
+
+
+def misreading(graph: PoseGraph) -> str | None:
+    """A sentence where the poses of the file contradict its odometry as they were read, and agree with it read in another way.
+
+    The ways are angles in degrees (2D), quaternions with w first (3D), and edges that go from the second pose to the first.
+    """
+    if graph.poses is None:
+        return None
+    steps = np.flatnonzero(consecutive_edges(graph))
+    steps = steps[:: max(1, len(steps) // _LIMIT)]
+    i, j = graph.edges[steps].T
+    split = 4 if graph.dimension == 3 else 1
+    p, t = graph.poses[:, split:], graph.measurements[steps, split:]
+    length = float(np.median(np.linalg.norm(t, axis=1))) if len(steps) else 0.0
+    if len(steps) < _LEAST or not length > 0.0:
+        return None
+    turn = graph.poses[:, :split]
+
+    def off(R: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int64]) -> float:
+        """Median distance between what poses and edges say of a step, as a share of its length."""
+        seen = np.einsum("nba,nb->na", R[a], p[b] - p[a])
+        return float(np.median(np.linalg.norm(seen - t, axis=1))) / length
+
+    R = _rotations(turn)
+    if not off(R, i, j) > _FAR:
+        return None
+    other = _rotations(np.radians(turn) if graph.dimension == 2 else turn[:, [1, 2, 3, 0]])
+    ways = {
+        "angles are taken for degrees" if graph.dimension == 2 else "quaternions are taken for qw qx qy qz": off(other, i, j),
+        "edges are taken to lead from their second pose to their first": off(R, j, i),
+    }
+    way = min(ways, key=lambda name: ways[name])
+    if not ways[way] < _NEAR:
+        return None
+    return (
+        f"the poses of the file contradict its odometry by {off(R, i, j):.0%} of a step as they were read, and by "
+        f"{ways[way]:.1%} if {way}: correct the file"
+    )
+
+
+def _rotations(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    if turn.shape[1] == 4:
+        return quaternion.to_matrix(turn)
+    c, s = np.cos(turn[:, 0]), np.sin(turn[:, 0])
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
