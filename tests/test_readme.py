@@ -19,6 +19,7 @@ from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.lidar_inertial.config import MapConfig
+from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudConfig
 from boxplus.simulation import simulate, write_recording
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -160,6 +161,7 @@ def test_every_page_is_in_the_index() -> None:
         ("configuration", LioConfig),
         ("configuration", RecordingOptions),
         ("configuration", MapConfig),
+        ("configuration", ScanCloudConfig),
         ("vio_configuration", VioConfig),
         ("vio_configuration", CameraRecordingOptions),
         ("slam", LocalMapConfig),

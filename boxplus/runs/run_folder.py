@@ -16,6 +16,8 @@ from boxplus.runs.storage.output_folder import SUMMARY, output_folder
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
 
+_SCAN_FILE = re.compile(r"-?\d+\.(pcd|ply|las|laz|e57)")
+
 
 def is_map_file(inside: Path) -> bool:
     """Whether a file, by its path inside a map folder, is one of the map, a half-written one too."""
@@ -121,6 +123,11 @@ class RunFolder(OdometryFolder):
         return self.path / "map.pcd"
 
     @property
+    def scan_clouds(self) -> Path:
+        """Folder of one cloud a scan, where they were asked for."""
+        return self.path / "scans"
+
+    @property
     def evaluation(self) -> Path:
         """The comparison with a ground truth, where one was given."""
         return self.path / "evaluation.json"
@@ -129,11 +136,13 @@ class RunFolder(OdometryFolder):
         """The files in the folder that a run writes."""
         yield from self.existing([self.scans, self.map_ply, self.map_pcd, self.evaluation], PLOTS)
         yield from (path for path in self.tiles.rglob("*") if path.is_file() and is_map_file(path.relative_to(self.tiles)))
+        names = self.scan_clouds.glob("*")
+        yield from (path for path in names if _SCAN_FILE.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)) and path.is_file())
 
     def own_folders(self) -> Iterator[Path]:
         """The folders in it that a run creates, inner ones first."""
         yield from self.tiles.glob("tiles/*")
-        yield from (self.tiles / "tiles", self.tiles, self.plots)
+        yield from (self.tiles / "tiles", self.tiles, self.scan_clouds, self.plots)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from boxplus.recordings.info import RecordingInfo
 from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions
+from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudConfig
 from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
@@ -41,10 +42,11 @@ class RunConfig(BaseModel):
     recording: RecordingOptions = Field(default_factory=lambda: RecordingOptions())
     odometry: LioConfig = Field(default_factory=lambda: LioConfig())  # type: ignore[call-arg]
     map: MapConfig = Field(default_factory=lambda: MapConfig())  # type: ignore[call-arg]
+    scans: ScanCloudConfig = Field(default_factory=lambda: ScanCloudConfig())  # type: ignore[call-arg]
 
     def of_odometry(self) -> RunConfig:
         """The part that `boxplus lio` has, of settings that have more."""
-        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map)
+        return RunConfig(recording=self.recording, odometry=self.odometry, map=self.map, scans=self.scans)
 
 
 def load_run_config(

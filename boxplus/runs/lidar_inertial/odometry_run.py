@@ -19,6 +19,7 @@ from boxplus.runs.checkpoint import run_identity
 from boxplus.runs.lidar_inertial.config import RunConfig, dump_run_config
 from boxplus.runs.lidar_inertial.extrinsic import Extrinsic, choose_extrinsic
 from boxplus.runs.lidar_inertial.lidar_facts import lidar_facts, lidar_warnings, watch_of
+from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudWriter
 from boxplus.runs.lidar_inertial.scan_log import ScanLogWriter
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
 from boxplus.runs.lidar_inertial.summary import ExtrinsicFacts, MapFacts, RecordingFacts, RunSummary, TimingFacts
@@ -134,6 +135,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         self._odometry = LidarOdometry(config.odometry) if alone else LidarInertialOdometry(config.odometry)
         self._watch = watch_of(recording)
         self._tiles: TileWriter | None = None
+        self._scan_clouds: ScanCloudWriter | None = None
         if extrinsic.warning:
             self._statistics.warnings.add(extrinsic.warning)
         self.seconds["merging"] = 0.0
@@ -167,6 +169,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             tiles = TileWriter(self._folder.tiles, tile_size=map_config.tile_size, voxel=map_config.voxel)
             self._tiles = stack.enter_context(tiles)
             tiles.stored = TileStore.open(self._folder.tiles).point_count if self.resumed else 0
+        if self._config.scans.frame != "none":
+            self._scan_clouds = ScanCloudWriter(self._folder.scan_clouds, self._config.scans)
 
     def push(self, event: Scan | ImuSamples) -> list[Estimate]:
         """See `RunLoop.push`."""
@@ -185,6 +189,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         state = estimate.state
         is_new = self.is_new(estimate.time_ns)
         if is_new:
+            if self._scan_clouds is not None:  # before the row: each row has its cloud, wherever the run is killed
+                self._scan_clouds.write(estimate)
             pose = state.R_world_imu, state.p_world_imu
             self._trajectory.append(estimate.time_ns, *pose, estimate.pose_covariance, estimate.status)
             self._scan_log.append(estimate)

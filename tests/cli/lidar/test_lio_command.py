@@ -59,6 +59,7 @@ def test_lio_without_configuration(bag: Path, tmp_path: Path, monkeypatch: pytes
 def test_options_reach_the_run(bag: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = ["--no-map", "--no-report", "--threads", "1", "--set", "scan_voxel=0.5", "--duration", "2", "--min-range", "1"]
+    words += ["--save-scans", "body", "--set", "scans.ending=ply"]
     code, _, err = call("lio", bag, "-o", out, "--T-imu-lidar", "xyz_rpy_deg: 0.06 -0.03 0.11 1.5 -2 25", *words)
     assert code == 0, err
     assert not (out / "map").exists()
@@ -68,6 +69,7 @@ def test_options_reach_the_run(bag: Path, tmp_path: Path) -> None:
         assert line in config
     summary = read_summary(out / "run.json")
     assert summary.extrinsic.source == "given"
+    assert len(list((out / "scans").glob("*.ply"))) == summary.scans
     assert summary.duration_s < 2.0
 
 

@@ -39,7 +39,7 @@ def test_later_settings_win(tmp_path: Path) -> None:
             ["odometry.voxel=1"],
             r"expected a known setting in section 'odometry' – got 'voxel' – .*the settings are: .*scan_voxel",
         ),
-        (["filter.x=1"], "expected a section .recording, odometry, map. – got 'filter'"),
+        (["filter.x=1"], "expected a section .recording, odometry, map, scans. – got 'filter'"),
         (["scan_voxel"], "expected a setting as key=value – got 'scan_voxel' – write e.g. --set scan_voxel=0.5"),
         (["scan_voxel=-1"], "expected a valid value for odometry.scan_voxel .side of the voxels.*– got -1"),
         (["threads=many"], "expected a valid value for odometry.threads .*– got 'many'"),
