@@ -31,8 +31,8 @@ def convert_command(
 ) -> None:
     """Write a file in another format of its kind, and say what that format cannot hold.
 
-    Trajectories as TUM, KITTI or boxplus CSV (EuRoC is read), clouds as PLY, PCD, LAS, LAZ or E57, graphs as g2o or TORO, COLMAP
-    models as text or binary, BAL files plain or compressed.
+    Trajectories as TUM, KITTI or boxplus CSV (EuRoC is read), clouds as PLY, PCD, LAS, LAZ or E57, graphs as g2o or TORO,
+    reconstructions (BAL, COLMAP) as BAL, plain or compressed, or as COLMAP's text or binary files.
     """
     from boxplus.formats.conversion import convert
 

@@ -44,6 +44,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "convert": (
         ("boxplus convert cloud.ply cloud.las", ""),
         ("boxplus convert sparse/0 sparse_text --to colmap-text", "where no ending tells the format"),
+        ("boxplus convert ladybug.txt.bz2 sparse --to colmap-binary", "a BAL file for COLMAP"),
     ),
     "map merge": (("boxplus map merge monday tuesday -o both", "runs of slam"),),
     "map update": (("boxplus map update both wednesday", ""),),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, cloud_writer, read_cloud
 from boxplus.formats.graphs.pose_graph_file import read_pose_graph, write_pose_graph
+from boxplus.formats.reconstructions.bal import BalProblem, write_bal
+from boxplus.formats.reconstructions.between_formats import bal_of, colmap_of
+from boxplus.formats.reconstructions.colmap import write_colmap
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
-from boxplus.formats.reconstructions.reconstruction import read_reconstruction, write_reconstruction
+from boxplus.formats.reconstructions.reconstruction import read_reconstruction
 from boxplus.formats.trajectory import read_trajectory, write_csv, write_kitti, write_tum
 from boxplus.formats.trajectory_rows import detect_format
 
@@ -33,8 +35,8 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
     """Write what a file holds in another format; what the other format cannot hold is refused or said.
 
     Args:
-        source: a trajectory (TUM, KITTI, EuRoC, boxplus CSV), a cloud (PLY, PCD, LAS, LAZ, E57), a graph (g2o, TORO), a BAL file
-            or the folder of a COLMAP model.
+        source: a trajectory (TUM, KITTI, EuRoC, boxplus CSV), a cloud (PLY, PCD, LAS, LAZ, E57), a graph (g2o, TORO), a BAL
+            file, one of the graph processor's, or the folder of a COLMAP model.
         output: a new file or, for COLMAP, folder.
         to: the format; auto: by the ending of `output`.
 
@@ -73,20 +75,28 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
         write_pose_graph(target, graph, "g2o" if to == "g2o" else "toro")
         lost = [f"{len(graph.fixed)} FIX"] if to == "toro" and len(graph.fixed) else []
         return _sentence(f"{len(graph.ids):,} poses, {len(graph.edges):,} edges", lost, graph.warnings)
-    found = read_reconstruction(path)
-    if isinstance(found, ColmapModel) != to.startswith("colmap"):
-        raise InputError(
-            "COLMAP as text or binary, or BAL plain or compressed",
-            f"{type(found).__name__} to {to}",
-            "their cameras are of other models: there is no exact conversion between them here",
-        )
-    if isinstance(found, ColmapModel):
-        found = replace(found, format="text" if to == "colmap-text" else "binary")
-    write_reconstruction(target, found)
-    folder = path if path.is_dir() else path.parent
-    lost = [name for name in ("rigs", "frames") if any((folder / f"{name}.{ending}").exists() for ending in ("bin", "txt"))]
-    lost = lost if isinstance(found, ColmapModel) else []
-    return _sentence(f"{len(found.points):,} points, {len(found.pixels):,} observations", lost, ())
+    return _convert_reconstruction(path, target, to)
+
+
+def _convert_reconstruction(source: Path, target: Path, to: Target) -> str:
+    found = read_reconstruction(source)
+    count = f"{len(found.points):,} points, {len(found.pixels):,} observations"
+    if to == "bal" and isinstance(found, BalProblem):
+        write_bal(target, found)
+        return count
+    model, lost, made_up = found, list[str](), ""
+    if not isinstance(model, ColmapModel):
+        model, made_up = colmap_of(model), "; names and sizes of the images and colours are made up"
+    else:
+        folder = source if source.is_dir() else source.parent
+        lost += [kind for kind in ("rigs", "frames") if any((folder / f"{kind}.{end}").exists() for end in ("bin", "txt"))]
+    if to == "bal":
+        problem, beside = bal_of(model)
+        write_bal(target, problem)
+        lost += beside if isinstance(found, ColmapModel) else ["cameras that images share (each image has its own now)"]
+        return _sentence(f"{len(problem.points):,} points, {len(problem.pixels):,} observations", lost, ())
+    write_colmap(target, model, "text" if to == "colmap-text" else "binary")
+    return _sentence(count, lost, ()) + made_up
 
 
 def _columns_beside_poses(path: Path) -> list[str]:

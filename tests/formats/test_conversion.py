@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from boxplus.cli import app
@@ -14,10 +16,12 @@ from boxplus.formats.clouds.cloud_file import cloud_writer, read_cloud
 from boxplus.formats.clouds.ply import write_ply
 from boxplus.formats.conversion import convert
 from boxplus.formats.graphs.g2o import read_g2o
-from boxplus.formats.reconstructions.bal import read_bal
+from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
 from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import write_gbp
 from boxplus.formats.trajectory import Trajectory, read_trajectory, write_csv
-from tests.small_problems import colmap_model, write_small_files
+from tests.small_problems import bal_problem, colmap_model, gbp_problem, write_small_files
 
 
 def test_trajectories(tmp_path: Path) -> None:
@@ -157,5 +161,75 @@ def test_graphs_and_reconstructions(tmp_path: Path) -> None:
     convert(tmp_path / "text", tmp_path / "binary", "colmap-binary")
     assert read_colmap(tmp_path / "text").format == "text" and read_colmap(tmp_path / "binary").format == "binary"
     np.testing.assert_array_equal(read_colmap(tmp_path / "binary").points, read_colmap(tmp_path / "colmap").points)
-    with pytest.raises(InputError, match="there is no exact conversion between them here"):
-        convert(tmp_path / "colmap", tmp_path / "b.txt", "bal")
+
+
+def seen_by_bal(problem: BalProblem) -> np.ndarray:
+    """Reprojections by the formula of the format's authors."""
+    w, t, f, k1, k2 = np.split(problem.cameras[problem.camera_of], [3, 6, 7, 8], axis=1)
+    P = Rotation.from_rotvec(w).apply(problem.points[problem.point_of]) + t
+    p = -P[:, :2] / P[:, 2:]
+    r2 = (p**2).sum(axis=1, keepdims=True)
+    return f * (1.0 + k1 * r2 + k2 * r2**2) * p
+
+
+def seen_by_colmap(model: ColmapModel) -> np.ndarray:
+    """Of its SIMPLE_RADIAL and RADIAL cameras, where the observations are of points."""
+    kept = model.point_of >= 0
+    image_of, points = model.image_of[kept], model.points[model.point_of[kept]]
+    T = model.T_camera_world[image_of]
+    P = Rotation.from_quat(T[:, [1, 2, 3, 0]]).apply(points) + T[:, 4:]
+    lens = np.array([np.pad(params, (0, 5 - len(params))) for params in model.camera_params])[model.camera_of[image_of]]
+    p = P[:, :2] / P[:, 2:]
+    r2 = (p**2).sum(axis=1, keepdims=True)
+    return lens[:, :1] * (1.0 + lens[:, 3:4] * r2 + lens[:, 4:] * r2**2) * p + lens[:, 1:3]
+
+
+def test_a_bal_file_becomes_a_colmap_model_and_comes_back(tmp_path: Path) -> None:
+    problem = bal_problem()
+    write_bal(tmp_path / "a.txt", problem)
+    told = convert(tmp_path / "a.txt", tmp_path / "model", "colmap-binary")
+    assert told.endswith(" observations; names and sizes of the images and colours are made up")
+    model = read_colmap(tmp_path / "model")
+    assert set(model.camera_models) == {"RADIAL"} and len(model.camera_ids) == len(model.image_ids) == len(problem.cameras)
+    sizes = model.camera_sizes[model.camera_of[model.image_of]]
+    assert (model.pixels >= 0.0).all() and (model.pixels <= sizes).all()
+    order = np.argsort(problem.camera_of, kind="stable")
+    errors = (seen_by_bal(problem) - problem.pixels)[order]
+    np.testing.assert_allclose(seen_by_colmap(model) - model.pixels, errors * [1.0, -1.0], atol=1e-9)
+    told = convert(tmp_path / "model", tmp_path / "b.txt.bz2")
+    assert told.endswith(", without the colours, ids, image names and image sizes of the source")
+    back = read_bal(tmp_path / "b.txt.bz2")
+    np.testing.assert_allclose(back.cameras, problem.cameras, atol=1e-9)
+    np.testing.assert_allclose(back.pixels, problem.pixels[order], atol=1e-9)
+
+
+def test_a_colmap_model_becomes_a_bal_file_with_the_same_errors(tmp_path: Path) -> None:
+    model = colmap_model()
+    write_colmap(tmp_path / "model", model)
+    told = convert(tmp_path / "model", tmp_path / "a.txt", "bal")
+    assert "cameras that images share (each image has its own now)" in told and "observations of no point" in told
+    problem = read_bal(tmp_path / "a.txt")
+    errors = seen_by_colmap(model) - model.pixels[model.point_of >= 0]
+    np.testing.assert_allclose((seen_by_bal(problem) - problem.pixels) * [1.0, -1.0], errors, atol=1e-8)
+    for name in ("OPENCV", "OPENCV_FISHEYE"):
+        lens = (np.array([5e2, 5e2, 3e2, 2e2, 0.1, 0.0, 1e-3, 0.0]),)
+        write_colmap(tmp_path / name, replace(model, camera_models=(name,), camera_params=lens))
+        with pytest.raises(InputError, match=f"cameras that BAL can hold: .* – got camera 7 of the model {name}"):
+            convert(tmp_path / name, tmp_path / "b.txt", "bal")
+    write_colmap(
+        tmp_path / "pinhole", replace(model, camera_models=("PINHOLE",), camera_params=(np.array([5e2, 5e2, 3e2, 2e2]),))
+    )
+    convert(tmp_path / "pinhole", tmp_path / "c.txt", "bal")
+    np.testing.assert_array_equal(read_bal(tmp_path / "c.txt").cameras[:, 6:], np.tile([500.0, 0.0, 0.0], (6, 1)))
+
+
+def test_a_file_of_the_graph_processor_is_converted_too(tmp_path: Path) -> None:
+    given = gbp_problem()
+    write_gbp(tmp_path / "a.txt", given)
+    convert(tmp_path / "a.txt", tmp_path / "model", "colmap-text")
+    model = read_colmap(tmp_path / "model")
+    np.testing.assert_allclose(model.T_camera_world, given.T_camera_world, atol=1e-9)
+    assert model.camera_models == ("PINHOLE",) and model.camera_params[0].tolist() == given.intrinsics.tolist()
+    told = convert(tmp_path / "a.txt", tmp_path / "b.txt", "bal")
+    assert told.endswith("without the cameras that images share (each image has its own now) of the source")
+    assert len(read_bal(tmp_path / "b.txt").cameras) == len(given.T_camera_world)
