@@ -122,7 +122,7 @@ def ba(
         return
     if triangulate or not points:
         raise InputError("--triangulate and --no-points with a line set", f"{file}", "leave them out")
-    config = BundleAdjustmentConfig(sigma_px=1.0 if sigma is None else sigma)
+    config = BundleAdjustmentConfig() if sigma is None else BundleAdjustmentConfig(sigma_px=sigma)
     config = config.model_copy(
         update={
             "intrinsics": "refined" if refine_intrinsics or refine_principal_point else "held",

@@ -19,7 +19,14 @@ from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
-from boxplus.systems.bundle_adjustment.plausibility import input_notes, outlier_notes, sigma_notes, structure_notes
+from boxplus.systems.bundle_adjustment.lens import lens_notes
+from boxplus.systems.bundle_adjustment.plausibility import (
+    input_notes,
+    outlier_notes,
+    sigma_doubt,
+    sigma_notes,
+    structure_notes,
+)
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
 
 _MOST = 0.5  # share of the observations that a robust loss may silence
@@ -118,7 +125,10 @@ def adjust_bundle(
     depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
     left = _redundancy(problem, points, point_of)
     notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
-    notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left)]
+    is_given = "sigma_px" in config.model_fields_set
+    notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
+    notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution.cost, left)
+    contradicted = sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     return BundleAdjustmentResult(
         reconstruction=adjusted,
         errors_start=errors_start,
@@ -128,7 +138,7 @@ def adjust_bundle(
         cheirality=cheirality,
         depth=depth,
         notes=(*notes, *structure_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth, solution, left),
+        doubt=_doubt(cheirality, depth, solution, left, contradicted),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -142,9 +152,11 @@ def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]
     return 2 * len(point_of) + 7 - others - 3 * len(np.unique(point_of))
 
 
-def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int) -> str | None:
+def _doubt(
+    cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, contradicted: str | None
+) -> str | None:
     """Why the result is not to be trusted."""
-    reasons = []
+    reasons = [contradicted] if contradicted else []
     if left <= 0:
         reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:

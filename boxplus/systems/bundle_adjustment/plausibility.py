@@ -5,16 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text
 
-_HEAVY, _LOAD = 0.01, 0.9  # a share of the observations, and of the cost, that only wrong matches carry
+_GROSS, _LOAD = 5.5, 0.5  # typical errors beyond which is no noise, once in four million, and the share of the cost that tells
+_LEAST = 100  # observations from which on shares mean something
 _LEAST_PIXEL = 1e-3  # [px] errors below are rounding
 _NARROW = 0.02  # spread of a camera's pixels, as a share of the others' or of the focal length, that asks for their unit
 _FEW = 10  # observations from which on a spread means something
-_OFF = 5.0  # times the errors may differ from what sigma says
+_OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says: one that was assumed, and one that was given
+_CONTRADICTED = 25.0  # times what a given sigma promises of χ²
+_SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
 
 
@@ -39,6 +43,12 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
     if not able.any():
         return said
     usual = float(np.median(spread[able]))
+    beyond = [float((x > 0.0).mean()) for x in seen.pixels.T]
+    if isinstance(reconstruction, BalProblem) and all(max(share, 1.0 - share) > _SIDE for share in beyond):
+        said.append(
+            "the pixels lie on one side of the principal point in both directions: are they counted from a corner of the image? "
+            "BAL counts them from its middle"
+        )
     narrow = np.flatnonzero(able & (spread < _NARROW * usual)).astype(np.int64)
     if len(narrow):
         said.append(
@@ -53,17 +63,19 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
     return said
 
 
-def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int) -> list[str]:
+def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_given: bool) -> list[str]:
     """Whether the errors are as large as sigma says, by their median, which wrong matches hardly move.
 
     Args:
         left: measurements less unknowns.
+        is_given: whether somebody meant sigma, or it is the default.
     """
     known = errors[np.isfinite(errors)]
     if left <= 0 or not len(known):
         return []
     noise = float(np.median(known)) / _RAYLEIGH * np.sqrt(2.0 * len(known) / left)
-    if sigma_px / _OFF <= noise <= _OFF * sigma_px:
+    off = _OFF_GIVEN if is_given else _OFF
+    if sigma_px / off <= noise <= off * sigma_px:
         return []
     return [
         f"the errors are those of sigma = {noise:.2g} px, {sigma_px:g} px was given: standard deviations are too small by a "
@@ -72,17 +84,30 @@ def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int) -> list
 
 
 def outlier_notes(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
-    """A sentence where a few observations carry nearly all of a cost without robust loss."""
-    squared = np.sort(errors[np.isfinite(errors)] ** 2)[::-1]
-    few = max(1, int(_HEAVY * len(squared)))
-    if loss is not None or len(squared) < 1.0 / _HEAVY or not squared[:few].sum() > _LOAD * squared.sum():
+    """A sentence where errors that no noise explains carry most of a cost without robust loss."""
+    known = errors[np.isfinite(errors)]
+    if loss is not None or len(known) < _LEAST:
         return []
-    if squared[0] < _LEAST_PIXEL**2:
+    squared = known**2
+    typical = max(float(np.median(known)) / _RAYLEIGH, _LEAST_PIXEL)
+    gross = known > _GROSS * typical
+    if not squared[gross].sum() > _LOAD * squared.sum():
         return []
     return [
-        f"{few} of {len(squared)} observations carry {squared[:few].sum() / squared.sum():.0%} of the cost, the largest error is "
-        f"{np.sqrt(squared[0]):.4g} px: wrong matches or a wrong start; use a robust loss (--loss huber)"
+        f"{np.count_nonzero(gross)} of {len(known)} observations are off by more than {_GROSS:g} times the typical error, with "
+        f"{squared[gross].sum() / squared.sum():.0%} of the cost; the largest is {known.max():.4g} px: wrong matches or a wrong "
+        "start, to which all else is bent; use a robust loss (--loss huber)"
     ]
+
+
+def sigma_doubt(cost: float, left: int, sigma_px: float, loss: Loss | None, *, is_given: bool) -> str | None:
+    """Where the errors contradict a sigma that somebody meant."""
+    if not is_given or loss is not None or left <= 0 or not 2.0 * cost > _CONTRADICTED * left:
+        return None
+    return (
+        f"χ² is {2.0 * cost / left:.3g} times what sigma = {sigma_px:g} px promises: wrong matches, a wrong start or lens, or "
+        "a sigma too small"
+    )
 
 
 def structure_notes(

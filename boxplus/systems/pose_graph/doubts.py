@@ -38,13 +38,17 @@ class Fit:
 
     @property
     def excess(self) -> float:
-        """By how many of its standard deviations χ² is above its mean."""
-        return (self.chi2 - self.dof) / math.sqrt(2.0 * self.dof) if self.dof > 0 else 0.0
+        """How unlikely χ² is, as standard deviations of a Gaussian (Wilson and Hilferty 1931: its cube root is nearly one)."""
+        if self.dof == 0:
+            return 0.0
+        spread = 2.0 / (9.0 * self.dof)
+        return float(((self.chi2 / self.dof) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread))
 
     @property
     def enough(self) -> float:
         """The largest χ² that is not doubtful."""
-        return self.dof + _DOUBTFUL * math.sqrt(2.0 * self.dof)
+        spread = 2.0 / (9.0 * self.dof) if self.dof else 0.0
+        return float(self.dof * (1.0 - spread + _DOUBTFUL * math.sqrt(spread)) ** 3)
 
     @property
     def is_doubtful(self) -> bool:
