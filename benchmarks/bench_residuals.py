@@ -3,7 +3,8 @@
     python benchmarks/bench_residuals.py [--edges 10000] [--rounds 7]
 
 The graph is a sphere of poses with noisy edges, solved from a noisy start by the default solver: with the built-in relative
-pose, with the same written by a user as a Python function with its Jacobian, and without one. They take turns, the fastest
+pose, with the same written by a user as a Python function: with its Jacobian, differentiated automatically, and by differences.
+Rotations written by a user as a manifold stand beside the shipped ones. They take turns, the fastest
 of all rounds counts, by processor time, as the machine is shared. Compilation comes before and is reported apart.
 """
 
@@ -18,9 +19,11 @@ from metrics import Metric, run_as_script
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
-from boxplus.manifolds.quaternion import multiply_scalars, rotate
+from boxplus.manifolds.quaternion import UnitQuaternion, exp_scalars, multiply_scalars, normalized_scalars, rotate
 from boxplus.manifolds.se3 import SE3, adjoint_into, between_into, between_scalars, log_scalars
 from boxplus.manifolds.se3_jacobians import right_jacobian_inverse_into
+from boxplus.manifolds.so3 import log_quaternion
+from boxplus.manifolds.user_manifold import UserManifold
 from boxplus.optimization.problem import Problem
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.residual import Residual
@@ -56,6 +59,19 @@ def relative_pose_jacobian(T_i, T_j, z, J_i, J_j):  # type: ignore[no-untyped-de
                 J_i[row, column] -= J_j[row, k] * Ad[k, column]
 
 
+def turned(x, delta):  # type: ignore[no-untyped-def]
+    """⊞ of unit quaternions, as a user would write it."""
+    w, a, b, c = exp_scalars(delta[0], delta[1], delta[2])
+    w, a, b, c = multiply_scalars(x[0], x[1], x[2], x[3], w, a, b, c)
+    return normalized_scalars(w, a, b, c)
+
+
+def turn(x, base):  # type: ignore[no-untyped-def]
+    """⊟ of unit quaternions."""
+    w, a, b, c = multiply_scalars(base[0], -base[1], -base[2], -base[3], x[0], x[1], x[2], x[3])
+    return log_quaternion(w, a, b, c)
+
+
 def sphere(edges: int) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
     """Start (n, 7), edges from i to j and what they measured: along the spiral and across to the next turn."""
     rng = np.random.default_rng(0)
@@ -87,9 +103,10 @@ def measure(options: argparse.Namespace) -> list[Metric]:
     residuals: list[Residual] = [
         RelativePose(Z, sigma=SIGMA),
         UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(Z,), sigma=SIGMA, jacobian=relative_pose_jacobian),
-        UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(Z,), sigma=SIGMA),
+        UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(Z,), sigma=SIGMA, jacobian="automatic"),
+        UserResidual(relative_pose, dim=6, manifolds=(SE3, SE3), data=(Z,), sigma=SIGMA, jacobian="differences"),
     ]
-    names = ("built in", "a user's, with Jacobian", "a user's, numeric")
+    names = ("built in", "a user's, with Jacobian", "a user's, automatic", "a user's, by differences")
 
     def linearized(residual: Residual) -> Callable[[], object]:
         count = residual.count
@@ -125,6 +142,16 @@ def measure(options: argparse.Namespace) -> list[Metric]:
         title = f"residuals/graph of {len(i)} edges, {name}"
         metrics.append(Metric(title, value, "ms", bar=BAR_SOLVE, opponent=names[0], opponent_value=whole[0]))
     x, delta = SE3.random(np.random.default_rng(1), 100_000), np.random.default_rng(2).normal(size=(100_000, 6))
+    mine = UserManifold("Rotations", size=4, dof=3, plus=turned, minus=turn, identity=[1.0, 0.0, 0.0, 0.0])
+    q, base, w = x[:, :4].copy(), x[::-1, :4].copy(), delta[:, :3].copy()
+    for title, tasks in (
+        ("⊞", [lambda: UnitQuaternion.boxplus(q, w), lambda: mine.boxplus(q, w)]),
+        ("⊟ and its Jacobian", [lambda: UnitQuaternion.boxminus_jacobian(q, base), lambda: mine.boxminus_jacobian(q, base)]),
+    ):
+        shipped, user = (seconds / len(q) * 1e9 for seconds in fastest(tasks, 5 * options.rounds))
+        metrics.append(
+            Metric(f"residuals/{title} on a user's manifold", user, "ns", opponent="UnitQuaternion", opponent_value=shipped)
+        )
     (seconds,) = fastest([lambda: SE3.boxplus(x, delta)], 5 * options.rounds)
     metrics.append(Metric("residuals/SE3 ⊞, each of 100,000", seconds / len(x) * 1e9, "ns", bar=BAR_BOXPLUS_NS, gated=False))
     return metrics

@@ -34,6 +34,7 @@ from .manifolds.se3 import SE3Left as SE3Left
 from .manifolds.sim3 import Sim3 as Sim3
 from .manifolds.so3 import SO3 as SO3
 from .manifolds.sphere import S2 as S2
+from .manifolds.user_manifold import UserManifold as UserManifold
 from .maps.ikd_tree import IkdTree as IkdTree
 from .optimization import losses as losses
 from .optimization.incremental.options import IncrementalOptions as IncrementalOptions

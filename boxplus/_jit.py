@@ -23,8 +23,9 @@ def kernel(
     fastmath: bool = False,
     inline: bool = False,
     borrow: bool = False,
-    cached: bool = True,
+    cached: bool | str = True,
     checked: bool = False,
+    internal: bool = False,
 ) -> Any:
     """Compile a function to native code: releases the GIL, divides like C, and is cached on disk.
 
@@ -32,11 +33,15 @@ def kernel(
     inline the function wherever it is called (small helpers of a hot loop). `borrow` leaves the reference counts of the
     arguments alone, which are otherwise raised and lowered, atomically, in every call of a function with a loop: for
     kernels that are called once a point, or on the same arrays by several threads. Such a kernel cannot allocate. What is
-    not `cached` is compiled in every process: functions of users, whose sources the cache does not know. What is `checked`
-    raises IndexError where it would read or write beyond an array: likewise functions of users.
+    not `cached` is compiled in every process; what is `cached` under a name of its own, which stands for all that decides what it
+    does, is a function that a user wrote or that is generated around one (`_user_code.py`). What is `checked` raises IndexError
+    where it would read or write beyond an array: functions of users. What is `internal` is called by other kernels only, with
+    values that Python does not know.
     """
     if function is None:
-        return lambda f: kernel(f, fastmath=fastmath, inline=inline, borrow=borrow, cached=cached, checked=checked)
+        return lambda f: kernel(
+            f, fastmath=fastmath, inline=inline, borrow=borrow, cached=cached, checked=checked, internal=internal
+        )
     flags = {"contract", "reassoc"} if fastmath else False
     options: dict[str, Any] = {
         "nogil": True,
@@ -47,11 +52,13 @@ def kernel(
     }
     if inline:
         options["forceinline"] = True
+    if internal:
+        options["no_cpython_wrapper"] = options["no_cfunc_wrapper"] = True
     dispatcher = numba.njit(**options)(function)
     if cached and not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
         # Without a cache folder that is safe to use the kernel still works; it compiles again in the next process.
         with contextlib.suppress(RuntimeError):
-            dispatcher._cache = KernelCache(dispatcher.py_func)
+            dispatcher._cache = KernelCache(dispatcher.py_func, cached if isinstance(cached, str) else None)
     return dispatcher
 
 

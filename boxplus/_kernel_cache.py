@@ -76,14 +76,14 @@ def _imported_files(file: Path) -> frozenset[Path]:
 
 
 @functools.cache
-def _source_key(file: Path) -> str:
+def source_key(file: Path) -> str:
     """Hash of `file`, of every boxplus file it depends on, of Numba's version and of the processor."""
     pending, seen = [file], {file}
     while pending:
         for dependency in _imported_files(pending.pop()) - seen:
             seen.add(dependency)
             pending.append(dependency)
-    digest = hashlib.sha256(f"{numba.__version__} {sys.implementation.cache_tag} {_processor()}".encode())
+    digest = hashlib.sha256(f"{numba.__version__} {sys.implementation.cache_tag} {processor()}".encode())
     for path in sorted(seen):
         digest.update(str(path).encode())
         digest.update(path.read_bytes())
@@ -91,7 +91,7 @@ def _source_key(file: Path) -> str:
 
 
 @functools.cache
-def _processor() -> str:
+def processor() -> str:
     from llvmlite import binding
 
     return f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
@@ -149,13 +149,16 @@ def _is_usable(folder: Path) -> bool:
 class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
     """Tells Numba to keep a function's machine code under the hash of everything it was compiled from."""
 
+    key: str | None = None
+    """Of a function that a user wrote; that of one of ours comes from its file."""
+
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
-        file = Path(py_file).resolve()
-        self._line = py_func.__code__.co_firstlineno
         # Machine code imports, by name, the module its function was defined in: a file that was run as a script and is
         # imported now, or imported under another name, is another one.
         module = hashlib.sha256(py_func.__module__.encode()).hexdigest()[:8]
-        self._folder = cache_root() / "kernels" / f"{_source_key(file)}-{module}"
+        # What a user wrote is known by what it does, wherever it stands.
+        self._line = 0 if self.key else py_func.__code__.co_firstlineno
+        self._folder = cache_root() / "kernels" / f"{self.key or source_key(Path(py_file).resolve())}-{module}"
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -239,24 +242,37 @@ def _replacing(path: str) -> Iterator[BinaryIO]:
 
 
 class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = [_KeyedLocator]  # noqa: RUF012
+    def check_cachable(self, compiled: Any) -> bool:
+        """Not what holds an address of this process, such as that of a large array among a user's globals."""
+        return not compiled.lifted and not compiled.library.has_dynamic_globals
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
     """What a dispatcher loads its machine code from, and saves it to.
 
+    Args:
+        key: of a function that a user wrote, a hash of all that decides what it does; a function of ours is kept under the
+            hash of its file and of what that imports.
+
     Raises:
         RuntimeError: there is no folder that can be used.
     """
 
-    _impl_class = _KeyedCacheImpl
-
-    def __init__(self, py_func: Callable[..., Any]) -> None:
+    def __init__(self, py_func: Callable[..., Any], key: str | None = None) -> None:
+        locator_class = type("_Locator", (_KeyedLocator,), {"key": key})
+        self._key = key
+        self._impl_class: type[Any] = type("_Impl", (_KeyedCacheImpl,), {"_locator_classes": [locator_class]})
         super().__init__(py_func)  # type: ignore[no-untyped-call]
         locator = self._impl.locator
         self._cache_file = _VerifiedFiles(  # type: ignore[no-untyped-call]
             cache_path=locator.get_cache_path(), filename_base=self._impl.filename_base, source_stamp=locator.get_source_stamp()
         )
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        """As Numba's, but without its hash of closures, which is another one in every process, where our key has their values."""
+        if self._key is None:
+            return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        return sig, codegen.magic_tuple()
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:

@@ -39,12 +39,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def _forget() -> None:
     _kernel_cache._module_files.cache_clear()
     _kernel_cache._imported_files.cache_clear()
-    _kernel_cache._source_key.cache_clear()
+    _kernel_cache.source_key.cache_clear()
 
 
 def _key(file: Path) -> str:
     _forget()
-    return _kernel_cache._source_key(file)
+    return _kernel_cache.source_key(file)
 
 
 @pytest.mark.parametrize("changed", ["top.py", "middle.py", "low/bottom.py", "low/__init__.py"])
@@ -82,7 +82,7 @@ def test_files_that_import_one_another_have_a_key(package: Path) -> None:
 
 def test_the_key_follows_the_processor(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = _key(package / "top.py")
-    monkeypatch.setattr(_kernel_cache, "_processor", lambda: "another one")
+    monkeypatch.setattr(_kernel_cache, "processor", lambda: "another one")
     assert _key(package / "top.py") != before
 
 

@@ -34,7 +34,15 @@ PYTHON_PAGES = [
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("library_use", "least_squares", "bundle_adjustment", "pose_graphs", "extending", "coming_from")
+        for name in (
+            "library_use",
+            "least_squares",
+            "bundle_adjustment",
+            "pose_graphs",
+            "extending",
+            "coming_from",
+            "differentiation",
+        )
     ),
 ]
 

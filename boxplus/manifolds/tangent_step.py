@@ -21,29 +21,29 @@ from boxplus.manifolds.sim3 import Sim3
 from boxplus.manifolds.so3 import SO3
 from boxplus.manifolds.sphere import S2, basis_scalars
 
-_ADD, _TURN_RIGHT, _TURN_LEFT, _MOVE_LOCAL, _TURN_MATRIX, _MOVE_PLANE, _MOVE_SCALED, _GROW, _TILT = range(9)
+ADD, TURN_RIGHT, TURN_LEFT, MOVE_LOCAL, TURN_MATRIX, MOVE_PLANE, MOVE_SCALED, GROW, TILT = range(9)
 
 
 def tangent_steps(manifold: Manifold) -> NDArray[np.int64] | None:
     """For every tangent direction (dof, 3): kind of step, first stored number it concerns, axis. None for foreign manifolds."""
     if isinstance(manifold, Euclidean):
-        rows = [(_ADD, k, 0) for k in range(manifold.n)]
+        rows = [(ADD, k, 0) for k in range(manifold.n)]
     elif manifold == UnitQuaternion:
-        rows = [(_TURN_RIGHT, 0, k) for k in range(3)]
+        rows = [(TURN_RIGHT, 0, k) for k in range(3)]
     elif manifold == SE3:
-        rows = [(_TURN_RIGHT, 0, k) for k in range(3)] + [(_MOVE_LOCAL, 0, k) for k in range(3)]
+        rows = [(TURN_RIGHT, 0, k) for k in range(3)] + [(MOVE_LOCAL, 0, k) for k in range(3)]
     elif manifold == SE3Left:
-        rows = [(_TURN_LEFT, 0, k) for k in range(3)] + [(_ADD, 4 + k, 0) for k in range(3)]
+        rows = [(TURN_LEFT, 0, k) for k in range(3)] + [(ADD, 4 + k, 0) for k in range(3)]
     elif manifold == SO3:
-        rows = [(_TURN_MATRIX, 0, k) for k in range(3)]
+        rows = [(TURN_MATRIX, 0, k) for k in range(3)]
     elif manifold == SE2:
-        rows = [(_ADD, 0, 0)] + [(_MOVE_PLANE, 0, k) for k in range(2)]
+        rows = [(ADD, 0, 0)] + [(MOVE_PLANE, 0, k) for k in range(2)]
     elif manifold == Line3D:
-        rows = [(_TURN_RIGHT, 0, k) for k in range(3)] + [(_ADD, 4, 0)]
+        rows = [(TURN_RIGHT, 0, k) for k in range(3)] + [(ADD, 4, 0)]
     elif manifold == S2:
-        rows = [(_TILT, 0, k) for k in range(2)]
+        rows = [(TILT, 0, k) for k in range(2)]
     elif manifold == Sim3:
-        rows = [(_TURN_RIGHT, 0, k) for k in range(3)] + [(_MOVE_SCALED, 0, k) for k in range(3)] + [(_GROW, 7, 0)]
+        rows = [(TURN_RIGHT, 0, k) for k in range(3)] + [(MOVE_SCALED, 0, k) for k in range(3)] + [(GROW, 7, 0)]
     elif isinstance(manifold, Product):
         parts, start = [], 0
         for component in manifold.components:
@@ -78,40 +78,40 @@ def step_into(
     """out = x ⊞ h e_direction, with cos_half = cos h/2 and sin_half = sin h/2."""
     kind, s, axis = steps[direction, 0], np.uint64(steps[direction, 1]), steps[direction, 2]
     copy_into(x, out)
-    if kind == _ADD:
+    if kind == ADD:
         out[s] += h
         return
     e0 = 1.0 if axis == 0 else 0.0
     e1 = 1.0 if axis == 1 else 0.0
     e2 = 1.0 if axis == 2 else 0.0
-    if kind == _TURN_RIGHT:
+    if kind == TURN_RIGHT:
         out[s], out[s + 1], out[s + 2], out[s + 3] = multiply_scalars(
             x[s], x[s + 1], x[s + 2], x[s + 3], cos_half, sin_half * e0, sin_half * e1, sin_half * e2
         )
-    elif kind == _TURN_LEFT:
+    elif kind == TURN_LEFT:
         w, a, b, c = cos_half, sin_half * e0, sin_half * e1, sin_half * e2
         out[s], out[s + 1], out[s + 2], out[s + 3] = multiply_scalars(w, a, b, c, x[s], x[s + 1], x[s + 2], x[s + 3])
         out[s + 4], out[s + 5], out[s + 6] = rotate(w, a, b, c, x[s + 4], x[s + 5], x[s + 6])
-    elif kind == _MOVE_LOCAL:
+    elif kind == MOVE_LOCAL:
         a, b, c = rotate(x[s], x[s + 1], x[s + 2], x[s + 3], h * e0, h * e1, h * e2)
         out[s + 4], out[s + 5], out[s + 6] = x[s + 4] + a, x[s + 5] + b, x[s + 6] + c
-    elif kind == _MOVE_SCALED:
+    elif kind == MOVE_SCALED:
         h *= x[s + 7]
         a, b, c = rotate(x[s], x[s + 1], x[s + 2], x[s + 3], h * e0, h * e1, h * e2)
         out[s + 4], out[s + 5], out[s + 6] = x[s + 4] + a, x[s + 5] + b, x[s + 6] + c
-    elif kind == _GROW:
+    elif kind == GROW:
         out[s] *= np.exp(h)
-    elif kind == _TILT:
+    elif kind == TILT:
         cosine, sine = 1.0 - 2.0 * sin_half * sin_half, 2.0 * sin_half * cos_half
         B = basis_scalars(x[s], x[s + 1], x[s + 2])
         out[s] = cosine * x[s] + sine * (e0 * B[0] + e1 * B[3])
         out[s + 1] = cosine * x[s + 1] + sine * (e0 * B[1] + e1 * B[4])
         out[s + 2] = cosine * x[s + 2] + sine * (e0 * B[2] + e1 * B[5])
-    elif kind == _MOVE_PLANE:
+    elif kind == MOVE_PLANE:
         cosine, sine = np.cos(x[s]), np.sin(x[s])
         out[s + 1] += h * (cosine * e0 - sine * e1)
         out[s + 2] += h * (sine * e0 + cosine * e1)
-    else:  # _TURN_MATRIX: the two columns beside the axis turn
+    else:  # TURN_MATRIX: the two columns beside the axis turn
         cosine, sine = 1.0 - 2.0 * sin_half * sin_half, 2.0 * sin_half * cos_half
         first, second = np.uint64((axis + 1) % 3), np.uint64((axis + 2) % 3)
         for row in range(np.uint64(3)):

@@ -14,8 +14,9 @@ import math
 from dataclasses import dataclass, replace
 
 from boxplus._jit import kernel
+from boxplus._user_code import UserCode
 from boxplus.errors import InputError
-from boxplus.optimization.user_loss import Derivatives, compiled_loss
+from boxplus.optimization.user_loss import Derivatives, compiled_loss, taken_down
 
 SQUARED, HUBER, CAUCHY, TUKEY, GEMAN_MCCLURE, WELSCH, TRUNCATED, USER = 0, 1, 2, 3, 4, 5, 6, 7
 # Share of ρ′ that must be left along the residual for its second-order term to be used. It matters little: over pose graphs and
@@ -31,6 +32,7 @@ class Loss:
 
     Attributes:
         function: of a `UserLoss`; None for those that the kernels know.
+        taken_down: that function as it was when the loss was made.
 
     Example:
         >>> bp.losses.Huber(1.5).with_scale(3.0)
@@ -41,6 +43,7 @@ class Loss:
     scale: float
     name: str
     function: Derivatives | None = None
+    taken_down: UserCode | None = None
 
     def __repr__(self) -> str:
         return self.name if self.code == SQUARED else f"{self.name}({self.scale:g})"
@@ -48,11 +51,11 @@ class Loss:
     @property
     def is_redescending(self) -> bool:
         """Whether a residual pulls the less the larger it is, far out: the cost then has minima that depend on the start."""
-        return compiled_loss(self.function)[1] if self.function is not None else self.code not in (SQUARED, HUBER)
+        return compiled_loss(self.taken_down)[1] if self.taken_down is not None else self.code not in (SQUARED, HUBER)
 
     def with_scale(self, scale: float) -> Loss:
         """The same loss with another scale."""
-        return replace(_loss(self.code, scale, self.name), function=self.function)
+        return replace(_loss(self.code, scale, self.name), function=self.function, taken_down=self.taken_down)
 
 
 def _loss(code: int, scale: float, name: str) -> Loss:
@@ -152,8 +155,8 @@ def UserLoss(function: Derivatives, scale: float = 1.0) -> Loss:
         >>> bp.losses.UserLoss(pseudo_huber, scale=1.5)
         pseudo_huber(1.5)
     """
-    compiled_loss(function)
-    return replace(_loss(USER, scale, function.__name__), function=function)
+    code = taken_down(function)
+    return replace(_loss(USER, scale, code.name), function=function, taken_down=code)
 
 
 @kernel(inline=True)

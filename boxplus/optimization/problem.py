@@ -22,7 +22,7 @@ from boxplus.optimization.solution import Solution, values_at
 from boxplus.optimization.solver_options import SolverOptions, options_from
 from boxplus.optimization.terms.connections import check_connections, require_connections
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
-from boxplus.optimization.terms.group import Group, ResidualRows
+from boxplus.optimization.terms.group import Group, ResidualRows, jacobian_notes
 from boxplus.optimization.terms.held_components import component_mask, held_groups
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
@@ -365,7 +365,7 @@ class Problem:
                 for group in self.groups
             },
             faded=faded,
-            notes=(*notes, *faded_notes(self.groups, faded)),
+            notes=(*notes, *jacobian_notes(self.groups), *faded_notes(self.groups, faded)),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )

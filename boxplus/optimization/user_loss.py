@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ from numba.core import types
 from numba.core.errors import NumbaError, UnsupportedBytecodeError
 
 from boxplus._jit import kernel
+from boxplus._user_code import UserCode, cached_name
 from boxplus.errors import InputError
 
 Derivatives = Callable[[float], tuple[float, float, float]]
@@ -24,16 +26,29 @@ _AGREES = 1e-5  # of the largest of what is compared
 _FADES = 0.99  # a residual that pulls less than this share of the most that any pulls is being forgotten
 
 
+def taken_down(function: Derivatives) -> UserCode:
+    """The function as it is now.
+
+    Raises:
+        InputError: not a function, or one that does not compile or is no loss, as for `compiled_loss`.
+    """
+    if not (inspect.isfunction(function) or inspect.isfunction(getattr(function, "py_func", None))):
+        raise InputError("a function of s as a loss", repr(function), "write `def loss(s): return rho, first, second`")
+    code = UserCode.of(function)
+    compiled_loss(code)
+    return code
+
+
 @functools.lru_cache(maxsize=64)
-def compiled_loss(function: Derivatives) -> tuple[Callable[..., None], bool]:
+def compiled_loss(code: UserCode) -> tuple[Callable[..., None], bool]:
     """The loop that fills (ρ, ρ′, ρ″) for every residual, and whether the loss forgets large ones.
 
     Raises:
         InputError: a function that Numba does not compile, that does not return three numbers, whose ρ(0) is not zero, whose
             ρ′ is negative or not finite somewhere, or whose derivatives are not those of its ρ.
     """
-    one = _compiled(function)
-    _check(function.__name__, one)
+    one = _compiled(code)
+    _check(code.name, one)
 
     def fill(begin: int, end: int, scale: float, r: Any, valid: Any, derivatives: Any) -> None:
         c2 = scale * scale
@@ -46,24 +61,21 @@ def compiled_loss(function: Derivatives) -> tuple[Callable[..., None], bool]:
                 derivatives[n, 0], derivatives[n, 1], derivatives[n, 2] = c2 * rho, first, second / c2
 
     pull = np.array([math.sqrt(s) * one(s)[1] for s in _GRID])
-    return kernel(fill, cached=False), bool(pull[-1] < _FADES * pull.max())
+    return kernel(fill, cached=cached_name(__file__, "loss", code)), bool(pull[-1] < _FADES * pull.max())
 
 
-def _compiled(function: Derivatives) -> Any:
-    if not callable(function) or not hasattr(function, "__name__"):
-        raise InputError("a function of s as a loss", repr(function), "write `def loss(s): return rho, first, second`")
-    plain = getattr(function, "py_func", function)
+def _compiled(code: UserCode) -> Any:
     if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
-        return plain
-    one = kernel(plain, inline=True, cached=False)
+        return getattr(code.function, "py_func", code.function)
+    one = kernel(code.snapshot(checked=False), inline=True, cached=code.cached())
     try:
         one.compile((types.float64,))
     except (NumbaError, UnsupportedBytecodeError, TypeError) as error:
         reason = str(error).strip().splitlines()[-1]
-        raise InputError("a loss that Numba can compile", f"{plain.__name__}: {reason}", "use numbers and `math` only") from error
+        raise InputError("a loss that Numba can compile", f"{code.name}: {reason}", "use numbers and `math` only") from error
     returned: Any = one.overloads[(types.float64,)].signature.return_type
     if not (_is_three_numbers(returned)):
-        raise InputError(f"three numbers from {plain.__name__}", str(returned), "return ρ(s), ρ′(s), ρ″(s)")
+        raise InputError(f"three numbers from {code.name}", str(returned), "return ρ(s), ρ′(s), ρ″(s)")
     return one
 
 

@@ -53,6 +53,7 @@ class Residual(ABC):
         whitening: square root of the information of the residuals.
         fixes_gauge: whether moving all connected variables together, as one rigid body, changes the residual. One that
             connects a single variable does; a relative measurement does not.
+        jacobian_note: what a user should know of its Jacobians, and a solution says; empty where there is nothing.
 
     Example:
         >>> prior = bp.residuals.Prior(bp.SE2, np.zeros((3, 3)), sigma=0.1)
@@ -61,6 +62,7 @@ class Residual(ABC):
     """
 
     fixes_gauge: bool
+    jacobian_note: str = ""
 
     def __init__(
         self,

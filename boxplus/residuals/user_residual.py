@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._numbers import as_array, as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_step import tangent_steps
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
-from boxplus.residuals.user_kernels import Loops, compiled_loops
+from boxplus.residuals.user_kernels import Derivative, Loops, compiled_loops
 from boxplus.residuals.whitening import Whitening
 
 _STEP = 1e-5  # of central differences: truncation and rounding both stay below about 1e-10
@@ -42,8 +41,9 @@ class UserResidual(Residual):
             comes as a number, or as the single row of (1, …).
         count: N, where no data tell.
         jacobian: takes the arguments of the function and then, for every variable, an array (dim, dof) of zeros to fill with
-            ∂r(x ⊞ δ)/∂δ. In a batch, it returns one array (n, dim, dof) for each variable. Without it, Jacobians are central
-            differences on the manifold; `jacobian_kind` says which.
+            ∂r(x ⊞ δ)/∂δ. In a batch, it returns one array (n, dim, dof) for each variable. "automatic" differentiates the
+            compiled function itself, exactly, and refuses one of which it cannot; "differences" takes central differences on the
+            manifold. Without it, the first where that can be, else the second: `jacobian_kind` says which, `jacobian_note` why.
         roles: names for the variables, for messages; the function's own argument names otherwise.
         step: of the differences, in tangent units; one number, or for every variable a number or (dof,). A variable of 1e5
             needs a larger one than the default 1e-5.
@@ -52,11 +52,12 @@ class UserResidual(Residual):
             single variable.
 
     Attributes:
-        jacobian_kind: "analytic" or "numeric".
+        jacobian_kind: "analytic", "automatic" (docs/differentiation.md) or "numeric".
 
     Raises:
-        InputError: shapes that do not fit; a function that does not compile (with the reason Numba gives) or returns
-            another number of values, the latter when it is first called if its type does not tell.
+        InputError: shapes that do not fit; a function that does not compile or cannot be differentiated as it was asked for
+            (with the reason Numba gives), or returns another number of values, the latter when it is first called if its
+            type does not tell.
 
     Example:
         >>> def distance(beacon, robot, measured):
@@ -67,7 +68,7 @@ class UserResidual(Residual):
         array([[-0.39]])
     """
 
-    jacobian_kind: Literal["analytic", "numeric"]
+    jacobian_kind: Derivative
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class UserResidual(Residual):
         manifolds: Sequence[Manifold],
         data: Sequence[ArrayLike] = (),
         count: int | None = None,
-        jacobian: Callable[..., Any] | None = None,
+        jacobian: Callable[..., Any] | Literal["automatic", "differences"] | None = None,
         is_batch: bool = False,
         roles: Sequence[str] | None = None,
         step: float | Sequence[ArrayLike] = _STEP,
@@ -107,25 +108,28 @@ class UserResidual(Residual):
             whitening=Whitening.of(dim, rows, sigma=sigma, covariance=covariance, information=information),
             fixes_gauge=fixes_gauge,
         )
-        self.function, self.jacobian, self.is_batch = function, jacobian, is_batch
-        self.jacobian_kind = "numeric" if jacobian is None else "analytic"
+        wanted = _derivative(jacobian, is_batch)
+        self.function, self.is_batch = function, is_batch
+        self.jacobian = jacobian if callable(jacobian) else None
+        self.jacobian_kind = wanted or "numeric"
         self._steps = _difference_steps(step, connected)
-        tables = tuple(tangent_steps(manifold) for manifold in connected)
-        self._tables = tables if all(table is not None for table in tables) else None
         self._loops: Loops | None = None
         if not is_batch:
             types = tuple((d.dtype.name, d.ndim, shared) for d, shared in zip(self.data, self._is_shared, strict=True))
-            self._loops = compiled_loops(
-                function, jacobian, dim, tuple(manifold.dof for manifold in connected), types, self._tables is not None
-            )
+            self._loops = compiled_loops(function, self.jacobian, wanted, dim, connected, types)
+            self.jacobian_kind, self.jacobian_note = self._loops.derivative, self._loops.note
 
     def linearize_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask) -> None:
         if self._loops is not None and self._loops.linearize is not None:
-            extra: tuple[Any, ...] = ()
-            if self.jacobian is None and self._tables is not None:
-                self.evaluate_into(begin, end, x, index, r, valid)  # with bounds checked, which the differences are not
-                extra = (*self._tables, *self._steps)
-            self._run(self._loops.linearize, begin, end, (*x, *index, *self.data, *extra), (r, *jacobians, valid))
+            rows = (*x, *index, *self.data, *self._loops.tables)
+            if self.jacobian_kind == "analytic":
+                self._run(self._loops.linearize, begin, end, rows, (r, *jacobians, valid))
+                return
+            self.evaluate_into(begin, end, x, index, r, valid)  # with bounds checked, which the derivatives are not
+            if self.jacobian_kind == "automatic":
+                self._run(self._loops.linearize, begin, end, rows, (*jacobians, valid))
+            else:
+                self._run(self._loops.linearize, begin, end, (*rows, *self._steps), (r, *jacobians, valid))
             return
         self.evaluate_into(begin, end, x, index, r, valid)
         if self.jacobian is None:
@@ -250,6 +254,21 @@ class UserResidual(Residual):
             f"one beyond the end, in residual {residual} of {self.count}, whose arguments are {', '.join(named)}",
             "correct the index, or return None where there is no residual",
         )
+
+
+def _derivative(jacobian: Any, is_batch: bool) -> Derivative | None:
+    """What the argument `jacobian` asks for; None where it leaves the choice."""
+    if callable(jacobian):
+        return "analytic"
+    if jacobian is None or jacobian == "differences":
+        return "numeric" if is_batch or jacobian else None
+    if jacobian != "automatic" or is_batch:
+        raise InputError(
+            'a function as jacobian, "automatic" (but for a batch function, which is not compiled), "differences" or None',
+            repr(jacobian),
+            "leave it out: differences are taken where automatic differentiation cannot be",
+        )
+    return "automatic"
 
 
 def _data(number: int, array: ArrayLike) -> NDArray[Any]:

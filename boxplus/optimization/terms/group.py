@@ -160,7 +160,7 @@ class Group:
         self.loss = loss
         scaled = self.residual.count if loss.code != SQUARED else 0
         self._factor, self._projection = np.zeros(scaled), np.zeros(scaled)
-        self._fill = compiled_loss(loss.function)[0] if loss.function is not None else None
+        self._fill = compiled_loss(loss.taken_down)[0] if loss.taken_down is not None else None
         self._derivatives = np.zeros((scaled if self._fill is not None else 0, 3))
 
     def set_weights(self, weights: NDArray[np.float64] | None) -> None:
@@ -300,6 +300,11 @@ class Group:
             if row >= 0:
                 return int(row), f"Jacobian with respect to {role} ({connection.block.name!r})"
         return None
+
+
+def jacobian_notes(groups: Sequence[Group]) -> tuple[str, ...]:
+    """What a user should know of the Jacobians of each group."""
+    return tuple(f"{group.name}: {group.residual.jacobian_note}" for group in groups if group.residual.jacobian_note)
 
 
 def broadcast(rows: VariableRows, count: int) -> VariableRows:

@@ -1,0 +1,1 @@
+"""Derivatives of compiled functions by dual numbers (docs/differentiation.md)."""
