@@ -9,7 +9,7 @@ Source: Qin, Li and Shen, VINS-Mono, TRO 2018; Leutenegger et al., OKVIS, IJRR 2
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, overload
@@ -33,14 +33,13 @@ from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatc
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
-from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
+from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
+from boxplus.systems.visual_inertial_odometry.start.start import Start
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
-_TRY_EVERY_NS = 150_000_000  # a start in motion takes longer to look for than a frame lasts
 _OUTLIER = 4.0  # standard deviations
 _GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
-_LONGEST_START = 4.0  # of the times a start takes: frames that wait longer are let go
 
 
 class VisualInertialOdometry:
@@ -77,7 +76,6 @@ class VisualInertialOdometry:
         self.config = config or VioConfig()
         self.rig = rig if self.config.cameras == "all" else replace(rig, cameras=rig.cameras[:1], mountings=rig.mountings[:1])
         self.start: Start | None = None
-        self.start_problem: str | None = None
         self.window = Window(self.config, self.rig)
         if self.config.lines and any(camera.line_delay_s for camera in self.rig.cameras):
             raise InputError("cameras that take all rows at once, for lines", "a rolling shutter", "leave lines out")
@@ -88,9 +86,8 @@ class VisualInertialOdometry:
             self._line_tracker = LineTracker(require("cv2", "which finds lines"), self.rig, self.config.max_lines)
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
-        self._waiting: deque[Tracks] = deque()
+        self._search = StartSearch()
         self._time_ns = 0  # of the frame before
-        self._next_try_ns = 0
         self._health = Health(self.config)
         self._watch = InertialWatch(self.config.gravity)
         self._counters: Counter[str] = Counter()
@@ -157,6 +154,11 @@ class VisualInertialOdometry:
     def counters(self) -> Mapping[str, int]:
         """What could not be used before it reached the window, by reason."""
         return Counter({reason: count for reason, count in self._counters.items() if count})
+
+    @property
+    def start_problem(self) -> str | None:
+        """Which test of the start was not passed, with its number; None where there is a start."""
+        return self._search.problem
 
     @property
     def contradiction(self) -> str | None:
@@ -232,26 +234,19 @@ class VisualInertialOdometry:
 
     def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         turn = np.eye(3)
-        if self._waiting:
+        if self._search.seen:
             chosen = (self._imu.time_ns >= self._time_ns - 20_000_000) & (self._imu.time_ns <= time_ns + 20_000_000)
             attitude = GyroAttitude(self._imu.time_ns[chosen], self._imu.gyro[chosen])
             before, now = attitude.at(np.array([self._time_ns, time_ns]))
             turn = before.T @ now
         tracks = self._tracker.detect(self._tracker.track(time_ns, images, turn, None, self._rate(time_ns)))
-        self._waiting.append(tracks)
-        while time_ns - self._waiting[0].time_ns > _LONGEST_START * self.config.start_duration * 1e9:
-            self._waiting.popleft()
-        self._forget_imu(self._waiting[0].time_ns)
-        seen = list(self._waiting)
-        if time_ns < self._next_try_ns:
-            return self._nothing(tracks, self.start_problem or "the next frames are waited for")
-        self._next_try_ns = time_ns + _TRY_EVERY_NS
-        start = find_start(seen, self._imu, self.rig, self.config) if len(seen) > 1 else "one frame so far"
-        if isinstance(start, str):
-            self.start_problem = start
-            return self._nothing(tracks, start)
-        self.start, self.start_problem = start, None
-        self._waiting.clear()
+        self._search.add(tracks, self.config)
+        seen = list(self._search.seen)
+        self._forget_imu(seen[0].time_ns)
+        start = self._search.look(self._imu, self.rig, self.config)
+        if start is None:
+            return self._nothing(tracks, self._search.problem or "the next frames are waited for")
+        self.start, self._search = start, StartSearch()
         self.window.begin(start, [seen[k] for k in start.frames], self._imu)
         self.window.solve(_START_ITERATIONS)
         fit = self.window.reject(_OUTLIER)

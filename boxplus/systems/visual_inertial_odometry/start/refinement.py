@@ -29,6 +29,7 @@ _MISTAKE = 4.0  # standard deviations, of a sighting that is left out
 _FARTHEST = 100.0  # m, of a point to begin with
 _ROUNDS = (40, 30)
 _COST_TOLERANCE, _DAMPING = 1e-4, 1e-9
+_MISTAKEN, _NOISE = 40.0, 5.0  # %, times `pixel_sigma`: of sightings that can be believed
 _WRONG_SHARE = 0.34
 _FEWEST_SIGHTINGS, _FEWEST_TRACKS = 3, 15
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
@@ -99,8 +100,8 @@ def refine(
     pixel: float,
     pixel_sigma: float,
     bias_sigma: tuple[float, float],
-) -> Refined | None:
-    """Minimise over everything, leave out sightings that do not agree, minimise again; None where too few are left.
+) -> Refined | str:
+    """Minimise over everything, leave out sightings that do not agree, minimise again; or a sentence why the second is hopeless.
 
     Args:
         tracks: in K frames.
@@ -143,7 +144,12 @@ def refine(
         lost = (wrong > _WRONG_SHARE * seen) | ~agrees[motion.anchors] | (seen - wrong < _FEWEST_SIGHTINGS)
         used = agrees & ~lost[track_of]
         if np.count_nonzero(~lost) < _FEWEST_TRACKS:
-            return None
+            return "too few corners agree with any one motion"
+        mistaken = 100.0 * float(np.mean(~used))
+        if not mistaken < _MISTAKEN:
+            return f"{mistaken:.0f} % of the sightings agree with no one motion (at most {_MISTAKEN:g})"
+        if not sigma < _NOISE * pixel_sigma * pixel:
+            return f"corners deviate by {sigma / pixel:.2f} px (at most {_NOISE * pixel_sigma:g})"
     covariance = solution.joint_covariance(parts.gravity, *_alternating(parts))
     imu_squares = parts.imu.squares(solution.values)
     left = 2 * np.count_nonzero(used) - 3 * len(np.unique(track_of[used]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +16,9 @@ import pytest
 from boxplus.manifolds import quaternion
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
-from boxplus.systems.visual_inertial_odometry.start.start import Start, find_start
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
+from boxplus.systems.visual_inertial_odometry.start.start import Start
 
 CONFIG = VioConfig()
 
@@ -58,6 +60,14 @@ def test_one_camera_refuses_what_does_not_show_the_scale(bench, motion) -> None:
 def test_several_cameras_start_at_constant_velocity(bench) -> None:
     line = bench.run_seed(seed_of(bench, "constant velocity", 2))
     assert line["verdict"] == "right" and line["said"] == "moving stereo"
+
+
+def find_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioConfig) -> Start | str | None:
+    """What is found in all these frames at once."""
+    search = StartSearch()
+    for tracks in seen:
+        search.add(tracks, config)
+    return search.look(imu, rig, config) or search.problem
 
 
 def start_of(bench: ModuleType, motion: str, cameras: int, frames: int = 41) -> tuple[Start | str, object]:
