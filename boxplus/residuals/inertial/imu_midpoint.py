@@ -32,6 +32,8 @@ from boxplus.residuals.matrix3 import (
 )
 
 ALPHA, THETA, BETA, BIAS_ACCEL, BIAS_GYRO = 0, 3, 6, 9, 12  # first row of each block of the error state
+GAP_S = 0.1  # between samples: above it the midpoint rule is too coarse, and what happens between the samples counts
+_GAP_NS, _GAP_STEP_NS = round(1e9 * GAP_S), 10_000_000  # of a step across a gap
 
 
 @kernel(inline=True)
@@ -88,13 +90,14 @@ def integrate_interval(
     Args:
         time_ns: (S,); gyro, accel: (S, 3).
         first: last sample that is not after begin_ns.
-        variances: densities squared of gyroscope, accelerometer, gyroscope bias, accelerometer bias.
+        variances: (6,) densities squared of gyroscope, accelerometer, gyroscope bias, accelerometer bias, and of how angular
+            velocity and specific force wander within a gap.
         merged: whether neighbouring steps share the noise of their common sample (docs/residuals/imu_preintegration.md).
         alpha, beta: (3,); gamma_wxyz: (4,); P: (15, 15), order α, θ, β, b_a, b_g; J: (9, 6), α, θ, β by b_a, b_g. Written.
         R_work: (3, 3).
 
     Returns:
-        number of steps and the longest of them [s].
+        number of steps and the longest time between two samples used [s].
     """
     R0 = IDENTITY
     ax, ay, az = 0.0, 0.0, 0.0
@@ -113,20 +116,26 @@ def integrate_interval(
     wx, wy, wz = _sample(gyro, k, share, bias_gyro)
     v0x, v0y, v0z = _sample(accel, k, share, bias_accel)  # R₀ a₀
     while now < end_ns:
-        following = time_ns[k + one]
-        if following <= end_ns:
+        sampled = time_ns[k + one]
+        gap_ns = sampled - time_ns[k]
+        following, wander_gyro, wander_accel = min(sampled, end_ns), 0.0, 0.0
+        if gap_ns > _GAP_NS:
+            following = min(following, now + _GAP_STEP_NS)
+            # A random walk between two samples that are known leaves the integral that white noise of this density leaves.
+            twelfth = float(gap_ns) * float(gap_ns) * 1e-18 / 12.0
+            wander_gyro, wander_accel = twelfth * variances[4], twelfth * variances[5]
+        longest = max(longest, float(gap_ns) * 1e-9)
+        if following == sampled:
             w1x, w1y, w1z = _sample(gyro, k + one, 0.0, bias_gyro)
             a1x, a1y, a1z = _sample(accel, k + one, 0.0, bias_accel)
+            k += one
         else:
-            share = float(end_ns - time_ns[k]) / float(following - time_ns[k])
-            following = end_ns
+            share = float(following - time_ns[k]) / float(gap_ns)
             w1x, w1y, w1z = _sample(gyro, k, share, bias_gyro)
             a1x, a1y, a1z = _sample(accel, k, share, bias_accel)
-        longest = max(longest, float(time_ns[k + one] - time_ns[k]) * 1e-9)
         dt = float(following - now) * 1e-9
         half = 0.5 * dt
         now = following
-        k += one
         steps += 1
 
         # Rotation over the step, and the two specific forces in the first frame.
@@ -161,6 +170,7 @@ def integrate_interval(
         q_gyro, q_accel, q_flat = variances[0] / dt, variances[1] / dt, 0.0
         if not merged:
             q_gyro, q_accel, q_flat = 0.5 * q_gyro, 0.0, half * variances[1]
+        q_gyro, q_accel = q_gyro + wander_gyro / dt, q_accel + wander_accel / dt
         p_of_p = multiply_add(P_pp, K, transposed(P_p_bg))
         p_of_b = multiply_add(P_pb, K, transposed(P_b_bg))
         a_of_p = multiply_add(P_ap, P_a_bg, transposed(K))  # cov(α, φ')

@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
-from boxplus.residuals.inertial.imu_midpoint import integrate_batch
+from boxplus.residuals.inertial.imu_midpoint import GAP_S, integrate_batch
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.sample_checks import checked_bias, checked_intervals, checked_samples, rows_of
 
 _log = logging.getLogger(__name__)
 
-GAP_S = 0.1  # between samples; the midpoint rule is inaccurate above it (docs/residuals/imu_preintegration.md, singular cases)
 REINTEGRATE_ACCEL = 0.1  # m/s², change of bias above which the linear correction is given up
 REINTEGRATE_GYRO = 0.01  # rad/s
 SPARE_NS = 50_000_000  # of samples kept on both sides of intervals that were selected, by which they may still be shifted
@@ -97,7 +96,7 @@ class Preintegration:
         """Preintegrate one stream of samples over one or many intervals, which may overlap.
 
         Where an interval does not begin or end at a sample, one is interpolated. A gap between samples above 0.1 s is
-        logged as a warning and kept in `longest_gap_s`.
+        kept in `longest_gap_s`, and logged as a warning where the noise does not say what may happen within it.
 
         Args:
             time_ns: (S,) int64, strictly increasing.
@@ -137,7 +136,7 @@ class Preintegration:
         )
         result._integrate(np.arange(count, dtype=np.uint32))
         gaps = result.gaps
-        if gaps.size:
+        if gaps.size and not noise.gap_accel:
             _log.warning(
                 "%d of %d intervals contain a gap between IMU samples above %g s (the longest: %.3f s); "
                 "they are less accurate than their covariance says",

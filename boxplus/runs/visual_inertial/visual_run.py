@@ -262,8 +262,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if not silent or self._odometry.contradiction is not None:
             return []
         longest = max(gap.duration_s for gap in silent)
-        text = f"a gap of {longest:.2f} s in the samples of the IMU: images alone tell the way across it, and the poses before "
-        text += "and after it are less certain of each other than their covariance says"
+        text = f"a gap of {longest:.2f} s in the samples of the IMU: images alone tell the way across it"
         return [WarningFacts(text=text, count=len(silent), first_s=silent[0].begin_s)]
 
     def _cameras(self) -> list[CameraFacts]:

@@ -32,7 +32,7 @@ def preintegrated(run: FinishedRun, scans: NDArray[np.int64], velocity_bias: Flo
         bias_accel=velocity_bias[begin, 3:6],
         bias_gyro=velocity_bias[begin, 6:],
     )
-    unknown = (found.longest_gap_s > _LONGEST_GAP_S) | (found.steps < 2)
+    unknown = (found.longest_gap_s > _LONGEST_GAP_S) | (found.longest_gap_s >= found.duration_s)
     gap = np.where(unknown, np.minimum(found.longest_gap_s, found.duration_s), 0.0)
     if not gap.any():
         return found

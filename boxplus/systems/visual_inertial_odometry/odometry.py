@@ -185,10 +185,16 @@ class VisualInertialOdometry:
         return estimates
 
     def _has_imu_since_last_frame(self, time_ns: int) -> bool:
-        """Whether a sample lies between the newest frame and this time: without one they cannot be told apart by the IMU."""
+        """Whether a sample lies between the newest frame and this time: without one they cannot be told apart by the IMU.
+
+        Within a gap nothing else is to be had, and images tell the motion.
+        """
         since, until = self.window.frames[-1].time_ns + self.window.cut_ns, time_ns + self.window.cut_ns
         first, last = np.searchsorted(self._imu.time_ns, [since, until], side="right")
-        return bool(last > first) and bool(self._imu.time_ns[first] < until)
+        if last > first and self._imu.time_ns[first] < until:
+            return True
+        around = self._imu.time_ns[max(first - 1, 0) : first + 1]
+        return len(around) == 2 and 1e-9 * float(around[1] - around[0]) > self.config.max_imu_gap
 
     def _frame(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         if self.start is None:

@@ -133,7 +133,7 @@ class Window:
         """What the IMU measured from the newest frame to a time of the cameras' clock."""
         interval_ns = self.frames[-1].time_ns + self.cut_ns, time_ns + self.cut_ns
         spare_ns = SPARE_NS if self._config.time_offset_estimation else 0
-        return imu_step(imu, interval_ns, self.states.values[-1], self._noise, self._config.max_imu_gap, spare_ns)
+        return imu_step(imu, interval_ns, self.states.values[-1], self._noise, spare_ns)
 
     def _follow_clock(self) -> None:
         """Cut the IMU's intervals anew where the clocks' offset moved away from that they were cut at."""
@@ -165,8 +165,6 @@ class Window:
             self._next = None
             self._imu = step if self._imu is None else self._imu.append(step)
             self.gap_s = float(step.longest_gap_s[0])
-            if self.gap_s > self._config.max_imu_gap:  # such an interval is never made one with another
-                self.frames[-1].is_keyframe = is_keyframe = True
             self.last_step = step if self.gap_s <= self._config.max_imu_gap else None
         number = int(self.problem.extend(self.bodies, pose).ids[0])
         self.problem.extend(self.states, state)

@@ -137,6 +137,56 @@ def test_only_stale_intervals_are_integrated_anew() -> None:
     assert np.array_equal(base.reintegrated(ba, bg, where=np.ones(3, dtype=bool)).beta, expected.beta)
 
 
+WANDERING = ImuNoise(gyro=1e-4, accel=1e-3, gyro_walk=1e-6, accel_walk=1e-5, gap_gyro=0.3, gap_accel=4.0)
+
+
+def wandering_stream(seed: int, gap: slice, count: int = 200) -> tuple[np.ndarray, ...]:
+    """A second of samples that wander as `WANDERING` says, and those of them that are left with a gap."""
+    random = np.random.default_rng(seed)
+    time_ns = 10**18 + np.arange(count + 1) * (10**9 // count)
+    step = np.sqrt(1.0 / count)
+    gyro = np.cumsum(random.normal(size=(count + 1, 3)) * WANDERING.gap_gyro * step, axis=0)
+    accel = np.cumsum(random.normal(size=(count + 1, 3)) * WANDERING.gap_accel * step, axis=0)
+    accel[:, 2] += 9.81
+    left = np.ones(count + 1, dtype=bool)
+    left[gap] = False
+    return time_ns, gyro, accel, left
+
+
+@pytest.mark.parametrize(("gap", "cuts"), [(slice(20, 181), ()), (slice(20, 181), (60, 100, 140)), (slice(80, 121), ())])
+def test_what_happens_within_a_gap_is_as_uncertain_as_stated(gap: slice, cuts: tuple[int, ...]) -> None:
+    """Chained over intervals that end within the gap, too; a bridge is a little more certain of position than white noise."""
+    errors, covariances = [], []
+    for seed in range(300):
+        time_ns, gyro, accel, left = wandering_stream(seed, gap)
+        true = Preintegration.integrate(time_ns, gyro, accel, noise=WANDERING)
+        ends = time_ns[[0, *cuts, len(time_ns) - 1]]
+        holed = Preintegration.integrate(
+            time_ns[left], gyro[left], accel[left], noise=WANDERING, intervals_ns=np.stack([ends[:-1], ends[1:]], axis=1)
+        )
+        whole = holed.merge(0, len(cuts)) if cuts else holed
+        turn = so3.log(quaternion.to_matrix(whole.gamma_wxyz[0]).T @ quaternion.to_matrix(true.gamma_wxyz[0]))
+        errors.append(np.concatenate([true.alpha[0] - whole.alpha[0], turn, true.beta[0] - whole.beta[0]]))
+        covariances.append(whole.covariance[0, :9, :9])
+    squares = np.array([error @ np.linalg.solve(P, error) for error, P in zip(errors, covariances, strict=True)])
+    assert 5.5 < squares.mean() < 9.6  # 9 degrees of freedom; what position and velocity do beside each other is overstated
+    shares = np.mean(np.square(errors), axis=0) / np.mean([np.diag(P) for P in covariances], axis=0)
+    assert (shares[3:].reshape(2, 3).mean(axis=1) > 0.85).all() and (shares < 1.2).all()
+
+
+def test_gaps_keep_their_uncertainty_when_integrated_anew() -> None:
+    time_ns, gyro, accel, left = wandering_stream(0, slice(20, 181))
+    ends = time_ns[[0, 100, 200]]
+    holed = Preintegration.integrate(
+        time_ns[left], gyro[left], accel[left], noise=WANDERING, intervals_ns=np.stack([ends[:-1], ends[1:]], axis=1)
+    )
+    whole = Preintegration.integrate(time_ns[left], gyro[left], accel[left], noise=WANDERING)
+    np.testing.assert_allclose(holed.merge(0).covariance, whole.covariance, rtol=1e-6, atol=1e-12)
+    anew = holed.reintegrated(np.full(3, 1e-9), np.zeros(3), where=np.ones(2, dtype=bool))
+    np.testing.assert_allclose(anew.covariance, holed.covariance, rtol=1e-6, atol=1e-12)
+    assert holed.longest_gap_s.tolist() == [0.81, 0.81] and (np.linalg.eigvalsh(holed.covariance)[:, 0] > 0.0).all()
+
+
 def test_gaps_are_counted_and_told(caplog: pytest.LogCaptureFixture) -> None:
     time_ns, gyro, accel = random_stream(7, 20, longest_ns=9_000_000)
     time_ns[12:] += 150_000_000
@@ -146,6 +196,7 @@ def test_gaps_are_counted_and_told(caplog: pytest.LogCaptureFixture) -> None:
     assert found.gaps.tolist() == [1] and found.longest_gap_s[1] > 0.15
     assert "1 of 2 intervals contain a gap" in caplog.text
     caplog.clear()
+    Preintegration.integrate(time_ns, gyro, accel, noise=WANDERING, intervals_ns=intervals)
     Preintegration.integrate(time_ns, gyro, accel, noise=NOISE, intervals_ns=intervals[0])
     assert not caplog.records
 

@@ -51,6 +51,7 @@ _JUMPS = 0.3, 5.0  # rad/s, m/s²: standard deviations
 _EXCITATION = 0.3  # m/s²
 _NO_EXCITATION = "the acceleration varies by {:.2f} m/s² ({:g} are needed to see the scale)"
 _ANY = 10.0  # rad, m, m/s
+_GAP_GYRO, _GAP_ACCEL = 1.2, 4.0  # rad/s/√s, m/s²/√s: of the most restless bodies, in a hand and on stairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +148,8 @@ def imu_noise(rig: Rig, config: VioConfig) -> ImuNoise:
     """What the settings state, and where they do not, the rig."""
     given = (config.gyro_noise, config.accel_noise, config.gyro_bias_walk, config.accel_bias_walk)
     stated = (rig.noise.gyro, rig.noise.accel, rig.noise.gyro_walk, rig.noise.accel_walk)
-    return ImuNoise(*(mine if mine is not None else its for mine, its in zip(given, stated, strict=True)))
+    gyro, accel, gyro_walk, accel_walk = (mine if mine is not None else its for mine, its in zip(given, stated, strict=True))
+    return ImuNoise(gyro, accel, gyro_walk, accel_walk, _GAP_GYRO, _GAP_ACCEL)
 
 
 def shaken(noise: ImuNoise, imu: ImuSamples) -> ImuNoise:
