@@ -15,12 +15,13 @@ from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_origin, principal_spread
 from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
+from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics
 from boxplus.evaluation.time_offset import TimeOffset
 from boxplus.formats.trajectory import Trajectory
-from boxplus.manifolds import quaternion, so3
+from boxplus.manifolds import so3
 
 DELTAS = (Delta(10.0, "m"), Delta(1.0, "s"))
 """The deltas of relative errors that are computed where nothing else is asked for."""
@@ -225,7 +226,10 @@ def evaluate(
             warnings.append(_clock_doubt(noticed, other.offset_s, _rms(translation), _rms(errors)))
         except InputError:
             warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, _rms(translation), None))
-    warnings += _alignment_doubts(transform, translation, rotation)
+    warnings += [
+        *alignment_doubts(association, transform, translation, rotation),
+        *reading_doubts(association, transform, translation),
+    ]
     relative = []
     for delta in deltas:
         try:
@@ -320,26 +324,3 @@ def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: flo
 
 def _rms(errors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(errors**2)))
-
-
-def _alignment_doubts(alignment: Alignment, translation: NDArray[np.float64], rotation: NDArray[np.float64]) -> list[str]:
-    doubts = []
-    rmse = _rms(translation)
-    if alignment.kind in ("se3", "sim3") and alignment.spread_m[1] < rmse:
-        doubts.append(
-            f"the path strays {alignment.spread_m[1]:.3g} m from a straight line, less than the error of {rmse:.3g} m: the "
-            "rotation of the alignment about that line is mostly noise"
-        )
-    if alignment.mirrored:
-        doubts.append("a mirror image would fit better than any rotation: does one of the files have a flipped axis?")
-    mean = rotation.mean(axis=0)
-    constant = float(np.degrees(np.linalg.norm(mean)))
-    scatter = float(np.degrees(np.sqrt(np.mean(np.sum((rotation - mean) ** 2, axis=1)))))
-    if constant > 2.0 and scatter < 0.5 * constant:
-        w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
-        doubts.append(
-            f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
-            "and the rotation error and the relative errors contain that; the pose of the one body in the other's frame can be "
-            f"given, for this rotation with --transform-right 'xyz_qxyzw: 0 0 0 {x:.5f} {y:.5f} {z:.5f} {w:.5f}'"
-        )
-    return doubts

@@ -61,6 +61,40 @@ def test_known_errors_without_alignment() -> None:
     assert result.relative == ()
 
 
+def test_files_that_mean_something_else_are_told() -> None:
+    truth = SmoothPath(3).sample(T)
+    estimate = moved(disturbed(truth, 3), Rotation.random(rng=np.random.default_rng(3)), np.array([5.0, 1.0, 2.0]))
+
+    def told(one: Trajectory, other: Trajectory) -> str:
+        return "; ".join(evaluate(one, other).warnings)
+
+    def swapped(poses: Trajectory) -> Trajectory:
+        return Trajectory(poses.time_ns, poses.p, poses.q_wxyz[:, [3, 0, 1, 2]])
+
+    assert "quaternions of the estimate are taken for qw" in told(swapped(estimate), truth)
+    assert "quaternions of the ground truth are taken for qw" in told(estimate, swapped(truth))
+    assert "quaternions of both files are taken for qw" in told(swapped(estimate), swapped(truth))
+    still = Trajectory(estimate.time_ns, estimate.p, np.tile(estimate.q_wxyz[0], (len(estimate), 1)))
+    assert "never change" in told(still, truth)
+    R = Rotation.from_quat(estimate.q_wxyz[:, [1, 2, 3, 0]]).inv()
+    inverted = Trajectory(estimate.time_ns, -R.apply(estimate.p), R.as_quat()[:, [3, 0, 1, 2]])
+    assert "poses of the estimate seem to be those of the world in the body" in told(inverted, truth)
+    smaller = Trajectory(estimate.time_ns, 0.8 * estimate.p, estimate.q_wxyz)
+    assert "1.25 times as large" in told(smaller, truth)
+    plain = told(estimate, truth)
+    assert not any(word in plain for word in ("quaternions", "never", "inverted", "as large", "scatter by"))
+
+
+def test_a_heading_that_the_positions_do_not_determine_is_told() -> None:
+    rng = np.random.default_rng(4)
+    truth = SmoothPath(4).sample(T)
+    at_rest = Trajectory(truth.time_ns, 0.001 * rng.normal(size=truth.p.shape), truth.q_wxyz)
+    estimate = Trajectory(truth.time_ns, 0.02 * rng.normal(size=truth.p.shape), truth.q_wxyz)
+    warnings = evaluate(estimate, at_rest, alignment="yaw").warnings
+    assert any("heading of the alignment is mostly noise" in warning for warning in warnings)
+    assert not any("body frames" in warning for warning in warnings)
+
+
 def test_doubts_are_said() -> None:
     truth = SmoothPath(4).sample(np.arange(0.0, 30.0, 0.01))
     sparse = SmoothPath(4).sample(np.arange(2.0, 12.0, 0.1))

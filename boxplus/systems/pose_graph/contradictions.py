@@ -18,6 +18,7 @@ from boxplus.systems.pose_graph.start import components
 _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as that
 _WIDTHS = (1, 3, 10, 30)  # steps that a slip is spread over
 _WITNESSES = 3  # loop closures that agree with each other by more than chance
+_OBJECTING = 2  # loop closures that may have been kept by chance, or bent; more of them confirm the odometry
 
 
 def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]) -> list[str]:
@@ -27,6 +28,11 @@ def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]
         bridges: loop closures that were believed beforehand.
     """
     said = [bridge.sentence(graph) for bridge in bridges if bridge.is_contested]
+    if not verdict.is_kept[verdict.is_loop].any() and not bridges:
+        said.append(
+            f"all {np.count_nonzero(verdict.is_loop)} loop closures were refused, and the result is odometry alone: all are "
+            "false, or the odometry claims more than it can"
+        )
     label, before = components(with_edges(graph, verdict.is_kept)), components(graph)
     if label.max(initial=0) > before.max(initial=0):
         alone = np.setdiff1d(np.unique(label, return_index=True)[1], np.unique(before, return_index=True)[1]).astype(np.int64)
@@ -86,7 +92,7 @@ def _slip(graph: PoseGraph, verdict: LoopVerdict) -> str | None:
         most = int(spanned.max())
         steps = np.flatnonzero(spanned == most)
         objecting = int(confirmed[steps].min())
-        if most >= _WITNESSES and most > 2 * (objecting + 1) and most > best:
+        if most >= _WITNESSES and most > 2 * (objecting + 1) and objecting <= _OBJECTING and most > best:
             at = np.flatnonzero(confirmed[steps] == objecting)
             order = np.argsort(rank)
             first, last = (graph.ids[order[k]] for k in (steps[at[0]], steps[at[-1]] + 1))

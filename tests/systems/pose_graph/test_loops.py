@@ -103,6 +103,12 @@ def test_odometry_that_slipped_is_a_doubt_that_names_it(dimension, slip):
         assert result.doubt is not None and ("140" in result.doubt or "slipped" in result.doubt)
 
 
+def test_odometry_alone_is_a_doubt_where_all_loops_were_refused():
+    simulated = simulate_pose_graph(poses=100, loops=4, block=2, seed=1, false_share=1.0)
+    result = optimize_pose_graph(simulated.graph, GNC)
+    assert not result.loops.is_kept[simulated.is_loop].any() and "4 loop closures were refused" in result.doubt
+
+
 def test_names_in_no_order_leave_the_order_of_the_file():
     simulated = simulate_pose_graph(poses=300, seed=1, false_share=0.3)
     graph = replace(simulated.graph, ids=np.random.default_rng(0).permutation(300) * 7 + 3)

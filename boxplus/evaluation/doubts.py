@@ -1,0 +1,153 @@
+"""What to doubt about a comparison: an alignment that the positions do not determine, files that mean something else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.evaluation.alignment import Alignment, align
+from boxplus.evaluation.association import Association
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
+
+_W_LAST = [1, 2, 3, 0]  # takes for (w, x, y, z) what was read as (x, y, z, w)
+_FAR_DEG = 10.0  # scatter of the orientations' differences that no estimate of these positions has
+_CLEARLY = 0.2  # times the error as read, that of another reading has to reach
+_SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from 1, from which on a scale is told
+_FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
+_STILL_DEG, _TURNED_DEG = 0.1, 10.0
+
+
+def alignment_doubts(
+    association: Association, alignment: Alignment, translation: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> list[str]:
+    """What the positions do not determine, and what they fit better.
+
+    Args:
+        translation: (M,) errors [m]. rotation: (M, 3) rotation vectors from the estimate's to the true orientations [rad].
+    """
+    doubts = []
+    rmse = _rms(translation)
+    about_line = alignment.kind in ("se3", "sim3") and alignment.spread_m[1] < rmse
+    if about_line:
+        doubts.append(
+            f"the path strays {alignment.spread_m[1]:.3g} m from a straight line, less than the error of {rmse:.3g} m: the "
+            "rotation of the alignment about that line is mostly noise"
+        )
+    flat = association.ground_truth.p[:, :2]
+    wide = float(np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    undetermined = alignment.kind == "yaw" and wide < rmse
+    if undetermined:
+        doubts.append(
+            f"the path spreads over {wide:.3g} m horizontally, less than the error of {rmse:.3g} m: the heading of the alignment "
+            "is mostly noise"
+        )
+    if alignment.mirrored:
+        doubts.append("a mirror image would fit better than any rotation: does one of the files have a flipped axis?")
+    mean = rotation.mean(axis=0)
+    constant = float(np.degrees(np.linalg.norm(mean)))
+    scatter = float(np.degrees(np.sqrt(np.mean(np.sum((rotation - mean) ** 2, axis=1)))))
+    if constant > 2.0 and scatter < min(0.5 * constant, _FAR_DEG) and not (undetermined or about_line):
+        w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
+        doubts.append(
+            f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
+            "and the rotation error and the relative errors contain that; the pose of the one body in the other's frame can be "
+            f"given, for this rotation with --transform-right 'xyz_qxyzw: 0 0 0 {x:.5f} {y:.5f} {z:.5f} {w:.5f}'"
+        )
+    return doubts
+
+
+def reading_doubts(association: Association, alignment: Alignment, translation: NDArray[np.float64]) -> list[str]:
+    """Whether files agree far better read in another way: order of the quaternion, inverted poses, another scale."""
+    estimate, truth, rmse = association.estimate, association.ground_truth, _rms(translation)
+    return [
+        *_orientation_doubts(estimate, truth, alignment, rmse),
+        *_inversion_doubts(estimate, truth, alignment, rmse),
+        *_scale_doubts(estimate, truth, alignment),
+    ]
+
+
+def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
+    R = alignment.R_world_estimate
+    scatter = _scatter_deg(R @ estimate.R, truth.R)
+    if scatter < _FAR_DEG:
+        return
+    for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
+        if _turned_deg(one) < _STILL_DEG and _turned_deg(other) > _TURNED_DEG:
+            yield (
+                f"the orientations of the {name} never change: it has none, and the rotation error and the relative errors mean "
+                "nothing"
+            )
+            return
+    swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
+    ways = {
+        "the estimate": _scatter_deg(R @ swapped[0], truth.R),
+        "the ground truth": _scatter_deg(R @ estimate.R, swapped[1]),
+        "both files": _scatter_deg(R @ swapped[0], swapped[1]),
+    }
+    way = min(ways, key=lambda name: ways[name])
+    if ways[way] < _CLEARLY * scatter:
+        yield (
+            f"the orientations scatter by {scatter:.0f}° as they were read, and by {ways[way]:.1f}° if the quaternions of {way} "
+            "are taken for qw qx qy qz: reorder the columns, the rotation error and the relative errors mean nothing"
+        )
+    elif rmse < _FITS * alignment.spread_m[0]:  # else what makes the positions differ turns them, too
+        yield (
+            f"the orientations scatter by {scatter:.0f}° against the ground truth's: another convention, or none; "
+            "look at the positions alone"
+        )
+
+
+def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
+    if alignment.kind not in ("se3", "sim3", "yaw"):
+        return
+    for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
+        p = -np.einsum("nba,nb->na", one.R, one.p)
+        try:
+            found = align(p, other.p, "sim3" if alignment.kind == "sim3" else "se3")
+        except InputError:
+            continue
+        moved = found.apply(replace(one, p=p, covariance=None, lines=None)).p
+        error = _rms(np.linalg.norm(moved - other.p, axis=1))
+        if error < _CLEARLY * rmse:
+            yield (
+                f"the poses of the {name} seem to be those of the world in the body: inverted, the ATE is {error:.4g} m instead "
+                f"of {rmse:.4g} m"
+            )
+
+
+def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Iterator[str]:
+    if alignment.kind != "se3":
+        return
+    try:
+        rigid, found = align(estimate.p, truth.p), align(estimate.p, truth.p, "sim3")
+    except InputError:
+        return
+    rmse, error = (_rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
+    if error < min(_SCALED * rmse, _FITS * rigid.spread_m[0]) and abs(found.scale - 1.0) > _SCALE:
+        yield (
+            f"{found.scale:.4g} times as large the estimate has an ATE of {error:.4g} m instead of {rmse:.4g} m: a wrong scale "
+            "is most of its error (--align sim3, for an estimate that has none)"
+        )
+
+
+def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> float:
+    """Root mean square of how far relative rotations are from their mean [degrees]."""
+    between = np.swapaxes(R_other, 1, 2) @ R_one
+    U, _, Vt = np.linalg.svd(between.mean(axis=0))
+    mean = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
+    return float(np.degrees(_rms(np.linalg.norm(so3.log(mean.T @ between), axis=1))))
+
+
+def _turned_deg(trajectory: Trajectory) -> float:
+    """The largest turn from the first orientation [degrees]."""
+    R = trajectory.R
+    return float(np.degrees(np.linalg.norm(so3.log(R[0].T @ R), axis=1).max()))
+
+
+def _rms(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
