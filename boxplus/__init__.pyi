@@ -23,11 +23,13 @@ from .formats.reconstructions.reconstruction import read_reconstruction as read_
 from .formats.trajectory import Trajectory as Trajectory
 from .formats.trajectory import read_trajectory as read_trajectory
 from .manifolds.body_pose import BodyPose as BodyPose
+from .manifolds.camera_pose import CameraPose as CameraPose
 from .manifolds.euclidean import Euclidean as Euclidean
 from .manifolds.lines import Line3D as Line3D
 from .manifolds.manifold import Manifold as Manifold
 from .manifolds.product import Product as Product
 from .manifolds.quaternion import UnitQuaternion as UnitQuaternion
+from .manifolds.quaternion import UnitQuaternionLeft as UnitQuaternionLeft
 from .manifolds.se2 import SE2 as SE2
 from .manifolds.se3 import SE3 as SE3
 from .manifolds.se3 import SE3Left as SE3Left

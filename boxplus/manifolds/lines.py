@@ -19,9 +19,18 @@ from boxplus.errors import InputError
 from boxplus.manifolds._batch import as_batch, map_batch
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.quaternion import exp_scalars, from_matrix, multiply_scalars, normalized_scalars, rotation_entries
+from boxplus.manifolds.quaternion import (
+    exp_scalars,
+    from_matrix,
+    multiply_scalars,
+    normalized_scalars,
+    rotation_entries,
+    to_matrix,
+)
 from boxplus.manifolds.se2 import wrapped_angle
-from boxplus.manifolds.so3 import log_quaternion, right_jacobian_into, right_jacobian_inverse_into
+from boxplus.manifolds.se3 import SE3Left
+from boxplus.manifolds.so3 import hat, log_quaternion, right_jacobian_into, right_jacobian_inverse_into
+from boxplus.manifolds.tangent_change import tangent_change
 
 _NO_MOMENT = 1e-12  # ‖m‖ below this share of ‖d‖ has no direction of its own: the line goes through the origin
 
@@ -108,6 +117,59 @@ def from_points(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
     start, end = np.broadcast_arrays(np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64))
     d = end - start
     return from_plucker(np.concatenate([np.cross(start, d), d], axis=-1))
+
+
+def motion_matrix(T_ab: ArrayLike) -> NDArray[np.float64]:
+    """[[R, [t]x R], [0, R]] (..., 6, 6) of motions (..., 7): L_a = M L_b of Plücker coordinates [m; d] (docs/lines.md).
+
+    The same matrix is ∂L_a/∂L_b. Bartoli and Sturm, Structure from motion using lines, 2005, section 3.1: the line motion matrix.
+
+    Example:
+        >>> motion_matrix([1.0, 0, 0, 0, 0, 0, 2.0])[0]  # m grows by t × d
+        array([ 1.,  0.,  0.,  0., -2.,  0.])
+    """
+    rows, lead = as_batch("T_ab", T_ab, (7,))
+    R = to_matrix(rows[:, :4])
+    M = np.zeros((len(rows), 6, 6))
+    M[:, :3, :3] = M[:, 3:, 3:] = R
+    M[:, :3, 3:] = hat(rows[:, 4:]) @ R
+    return M.reshape((*lead, 6, 6))
+
+
+def transform(T_ab: ArrayLike, L_b: ArrayLike) -> NDArray[np.float64]:
+    """Plücker coordinates [m; d] (..., 6) in a of those in b: m_a = R m + t × R d, d_a = R d.
+
+    Example:
+        >>> transform([1.0, 0, 0, 0, 0, 0, 2.0], [0.0, 0, 0, 1, 0, 0])  # the x axis, two metres up: m = p × d
+        array([0., 2., 0., 1., 0., 0.])
+    """
+    return np.asarray((motion_matrix(T_ab) @ np.asarray(L_b, dtype=np.float64)[..., None])[..., 0])
+
+
+def transform_jacobian(T_ab: ArrayLike, L_b: ArrayLike, manifold: Manifold = SE3Left) -> NDArray[np.float64]:
+    """∂L_a/∂δ (..., 6, 6) of `transform` by the motion, which moves on `manifold`: any update of a pose (docs/lines.md).
+
+    On the left it is [[−[m_a]x, −[d_a]x], [−[d_a]x, 0]]; on `CameraPose`, whose translation is added, −[R m]x − [t]x [d_a]x takes
+    the place of −[m_a]x.
+
+    Raises:
+        InputError: no update of a pose (7,).
+
+    Example:
+        >>> J = transform_jacobian([1.0, 0, 0, 0, 0, 0, 2.0], [0.0, 0, 0, 1, 0, 0])
+        >>> J[:, 4] + 0.0  # moving it along y: m gains e_y × d
+        array([ 0.,  0., -1.,  0.,  0.,  0.])
+    """
+    L_a = transform(T_ab, L_b)
+    J = np.zeros((*L_a.shape, 6))
+    J[..., :3, :3] = -hat(L_a[..., :3])
+    J[..., :3, 3:] = J[..., 3:, :3] = -hat(L_a[..., 3:])
+    rows = J.reshape(-1, 6, 6)
+    change = tangent_change(SE3Left, manifold)
+    if change is not None:
+        T = np.ascontiguousarray(np.broadcast_to(np.asarray(T_ab, dtype=np.float64), (*L_a.shape[:-1], 7))).reshape(-1, 7)
+        change(0, len(rows), T, np.arange(len(rows), dtype=np.uint32), rows)
+    return rows.reshape(J.shape)
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
-from boxplus.manifolds._batch import map_batch, map_pairs
+from boxplus.errors import InputError
+from boxplus.manifolds._batch import as_batch, map_batch, map_pairs
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.so3 import (
     SERIES_SWITCH,
+    hat,
     log_quaternion,
     quaternion_scalars,
     right_jacobian_batch,
@@ -133,48 +136,149 @@ def multiply(p_wxyz: ArrayLike, q_wxyz: ArrayLike) -> NDArray[np.float64]:
     return map_pairs(_multiply_batch, "p_wxyz", p_wxyz, 4, "q_wxyz", q_wxyz, 4, 4)
 
 
+def left_matrix(q_wxyz: ArrayLike) -> NDArray[np.float64]:
+    """[q]_L (..., 4, 4) of quaternions wxyz (..., 4): q ⊗ p = [q]_L p, linear in p (docs/manifolds.md).
+
+    Example:
+        >>> q, p = [0.5, 0.5, 0.5, 0.5], [0.0, 1.0, 0.0, 0.0]
+        >>> left_matrix(q) @ p, multiply(q, p)
+        (array([-0.5,  0.5,  0.5, -0.5]), array([-0.5,  0.5,  0.5, -0.5]))
+    """
+    return _product_matrix(q_wxyz, 1.0)
+
+
+def right_matrix(q_wxyz: ArrayLike) -> NDArray[np.float64]:
+    """[q]_R (..., 4, 4) of quaternions wxyz (..., 4): p ⊗ q = [q]_R p, linear in p (docs/manifolds.md).
+
+    Example:
+        >>> q, p = [0.5, 0.5, 0.5, 0.5], [0.0, 1.0, 0.0, 0.0]
+        >>> right_matrix(q) @ p, multiply(p, q)
+        (array([-0.5,  0.5, -0.5,  0.5]), array([-0.5,  0.5, -0.5,  0.5]))
+    """
+    return _product_matrix(q_wxyz, -1.0)
+
+
+def _product_matrix(q_wxyz: ArrayLike, sign: float) -> NDArray[np.float64]:
+    """[w, −vᵀ; v, w I ± [v]×]."""
+    rows, lead = as_batch("q_wxyz", q_wxyz, (4,))
+    M = np.zeros((len(rows), 4, 4))
+    M[:, 0, 1:], M[:, 1:, 0] = -rows[:, 1:], rows[:, 1:]
+    M[:, 1:, 1:] = sign * hat(rows[:, 1:])
+    M[:, range(4), range(4)] = rows[:, :1]
+    return M.reshape((*lead, 4, 4))
+
+
+def from_half_angle_vector(epsilon: ArrayLike) -> NDArray[np.float64]:
+    """Quaternions [√(1 − εᵀε), ε] (..., 4) of half-angle vectors ε = sin(θ/2) axis (..., 3), up to half a turn.
+
+    Raises:
+        InputError: longer than 1.
+
+    Example:
+        >>> from_half_angle_vector([0.6, 0.0, 0.0])
+        array([0.8, 0.6, 0. , 0. ])
+    """
+    rows, lead = as_batch("epsilon", epsilon, (3,))
+    square = (rows * rows).sum(axis=1)
+    if not (square <= 1.0).all():
+        row = int(np.argmin(square <= 1.0))
+        raise InputError("half-angle vectors no longer than 1", f"{rows[row]} in row {row}", "rotation vectors have `so3.exp`")
+    return np.column_stack([np.sqrt(1.0 - square), rows]).reshape((*lead, 4))
+
+
+def to_half_angle_vector(q_wxyz: ArrayLike) -> NDArray[np.float64]:
+    """Half-angle vectors ε = sin(θ/2) axis (..., 3) of unit quaternions wxyz (..., 4), of q and −q alike.
+
+    Example:
+        >>> to_half_angle_vector([-0.8, -0.6, 0.0, 0.0])
+        array([ 0.6, -0. , -0. ])
+    """
+    rows, lead = as_batch("q_wxyz", q_wxyz, (4,))
+    return np.asarray(np.where(rows[:, :1] < 0.0, -rows[:, 1:], rows[:, 1:])).reshape((*lead, 3))
+
+
+def rotation_jacobian(
+    q_wxyz: ArrayLike, p: ArrayLike, by: Literal["quaternion", "right", "left", "half_angle"] = "quaternion"
+) -> NDArray[np.float64]:
+    """Derivative of the rotated point q ⊗ [0, p] ⊗ q* (..., 3) of p (..., 3) by its rotation (docs/manifolds.md).
+
+    Args:
+        by: the "quaternion" as four free numbers, (..., 3, 4): 2 [w p + v × p | vᵀp I + v pᵀ − p vᵀ − w [p]×] (Solà, Quaternion
+            kinematics for the error-state Kalman filter, 2017, equation 174). A rotation vector on the "right", −R [p]×, or the
+            "left", −[R p]×, or the "half_angle" vector on the right, −2 R [p]×: (..., 3, 3).
+
+    Example:
+        >>> rotation_jacobian([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0], by="right") + 0.0  # turning about z moves x along y
+        array([[ 0.,  0.,  0.],
+               [ 0.,  0.,  1.],
+               [ 0., -1.,  0.]])
+    """
+    q, p = np.asarray(q_wxyz, dtype=np.float64), np.asarray(p, dtype=np.float64)
+    if by == "quaternion":
+        w, v = q[..., :1], q[..., 1:]
+        J = np.empty((*np.broadcast_shapes(v.shape, p.shape), 4))
+        J[..., 0] = w * p + np.cross(v, p)
+        J[..., 1:] = (v * p).sum(axis=-1)[..., None, None] * np.eye(3) - w[..., None] * hat(p)
+        J[..., 1:] += v[..., :, None] * p[..., None, :] - p[..., :, None] * v[..., None, :]
+        return 2.0 * J
+    R = to_matrix(q)
+    if by == "left":
+        return np.asarray(-hat((R @ p[..., None])[..., 0]))
+    if by not in ("right", "half_angle"):
+        raise InputError('by "quaternion", "right", "left" or "half_angle"', repr(by), "see docs/manifolds.md")
+    return np.asarray((-2.0 if by == "half_angle" else -1.0) * R @ hat(p))
+
+
 @kernel
-def _boxplus_batch(x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def _boxplus_batch(x: NDArray[np.float64], delta: NDArray[np.float64], is_left: bool, out: NDArray[np.float64]) -> None:
     for i in range(x.shape[0]):
         w, a, b, c = exp_scalars(delta[i, 0], delta[i, 1], delta[i, 2])
-        w, a, b, c = multiply_scalars(x[i, 0], x[i, 1], x[i, 2], x[i, 3], w, a, b, c)
+        if is_left:
+            w, a, b, c = multiply_scalars(w, a, b, c, x[i, 0], x[i, 1], x[i, 2], x[i, 3])
+        else:
+            w, a, b, c = multiply_scalars(x[i, 0], x[i, 1], x[i, 2], x[i, 3], w, a, b, c)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = normalized_scalars(w, a, b, c)
 
 
 @kernel
-def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def _boxminus_batch(x: NDArray[np.float64], base: NDArray[np.float64], is_left: bool, out: NDArray[np.float64]) -> None:
     for i in range(x.shape[0]):
-        w, a, b, c = multiply_scalars(base[i, 0], -base[i, 1], -base[i, 2], -base[i, 3], x[i, 0], x[i, 1], x[i, 2], x[i, 3])
+        bw, bx, by, bz = base[i, 0], -base[i, 1], -base[i, 2], -base[i, 3]
+        if is_left:
+            w, a, b, c = multiply_scalars(x[i, 0], x[i, 1], x[i, 2], x[i, 3], bw, bx, by, bz)
+        else:
+            w, a, b, c = multiply_scalars(bw, bx, by, bz, x[i, 0], x[i, 1], x[i, 2], x[i, 3])
         out[i, 0], out[i, 1], out[i, 2] = log_quaternion(w, a, b, c)
 
 
 @dataclass(frozen=True, repr=False)
 class _UnitQuaternion(KernelManifold):
-    """Rotations stored wxyz (4,), moved by rotation vectors (3,) on the right: q ⊗ Exp_q(w).
+    """Rotations stored wxyz (4,), moved by rotation vectors (3,): on the right, q ⊗ Exp_q(w), or on the left, Exp_q(w) ⊗ q.
 
     Example:
         >>> bp.UnitQuaternion.boxplus([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(3)
         array([0.707, 0.   , 0.   , 0.707])
     """
 
-    name = "UnitQuaternion"
+    name: str
+    is_left: bool
     size = 4
     dof = 3
     tangent_names = ("rotation x [rad]", "rotation y [rad]", "rotation z [rad]")
 
     def boxplus_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        _boxplus_batch(x, delta, out)
+        _boxplus_batch(x, delta, self.is_left, out)
 
     def boxminus_into(self, x: NDArray[np.float64], base: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        _boxminus_batch(x, base, out)
+        _boxminus_batch(x, base, self.is_left, out)
 
     def boxplus_jacobian_into(self, x: NDArray[np.float64], delta: NDArray[np.float64], J: NDArray[np.float64]) -> None:
-        right_jacobian_batch(delta, J)
+        right_jacobian_batch(-delta if self.is_left else delta, J)  # J_l(w) = J_r(−w)
 
     def boxminus_jacobian_into(self, x: NDArray[np.float64], base: NDArray[np.float64], J: NDArray[np.float64]) -> None:
         difference = np.empty((len(x), 3))
-        _boxminus_batch(x, base, difference)
-        right_jacobian_inverse_batch(difference, J)
+        _boxminus_batch(x, base, self.is_left, difference)
+        right_jacobian_inverse_batch(-difference if self.is_left else difference, J)
 
     def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
         rows = super().check(name, x)
@@ -190,4 +294,5 @@ class _UnitQuaternion(KernelManifold):
         return q
 
 
-UnitQuaternion: Manifold = _UnitQuaternion()
+UnitQuaternion: Manifold = _UnitQuaternion("UnitQuaternion", False)
+UnitQuaternionLeft: Manifold = _UnitQuaternion("UnitQuaternionLeft", True)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
-from boxplus.manifolds._batch import map_batch, map_pairs
+from boxplus.manifolds._batch import as_batch, map_batch, map_pairs
 from boxplus.manifolds._kernel_manifold import KernelManifold, normalize_quaternions
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.quaternion import half_angle, multiply_scalars, normalized_scalars, rotate, rotation_entries
@@ -27,12 +27,13 @@ from boxplus.manifolds.se3_jacobians import (
     right_jacobian_inverse,
     right_jacobian_inverse_into,
 )
-from boxplus.manifolds.so3 import SERIES_SWITCH, exp_coefficients, log_quaternion
+from boxplus.manifolds.so3 import SERIES_SWITCH, exp_coefficients, hat, log_quaternion
 
 __all__ = [
     "SE3",
     "SE3Left",
     "act",
+    "ad",
     "adjoint",
     "adjoint_into",
     "between_into",
@@ -252,6 +253,22 @@ def inverse(T_ab: ArrayLike) -> NDArray[np.float64]:
 def act(T_ab: ArrayLike, p_b: ArrayLike) -> NDArray[np.float64]:
     """Points p_a = T_ab p_b, (..., 3)."""
     return map_pairs(_act_batch, "T_ab", T_ab, 7, "p_b", p_b, 3, 3)
+
+
+def ad(xi: ArrayLike) -> NDArray[np.float64]:
+    """ad(ξ) = [[[w]x, 0], [[v]x, [w]x]] (..., 6, 6) of ξ = [w, v] (..., 6): ad(a) b is the Lie bracket, Ad(Exp(ξ)) = exp(ad(ξ)).
+
+    I + ½ ad(e) is J_r⁻¹(e) to first order (docs/manifolds.md; Barfoot, State Estimation for Robotics, 2017, section 7.1).
+
+    Example:
+        >>> ad([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) @ [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]  # turning about z, moving along x
+        array([0., 0., 0., 0., 1., 0.])
+    """
+    rows, lead = as_batch("xi", xi, (6,))
+    A = np.zeros((len(rows), 6, 6))
+    A[:, :3, :3] = A[:, 3:, 3:] = hat(rows[:, :3])
+    A[:, 3:, :3] = hat(rows[:, 3:])
+    return A.reshape((*lead, 6, 6))
 
 
 def adjoint(T: ArrayLike) -> NDArray[np.float64]:

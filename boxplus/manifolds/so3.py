@@ -203,6 +203,16 @@ def hat(w: ArrayLike) -> NDArray[np.float64]:
     return matrices.reshape((*lead, 3, 3))
 
 
+def ad(w: ArrayLike) -> NDArray[np.float64]:
+    """ad(w) = [w]x (..., 3, 3) of (..., 3): ad(a) b = a × b is the Lie bracket, and Exp(w) = exp(ad(w)) is the adjoint.
+
+    Example:
+        >>> ad([0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]
+        array([0., 1., 0.])
+    """
+    return hat(w)
+
+
 def boxplus(R: ArrayLike, w: ArrayLike) -> NDArray[np.float64]:
     """R ⊞ w = R Exp(w): right (local) update."""
     return np.asarray(np.asarray(R, dtype=np.float64) @ exp(w))

@@ -22,6 +22,7 @@ from boxplus.manifolds.tangent_step import (
     MOVE_PLANE,
     MOVE_SCALED,
     TILT,
+    TURN_ALONE,
     TURN_LEFT,
     TURN_RIGHT,
     tangent_steps,
@@ -49,13 +50,14 @@ def tangent_basis_into(
             basis[r, c], basis[r + 1, c], basis[r + 2, c], basis[r + 3, c] = multiply_scalars(
                 x[s], x[s + 1], x[s + 2], x[s + 3], 0.0, 0.5 * e0, 0.5 * e1, 0.5 * e2
             )
-        elif kind == TURN_LEFT:
+        elif kind == TURN_LEFT or kind == TURN_ALONE:  # noqa: SIM109 - a tuple is slower
             basis[r, c], basis[r + 1, c], basis[r + 2, c], basis[r + 3, c] = multiply_scalars(
                 0.0, 0.5 * e0, 0.5 * e1, 0.5 * e2, x[s], x[s + 1], x[s + 2], x[s + 3]
             )
-            basis[r + 4, c] = e1 * x[s + 6] - e2 * x[s + 5]
-            basis[r + 5, c] = e2 * x[s + 4] - e0 * x[s + 6]
-            basis[r + 6, c] = e0 * x[s + 5] - e1 * x[s + 4]
+            if kind == TURN_LEFT:
+                basis[r + 4, c] = e1 * x[s + 6] - e2 * x[s + 5]
+                basis[r + 5, c] = e2 * x[s + 4] - e0 * x[s + 6]
+                basis[r + 6, c] = e0 * x[s + 5] - e1 * x[s + 4]
         elif kind == MOVE_LOCAL or kind == MOVE_SCALED:  # noqa: SIM109 - a tuple is slower
             size = x[s + 7] if kind == MOVE_SCALED else 1.0
             basis[r + 4, c], basis[r + 5, c], basis[r + 6, c] = rotate(

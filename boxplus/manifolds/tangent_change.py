@@ -1,9 +1,9 @@
 """The one place where a Jacobian goes over from one ⊞ of a pose to another (docs/manifolds.md).
 
-A pose (7,) moves on the right, `SE3`; on the left, `SE3Left`; or with its rotation on the right and its translation by
-addition, `BodyPose`. To first order the same motion is, with T = (R, t),
+A pose (7,) moves on the right, `SE3`; on the left, `SE3Left`; with its translation by addition and its rotation on the right,
+`BodyPose`, or on the left, `CameraPose`. To first order the same motion is, with T = (R, t),
 
-    δ_left = Ad_T δ_right,    δ_product = diag(I, R) δ_right,
+    δ_left = Ad_T δ_right,    δ_body = diag(I, R) δ_right,    δ_camera = diag(R, R) δ_right,
 
 so a Jacobian, which multiplies δ from the left, changes by the same matrices on its right side: J_right = J_left Ad_T. Products
 change component by component: a camera on `Product(SE3Left, Euclidean(3))` may move on `Product(SE3, Euclidean(3))`.
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.body_pose import BodyPose
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import rotate
@@ -26,9 +27,9 @@ from boxplus.manifolds.se3 import SE3, SE3Left
 
 TangentChange = Callable[[int, int, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]], None]
 
-POSES: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose)
+POSES: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose, CameraPose)
 """The updates of a pose (7,) that change into each other."""
-_RIGHT, _LEFT = 0, 1  # positions in POSES
+_RIGHT, _LEFT, _CAMERA = 0, 1, 3  # positions in POSES
 
 
 @kernel
@@ -57,13 +58,15 @@ def _change(
             b0, b1, b2 = J[n, row, c + 3], J[n, row, c + 4], J[n, row, c + 5]
             if native == _LEFT:  # [a, b] Ad = [(a + b [t]x) R, b R], and b [t]x is the row b × t
                 a0, a1, a2 = a0 + b1 * tz - b2 * ty, a1 + b2 * tx - b0 * tz, a2 + b0 * ty - b1 * tx
+            if native in (_LEFT, _CAMERA):
                 a0, a1, a2 = rotate(qw, -qx, -qy, -qz, a0, a1, a2)
             if native != _RIGHT:
                 b0, b1, b2 = rotate(qw, -qx, -qy, -qz, b0, b1, b2)
             if actual != _RIGHT:
                 b0, b1, b2 = rotate(qw, qx, qy, qz, b0, b1, b2)
-            if actual == _LEFT:  # [a, b] Ad⁻¹ = [a Rᵀ − b Rᵀ [t]x, b Rᵀ]
+            if actual in (_LEFT, _CAMERA):
                 a0, a1, a2 = rotate(qw, qx, qy, qz, a0, a1, a2)
+            if actual == _LEFT:  # [a, b] Ad⁻¹ = [a Rᵀ − b Rᵀ [t]x, b Rᵀ]
                 a0, a1, a2 = a0 - (b1 * tz - b2 * ty), a1 - (b2 * tx - b0 * tz), a2 - (b0 * ty - b1 * tx)
             J[n, row, c], J[n, row, c + 1], J[n, row, c + 2] = a0, a1, a2
             J[n, row, c + 3], J[n, row, c + 4], J[n, row, c + 5] = b0, b1, b2

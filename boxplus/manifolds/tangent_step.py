@@ -14,14 +14,14 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion, multiply_scalars, rotate
+from boxplus.manifolds.quaternion import UnitQuaternion, UnitQuaternionLeft, multiply_scalars, rotate
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.sim3 import Sim3
 from boxplus.manifolds.so3 import SO3
 from boxplus.manifolds.sphere import S2, basis_scalars
 
-ADD, TURN_RIGHT, TURN_LEFT, MOVE_LOCAL, TURN_MATRIX, MOVE_PLANE, MOVE_SCALED, GROW, TILT = range(9)
+ADD, TURN_RIGHT, TURN_LEFT, MOVE_LOCAL, TURN_MATRIX, MOVE_PLANE, MOVE_SCALED, GROW, TILT, TURN_ALONE = range(10)
 
 
 def tangent_steps(manifold: Manifold) -> NDArray[np.int64] | None:
@@ -30,6 +30,8 @@ def tangent_steps(manifold: Manifold) -> NDArray[np.int64] | None:
         rows = [(ADD, k, 0) for k in range(manifold.n)]
     elif manifold == UnitQuaternion:
         rows = [(TURN_RIGHT, 0, k) for k in range(3)]
+    elif manifold == UnitQuaternionLeft:
+        rows = [(TURN_ALONE, 0, k) for k in range(3)]
     elif manifold == SE3:
         rows = [(TURN_RIGHT, 0, k) for k in range(3)] + [(MOVE_LOCAL, 0, k) for k in range(3)]
     elif manifold == SE3Left:
@@ -88,10 +90,11 @@ def step_into(
         out[s], out[s + 1], out[s + 2], out[s + 3] = multiply_scalars(
             x[s], x[s + 1], x[s + 2], x[s + 3], cos_half, sin_half * e0, sin_half * e1, sin_half * e2
         )
-    elif kind == TURN_LEFT:
+    elif kind == TURN_LEFT or kind == TURN_ALONE:  # noqa: SIM109 - a tuple is slower
         w, a, b, c = cos_half, sin_half * e0, sin_half * e1, sin_half * e2
         out[s], out[s + 1], out[s + 2], out[s + 3] = multiply_scalars(w, a, b, c, x[s], x[s + 1], x[s + 2], x[s + 3])
-        out[s + 4], out[s + 5], out[s + 6] = rotate(w, a, b, c, x[s + 4], x[s + 5], x[s + 6])
+        if kind == TURN_LEFT:
+            out[s + 4], out[s + 5], out[s + 6] = rotate(w, a, b, c, x[s + 4], x[s + 5], x[s + 6])
     elif kind == MOVE_LOCAL:
         a, b, c = rotate(x[s], x[s + 1], x[s + 2], x[s + 3], h * e0, h * e1, h * e2)
         out[s + 4], out[s + 5], out[s + 6] = x[s + 4] + a, x[s + 5] + b, x[s + 6] + c

@@ -22,8 +22,9 @@ from boxplus.optimization.solution import Solution, values_at
 from boxplus.optimization.solver_options import SolverOptions, options_from
 from boxplus.optimization.terms.connections import check_connections, require_connections
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
-from boxplus.optimization.terms.group import Group, ResidualRows, jacobian_notes
+from boxplus.optimization.terms.group import Group, ResidualRows
 from boxplus.optimization.terms.held_components import component_mask, held_groups
+from boxplus.optimization.terms.jacobian_notes import jacobian_notes
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
 from boxplus.optimization.terms.variables import VariableRows, Variables
@@ -343,7 +344,8 @@ class Problem:
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0
-        model.start(self.values_at(start))
+        began = self.values_at(start)
+        model.start(began)
         cost_initial = model.cost.cost
         strategy = strategy_of(options)
         try:
@@ -365,7 +367,7 @@ class Problem:
                 for group in self.groups
             },
             faded=faded,
-            notes=(*notes, *jacobian_notes(self.groups), *faded_notes(self.groups, faded)),
+            notes=(*notes, *jacobian_notes(self.groups, began, model.values), *faded_notes(self.groups, faded)),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )

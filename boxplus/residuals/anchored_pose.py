@@ -42,6 +42,8 @@ class AnchoredRelativePose(Residual):
         array([[0., 0., 0., 0., 0., 0.]])
     """
 
+    rotation_rows = 3
+
     def __init__(
         self,
         measured: ArrayLike,

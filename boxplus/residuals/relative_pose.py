@@ -15,8 +15,6 @@ from boxplus.manifolds.se3_jacobians import dual_blocks_into, right_jacobian_inv
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
 
-HALF_TURN_MARGIN = 1e-6  # rotation errors this close to π [rad] have an arbitrary axis sign
-
 
 @kernel(inline=True)
 def error_scalars(
@@ -106,6 +104,8 @@ class RelativePose(Residual):
         array([[0. , 0. , 0. , 0.5, 0. , 0. ]])
     """
 
+    rotation_rows = 3
+
     def __init__(
         self,
         measured: ArrayLike,
@@ -136,8 +136,3 @@ class RelativePose(Residual):
 
     def evaluate_into(self, begin: int, end: int, x: Arrays, index: Rows, r: Array, valid: Mask) -> None:
         evaluate_rows(begin, end, x[0], x[1], index[0], index[1], self.measured, r, valid)
-
-    def at_half_turn(self, *x: ArrayLike) -> NDArray[np.bool_]:
-        """Which residuals (N,) have a rotation error within 1e-6 rad of π, the singular case."""
-        angle = np.linalg.norm(self.evaluate(*x)[:, :3], axis=1)
-        return np.asarray(angle >= np.pi - HALF_TURN_MARGIN)

@@ -95,6 +95,8 @@ class RelativePose2D(Residual):
         array([[0. , 0.5, 0. ]])
     """
 
+    rotation_rows = 1
+
     def __init__(
         self,
         measured: ArrayLike,

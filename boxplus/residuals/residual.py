@@ -13,6 +13,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.whitening import Whitening
 
+HALF_TURN_MARGIN = 1e-6  # rotation errors this close to π [rad] have an arbitrary axis sign
+
 Array = NDArray[np.float64]
 Arrays = tuple[NDArray[np.float64], ...]
 Rows = tuple[NDArray[np.uint32], ...]
@@ -53,6 +55,7 @@ class Residual(ABC):
         whitening: square root of the information of the residuals.
         fixes_gauge: whether moving all connected variables together, as one rigid body, changes the residual. One that
             connects a single variable does; a relative measurement does not.
+        rotation_rows: the first rows are the logarithm of a rotation: 3, 1 in the plane, 0 where they are not.
         jacobian_note: what a user should know of its Jacobians, and a solution says; empty where there is nothing.
 
     Example:
@@ -62,6 +65,7 @@ class Residual(ABC):
     """
 
     fixes_gauge: bool
+    rotation_rows: int = 0
     jacobian_note: str = ""
 
     def __init__(
@@ -114,6 +118,16 @@ class Residual(ABC):
         r = np.zeros((self.count, self.dim))
         self.evaluate_into(0, self.count, values, index, r, np.ones(self.count, dtype=np.bool_))
         return r
+
+    def at_half_turn(self, *x: ArrayLike) -> NDArray[np.bool_]:
+        """Which residuals (N,) have a rotation error within 1e-6 rad of π, where the sign of its axis is arbitrary and the
+        Jacobian jumps; arguments as in `linearize`."""
+        return self.is_half_turn(self.evaluate(*x))
+
+    def is_half_turn(self, r: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """As `at_half_turn`, of residuals r (N, dim) before whitening."""
+        angle = np.sqrt((r[:, : self.rotation_rows] ** 2).sum(axis=1))
+        return np.asarray(angle >= np.pi - HALF_TURN_MARGIN)
 
     def _rows(self, x: tuple[ArrayLike, ...]) -> tuple[tuple[NDArray[np.float64], ...], tuple[NDArray[np.uint32], ...]]:
         if len(x) != len(self.manifolds):

@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion
+from boxplus.manifolds.quaternion import UnitQuaternion, UnitQuaternionLeft
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
@@ -26,7 +27,9 @@ MANIFOLDS = [
     Line3D,
     Euclidean(1),
     Euclidean(5),
+    UnitQuaternionLeft,
     Product(UnitQuaternion, Euclidean(3)),
+    CameraPose,
     Product(SE2, Product(SO3, SE3Left)),
 ]
 ANGLES = [0.0, 1e-8, 1e-3, 0.5 - 1e-9, 0.5 + 1e-9, 1.0 - 1e-9, 1.0 + 1e-9, 2.0, 3.0, np.pi - 1e-6, np.pi]

@@ -6,8 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError
-from boxplus.manifolds import lines, quaternion
+from boxplus.manifolds import lines, quaternion, se3, so3
+from boxplus.manifolds.body_pose import BodyPose
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.lines import Line3D
+from boxplus.manifolds.manifold import Manifold
+from boxplus.manifolds.se3 import SE3, SE3Left
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -80,3 +84,35 @@ def test_lines_without_direction_are_refused() -> None:
         lines.from_points([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     with pytest.raises(InputError, match="leave this line out"):
         lines.from_plucker([np.nan, 0.0, 0.0, 1.0, 0.0, 0.0])
+
+
+def test_the_pluecker_transform_moves_points_of_the_line() -> None:
+    rng = np.random.default_rng(8)
+    T, p, q = SE3.random(rng, 10), rng.normal(size=(10, 3)), rng.normal(size=(10, 3))
+
+    def through(p, q):
+        return np.concatenate([np.cross(p, q - p), q - p], axis=-1)
+
+    moved = lines.transform(T, through(p, q))
+    assert np.allclose(moved, through(se3.act(T, p), se3.act(T, q)), atol=1e-12)
+    back = lines.transform(se3.inverse(T), moved)
+    assert np.allclose(back, through(p, q), atol=1e-12)
+    assert np.allclose(lines.motion_matrix(se3.inverse(T)) @ lines.motion_matrix(T), np.eye(6), atol=1e-12)
+
+
+@pytest.mark.parametrize("manifold", [SE3Left, SE3, BodyPose, CameraPose], ids=str)
+def test_jacobians_of_the_pluecker_transform(manifold: Manifold) -> None:
+    rng, h = np.random.default_rng(9), 1e-4
+    T, L = SE3.random(rng, 10), rng.normal(size=(10, 6))
+    numeric = np.stack(
+        [
+            (lines.transform(manifold.boxplus(T, h * e), L) - lines.transform(manifold.boxplus(T, -h * e), L)) / (2.0 * h)
+            for e in np.eye(6)
+        ],
+        axis=-1,
+    )
+    assert np.allclose(lines.transform_jacobian(T, L, manifold), numeric, atol=1e-6)
+    if manifold == CameraPose:  # as the page writes it
+        M, t, d = lines.motion_matrix(T), T[:, 4:], lines.transform(T, L)[:, 3:]
+        block = -so3.hat((M[:, :3, :3] @ L[:, :3, None])[..., 0]) - so3.hat(t) @ so3.hat(d)
+        assert np.allclose(lines.transform_jacobian(T, L, manifold)[:, :3, :3], block, atol=1e-12)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
@@ -15,7 +16,7 @@ from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
 from boxplus.manifolds.tangent_change import tangent_change
 
-POSES = [SE3, SE3Left, Product(UnitQuaternion, Euclidean(3))]
+POSES = [SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)), CameraPose]
 
 
 PAIRS = [

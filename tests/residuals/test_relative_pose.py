@@ -16,6 +16,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
 from boxplus.optimization.jacobian_check import check_jacobian
+from boxplus.optimization.problem import Problem
 from boxplus.residuals.prior import Prior
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
@@ -192,3 +193,19 @@ def test_rows_outside_of_a_chunk_are_left_alone() -> None:
         assert all(np.array_equal(J[s][2:5], expected.jacobians[s][2:5]) for s in range(slots))
         assert (r[:2] == 7.0).all() and (r[5:] == 7.0).all() and (J[0][5:] == 7.0).all()
         assert valid.tolist() == [False, False, True, True, True, False]
+
+
+def test_a_solution_names_what_began_or_ended_half_a_turn_off() -> None:
+    still, turned = SE3.identity(), SE3.boxplus(SE3.identity(), [0.0, 0.0, np.pi, 0.0, 0.0, 0.0])
+    problem = Problem()
+    poses = problem.add_variables(SE3, [still, turned, still])
+    problem.add_residuals(RelativePose([still, still]), poses[[0, 0]], poses[[1, 2]], name="edges")
+    problem.fix(poses[0])
+    (note,) = [note for note in problem.solve().notes if "half a turn" in note]
+    assert note.startswith("1 of the residuals of edges (0) began half a turn off, which way they turned back was arbitrary")
+    problem.fix(poses[1])
+    notes = [note for note in problem.solve().notes if "half a turn" in note]
+    assert len(notes) == 2 and "ended half a turn off" in notes[1]
+    planar = RelativePose2D([[0.0, 0.0, 0.0]])
+    assert planar.at_half_turn([0.0, 0.0, 0.0], [np.pi, 1.0, 0.0]).tolist() == [True]
+    assert planar.at_half_turn([0.0, 0.0, 0.0], [3.0, 9.0, 0.0]).tolist() == [False]

@@ -124,6 +124,8 @@ def test_residuals_and_validity_are_those_of_the_evaluation() -> None:
 MANIFOLDS = [
     bp.SO3,
     bp.UnitQuaternion,
+    bp.UnitQuaternionLeft,
+    bp.CameraPose,
     bp.SE2,
     bp.SE3,
     bp.SE3Left,

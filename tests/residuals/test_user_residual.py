@@ -14,7 +14,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion, multiply_scalars, rotate
+from boxplus.manifolds.quaternion import UnitQuaternion, UnitQuaternionLeft, multiply_scalars, rotate
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left, adjoint_into, between_into, between_scalars, log_scalars
 from boxplus.manifolds.se3_jacobians import right_jacobian_inverse_into
@@ -121,7 +121,9 @@ def test_rows_and_chunks_are_honoured() -> None:
     assert valid.tolist() == [False] * 3 + [True] * 6 + [False] * 3
 
 
-EVERYTHING = Product(SO3, UnitQuaternion, SE2, SE3, SE3Left, Line3D, Euclidean(4), Product(SE2, UnitQuaternion))
+EVERYTHING = Product(
+    SO3, UnitQuaternion, UnitQuaternionLeft, SE2, SE3, SE3Left, Line3D, Euclidean(4), Product(SE2, UnitQuaternion)
+)
 
 
 def weighted_numbers(x, weights):

@@ -11,22 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import lines, quaternion
-from boxplus.manifolds.body_pose import BodyPose
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.lines import Line3D
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
-from boxplus.manifolds.quaternion import UnitQuaternion
+from boxplus.manifolds.quaternion import UnitQuaternion, UnitQuaternionLeft
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
 from boxplus.manifolds.sphere import S2, tangent_basis
+from boxplus.manifolds.tangent_change import POSES
 
 DOF = 7
 """Numbers of a motion: rotation, translation, scale."""
 
 _STEP = 1e-6  # of the difference quotient for lines
-_POSES: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose)
 _POSE_KINDS = ("world_from_body", "body_from_world")
 
 Motions = NDArray[np.float64]
@@ -35,7 +35,7 @@ Points = NDArray[np.float64]
 
 def kinds_of(manifold: Manifold) -> tuple[str, ...]:
     """What a variable on this manifold may stand for."""
-    if manifold in _POSES or manifold in (SE2, SO3, UnitQuaternion):
+    if manifold in POSES or manifold in (SE2, SO3, UnitQuaternion, UnitQuaternionLeft):
         return _POSE_KINDS
     if isinstance(manifold, Product):
         return tuple(dict.fromkeys(kind for part in manifold.components for kind in kinds_of(part) if kind in _POSE_KINDS)) or (
@@ -54,14 +54,16 @@ def kinds_of(manifold: Manifold) -> tuple[str, ...]:
 
 def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
     """Tangents (n, dof, 7) at x (n, size) of the seven motions of the world."""
-    if manifold in _POSES:
+    if manifold in POSES:
         return _pose(manifold, kind, x)
     if manifold == SE2:
         return _pose_2d(kind, x)
-    if manifold in (SO3, UnitQuaternion):
+    if manifold in (SO3, UnitQuaternion, UnitQuaternionLeft):
         R = x.reshape(-1, 3, 3) if manifold == SO3 else quaternion.to_matrix(x)
         B = np.zeros((len(x), 3, DOF))
         B[:, :, :3] = np.swapaxes(R, 1, 2) if kind == "world_from_body" else -np.eye(3)
+        if manifold == UnitQuaternionLeft:
+            B = R @ B
         return B
     if manifold == Line3D:
         return _line(x)
@@ -89,14 +91,14 @@ def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
 def positions_of(manifold: Manifold, kind: str, x: Points) -> Points | None:
     """Where variables are in the world, (n, 3); None where they have no place."""
     n = len(x)
-    if isinstance(manifold, Product) and manifold != BodyPose:
+    if isinstance(manifold, Product) and manifold not in POSES:
         size = 0
         for part in manifold.components:
-            if part in _POSES:
+            if part in POSES:
                 return positions_of(part, kind, x[:, size : size + part.size])
             size += part.size
         return None
-    if manifold in _POSES:
+    if manifold in POSES:
         t = x[:, 4:7]
         return t if kind == "world_from_body" else -np.einsum("nji,nj->ni", quaternion.to_matrix(x[:, :4]), t)
     if manifold == SE2:
@@ -145,7 +147,7 @@ def _pose(manifold: Manifold, kind: str, x: Points) -> Motions:
     if manifold == SE3Left:  # t' = ω × t + v
         shift = shift - np.cross(turn, t[:, :, None], axis=1)
         return np.concatenate([turn, shift], axis=1)
-    return np.concatenate([Rt @ turn, shift if manifold == BodyPose else Rt @ shift], axis=1)
+    return np.concatenate([turn if manifold == CameraPose else Rt @ turn, Rt @ shift if manifold == SE3 else shift], axis=1)
 
 
 def _pose_2d(kind: str, x: Points) -> Motions:

@@ -209,6 +209,16 @@ class Group:
         """Cost at the point `values`; overwrites `r` and `valid`, not the Jacobians."""
         return self._visit(values, threads, None)
 
+    def half_turned(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """(N,) residuals whose rotation error is half a turn at the point `values`, those that were removed left out."""
+        if not self.residual.rotation_rows:
+            return np.zeros(self.residual.count, dtype=np.bool_)
+        x = tuple(values[connection.block.number] for connection in self.connections)
+        r, valid = np.zeros((self.residual.count, self.residual.dim)), np.ones(self.residual.count, dtype=np.bool_)
+        self.residual.evaluate_into(0, self.residual.count, x, self._index, r, valid)
+        found = self.residual.is_half_turn(r) & valid
+        return found if self.removed is None else found & ~self.removed
+
     def unweighed(self) -> Group:
         """The same residuals under least squares, with arrays of its own: what it linearises disturbs nobody."""
         other = Group(self.residual, self.connections, Squared(), self.name)
@@ -300,11 +310,6 @@ class Group:
             if row >= 0:
                 return int(row), f"Jacobian with respect to {role} ({connection.block.name!r})"
         return None
-
-
-def jacobian_notes(groups: Sequence[Group]) -> tuple[str, ...]:
-    """What a user should know of the Jacobians of each group."""
-    return tuple(f"{group.name}: {group.residual.jacobian_note}" for group in groups if group.residual.jacobian_note)
 
 
 def broadcast(rows: VariableRows, count: int) -> VariableRows:

@@ -17,13 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
+from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.tangent_change import POSES, tangent_change
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout
 
 _GAIN = math.log(1e6)  # of the product of the diagonal, on average over the variables; a lever of about ten
+# A rotation about the other frame's axes turns the same lever: `CameraPose` is as well conditioned as `BodyPose`.
+_WAYS: tuple[Manifold, ...] = (SE3, SE3Left, BodyPose)
 _SAMPLE = 1024  # residuals of a group looked at
 
 
@@ -54,11 +58,11 @@ def to_own_tangent(layout: Layout, number: int, x: NDArray[np.float64]) -> NDArr
 
 
 def _alternatives(manifold: Manifold) -> list[Manifold]:
-    """The same points with every pose moved in each of the three ways; none where there is no pose."""
+    """The same points with every pose moved in each of three ways; none where there is no pose."""
     if manifold in POSES:
-        return list(POSES)
+        return list(_WAYS)
     if isinstance(manifold, Product) and any(component in POSES for component in manifold.components):
-        return [Product(*(pose if part in POSES else part for part in manifold.components)) for pose in POSES]
+        return [Product(*(pose if part in POSES else part for part in manifold.components)) for pose in _WAYS]
     return []
 
 

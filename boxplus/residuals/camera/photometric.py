@@ -20,6 +20,8 @@ Source: Engel, Koltun and Cremers, Direct Sparse Odometry, PAMI 2018; signs and 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -62,6 +64,8 @@ class Photometric(Residual):
         depth_1: (N,) z in camera 1 [m]; None exactly when `inverse_depth` is a variable.
         pattern: (K, 2) offsets (u, v) [px] of the pixels of a patch; the residual has K rows.
         inverse_depth, intrinsics, brightness: whether these are variables.
+        gradient: of image 2, that of the bilinear interpolant, or "smoothed", differences over two pixels: it does not jump where
+            p₂ crosses a pixel centre, but is not the derivative of the residual; all residuals need a pixel more to the border.
         sigma, covariance, information: of a grey value's difference, as in `Whitening.of`.
 
     Raises:
@@ -88,10 +92,13 @@ class Photometric(Residual):
         inverse_depth: bool = False,
         intrinsics: bool = False,
         brightness: bool = False,
+        gradient: Literal["exact", "smoothed"] = "exact",
         sigma: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
+        if gradient not in ("exact", "smoothed"):
+            raise InputError('gradient "exact" or "smoothed"', repr(gradient), 'leave it at "exact" unless the images are noisy')
         self.camera = camera = check_pinhole(camera, "photometric residuals")
         self.image_2 = checked_image("image_2", image_2)
         self.pixels_1 = _checked_patches(pixels_1, pattern)
@@ -124,7 +131,7 @@ class Photometric(Residual):
         parameters = camera.padded_parameters
         self._terms = (
             self.image_2, self.grey_1, self.pixels_1, np.ascontiguousarray(rays[..., :2]), parameters[4:], camera.z_min,
-            intrinsics,
+            intrinsics, gradient == "smoothed",
         )  # fmt: skip
         self._is_variable = is_variable
         self._no_jacobians = tuple(np.zeros((0, dim, manifold.dof)) for _, manifold in _SLOTS)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.cameras.pinhole import project_point
 from boxplus.manifolds.quaternion import rotation_entries
-from boxplus.residuals.camera.photometric_sampling import sample_bilinear
+from boxplus.residuals.camera.photometric_sampling import sample_bilinear, sample_smoothed
 
 LEAST_INVERSE_DEPTH = 1e-6  # 1/m; below it a point is at infinity (docs/residuals/inverse_depth.md)
 _LEAST_Y_Z = 1e-6  # of a ray with z = 1: a point at infinity 90° off the optical axis
@@ -36,6 +36,7 @@ def warped_pixel(
     rho: float,
     c: Intrinsics,
     z_min: float,
+    smoothed: bool,
 ) -> tuple[bool, float, float, float, float, float, float, float, float, float]:
     """Where the ray (mx, my, 1) at inverse depth rho of view 1 lands in image 2.
 
@@ -50,7 +51,10 @@ def warped_pixel(
     if not (z > z_min * rho and z > _LEAST_Y_Z):
         return False, 0.0, 0.0, 0.0, x, y, z, 0.0, 0.0, 0.0
     u, v, p00, p01, p02, p10, p11, p12 = project_point(x, y, z, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
-    valid, value, along_u, along_v = sample_bilinear(image_2, u, v)
+    if smoothed:
+        valid, value, along_u, along_v = sample_smoothed(image_2, u, v)
+    else:
+        valid, value, along_u, along_v = sample_bilinear(image_2, u, v)
     return (
         valid,
         value,
@@ -84,6 +88,7 @@ def photometric(
     distortion: NDArray[np.float64],
     z_min: float,
     rays_move: bool,
+    smoothed: bool,
     r: NDArray[np.float64],
     J_pose: NDArray[np.float64],
     J_inverse_depth: NDArray[np.float64],
@@ -98,6 +103,7 @@ def photometric(
         poses: (·, 7), inverse_depths: (·, 1), intrinsics: (·, 4), brightness: (·, 2), each gathered by its index (N,).
         grey_1: (N, K); pixels_1: (N, K, 2); rays_1: (N, K, 2), used unless `rays_move` with the intrinsics.
         distortion: (5,), after the four intrinsics.
+        smoothed: the gradient of image 2, over two pixels.
         r: (N, K); the Jacobians (N, K, 6), (N, K, 1), (N, K, 4), (N, K, 2).
     """
     has_depth, has_intrinsics = J_inverse_depth.shape[0] > 0, J_intrinsics.shape[0] > 0
@@ -116,7 +122,7 @@ def photometric(
                 mx, my = (pixels_1[n, k, 0] - cx) / fx, (pixels_1[n, k, 1] - cy) / fy
             else:
                 mx, my = rays_1[n, k, 0], rays_1[n, k, 1]
-            found, value, along_u, along_v, x, y, z, gx, gy, gz = warped_pixel(image_2, R, t, mx, my, rho, c, z_min)
+            found, value, along_u, along_v, x, y, z, gx, gy, gz = warped_pixel(image_2, R, t, mx, my, rho, c, z_min, smoothed)
             if not found:
                 is_valid = False
                 break

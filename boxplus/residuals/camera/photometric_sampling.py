@@ -35,6 +35,21 @@ def sample_bilinear(image: NDArray[np.float32], u: float, v: float) -> tuple[boo
     return math.isfinite(value), value, top + a * (bottom - top), lower - upper
 
 
+@kernel(inline=True)
+def sample_smoothed(image: NDArray[np.float32], u: float, v: float) -> tuple[bool, float, float, float]:
+    """As `sample_bilinear`, with differences over two pixels, (I(u + 1, v) − I(u − 1, v))/2, in place of the exact gradient.
+
+    They do not jump at integer coordinates; twelve pixels around (u, v) have to be there.
+    """
+    valid, value, _, _ = sample_bilinear(image, u, v)
+    has_right, right, _, _ = sample_bilinear(image, u + 1.0, v)
+    has_left, left, _, _ = sample_bilinear(image, u - 1.0, v)
+    has_below, below, _, _ = sample_bilinear(image, u, v + 1.0)
+    has_above, above, _, _ = sample_bilinear(image, u, v - 1.0)
+    known = valid and has_right and has_left and has_below and has_above
+    return known, value, 0.5 * (right - left), 0.5 * (below - above)
+
+
 @kernel
 def _sample_batch(
     image: NDArray[np.float32],

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus import SE2, SE3, SO3, Euclidean, Line3D, Product, SE3Left, UnitQuaternion
+from boxplus import SE2, SE3, SO3, Euclidean, Line3D, Product, SE3Left, UnitQuaternion, UnitQuaternionLeft
 from boxplus.manifolds import lines, quaternion, se2, se3, so3
+from boxplus.manifolds.camera_pose import CameraPose
 from boxplus.manifolds.sphere import S2
 from boxplus.optimization.observability.world_motions import kinds_of, motions_of, positions_of
 
@@ -17,7 +18,7 @@ def moved(manifold, kind, x, tau):
     """x (n, size) after p ↦ (1 + s) Exp(w) p + v for a small τ; every kind from its meaning, not from its tangents."""
     w, v, s = tau[:3], tau[3:6], tau[6]
     R = so3.exp(w)
-    if manifold in (SE3, SE3Left, Product(UnitQuaternion, Euclidean(3))):
+    if manifold in (SE3, SE3Left, CameraPose, Product(UnitQuaternion, Euclidean(3))):
         if kind == "world_from_body":
             q = quaternion.multiply(quaternion.from_matrix(R), x[:, :4])
             return np.column_stack([q, (1 + s) * x[:, 4:] @ R.T + v])
@@ -27,7 +28,7 @@ def moved(manifold, kind, x, tau):
         lift = np.column_stack([np.cos(x[:, 0] / 2), 0 * x[:, 0], 0 * x[:, 0], np.sin(x[:, 0] / 2), x[:, 1:], 0 * x[:, 0]])
         flat = moved(SE3, kind, lift, np.array([0, 0, w[2], v[0], v[1], 0, s]))
         return np.column_stack([2 * np.arctan2(flat[:, 3], flat[:, 0]), flat[:, 4:6]])
-    if manifold == UnitQuaternion:
+    if manifold in (UnitQuaternion, UnitQuaternionLeft):
         turn = quaternion.from_matrix(R)
         inverse = turn * [1, -1, -1, -1]
         return quaternion.multiply(turn, x) if kind == "world_from_body" else quaternion.multiply(x, inverse)
@@ -56,6 +57,8 @@ def moved(manifold, kind, x, tau):
 MANIFOLDS = (
     SE3,
     SE3Left,
+    CameraPose,
+    UnitQuaternionLeft,
     Product(UnitQuaternion, Euclidean(3)),
     SE2,
     UnitQuaternion,

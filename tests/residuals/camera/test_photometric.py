@@ -228,3 +228,23 @@ def test_refusals() -> None:
     refused(r"depth_1 of shape \(1,\)", CAMERA, first, second, pixels, [1.0, 2.0])
     refused("expected depth_1 – got none", CAMERA, first, second, pixels)
     refused("no depth_1 where the inverse depth", CAMERA, first, second, pixels, depth, inverse_depth=True)
+
+
+def test_a_smoothed_gradient_is_that_of_a_parabola_and_does_not_jump() -> None:
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    image = 0.5 * u * u - 0.25 * v * v + 3.0 * u
+    pixels = np.random.default_rng(0).uniform([20.0, 20.0], [60.0, 40.0], (40, 2))
+    pixels[0] = 30.0, 30.0  # where the exact one has a kink
+    given = {"depth_1": np.full(40, 2.0)}
+    smoothed = Photometric(CAMERA, image, image, pixels, **given, gradient="smoothed")
+    exact = Photometric(CAMERA, image, image, pixels, **given)
+    still = SE3Left.identity()
+    J = smoothed.linearize(still).jacobians[0]
+    assert np.array_equal(smoothed.evaluate(still), exact.evaluate(still))
+    along = np.column_stack([pixels[:, 0] + 3.0, -0.5 * pixels[:, 1]]) * [CAMERA.fx, CAMERA.fy]
+    assert np.allclose(J[:, 0, 3:5], -along / 2.0, atol=1e-3)
+    assert not np.allclose(exact.linearize(still).jacobians[0][:, 0, 3:5], -along / 2.0, atol=1.0)
+    at_border = Photometric(CAMERA, image, image, [[0.5, 20.0], [1.0, 20.0], [78.0, 20.0]], np.full(3, 2.0), gradient="smoothed")
+    assert at_border.linearize(still).valid.tolist() == [False, True, False]
+    with pytest.raises(InputError, match=r"got 'central' – leave it"):
+        Photometric(CAMERA, image, image, pixels, **given, gradient="central")
