@@ -33,8 +33,8 @@ _PARTS = 64  # of a metre: what points of a map are rounded to, which makes the 
 _FONT = {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 12, "color": INK}
 
 
-def map_and_trajectory(data: Timeline, unit: str = "m") -> go.Figure:
-    """The map, coloured by height, and the trajectory, coloured by status."""
+def map_and_trajectory(data: Timeline, unit: str = "m", names: tuple[str, str, str] = ("x", "y", "z")) -> go.Figure:
+    """The map, coloured by height, and the trajectory, coloured by status; of three axes with these names, the last one up."""
     figure = go.Figure()
     points = np.round(_PARTS * data.map_points) / _PARTS
     if len(points):
@@ -89,7 +89,7 @@ def map_and_trajectory(data: Timeline, unit: str = "m") -> go.Figure:
             "aspectmode": "data",
             "dragmode": "orbit",
             "camera": {"eye": {"x": -0.85, "y": -0.85, "z": 1.5}},
-            **{f"{name}axis": {**axis, "title": {"text": f"{name} [{unit}]"}} for name in "xyz"},
+            **{f"{at}axis": {**axis, "title": {"text": f"{name} [{unit}]"}} for at, name in zip("xyz", names, strict=True)},
         },
     )
     return figure
@@ -317,19 +317,25 @@ def _range_of(values: NDArray[np.float64]) -> list[float]:
     return [low - margin, high + margin]
 
 
-def over_time(figure: go.Figure, data: Timeline, height: int, bottom_row: int | None = None) -> go.Figure:
-    """The look of all figures over time."""
+def plain_figure(figure: go.Figure, height: int) -> None:
+    """White paper, a quiet grid, and the legend in lines above."""
     figure.update_layout(
         height=height,
         font=_FONT,
         paper_bgcolor="white",
         plot_bgcolor="white",
         margin={"l": 80, "r": 20, "t": 10, "b": 44},
-        hovermode="x unified",
         legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "itemsizing": "constant", "traceorder": "normal"},
     )
-    figure.update_xaxes(showgrid=True, gridcolor=GRID, zeroline=False, range=[0.0, float(max(data.seconds[-1], 1e-3))])
+    figure.update_xaxes(showgrid=True, gridcolor=GRID, zerolinecolor=GRID)
     figure.update_yaxes(showgrid=True, gridcolor=GRID, zerolinecolor=GRID)
+
+
+def over_time(figure: go.Figure, data: Timeline, height: int, bottom_row: int | None = None) -> go.Figure:
+    """The look of all figures over time."""
+    plain_figure(figure, height)
+    figure.update_layout(hovermode="x unified")
+    figure.update_xaxes(zeroline=False, range=[0.0, float(max(data.seconds[-1], 1e-3))])
     place = {} if bottom_row is None else {"row": bottom_row, "col": 1}
     figure.update_xaxes(title_text="time since the first estimate [s]", **place)
     return figure

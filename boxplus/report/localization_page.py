@@ -59,13 +59,13 @@ def _body(own: LocalizationFolder, result: LocalizationResult) -> str:
     map_section = f"<section><h2>The map</h2><ul>{notes}</ul></section>"
     parts = [head, warnings_section([escape(text) for text in said]), _overview(own, result), _timeline(own)]
     if summary.best_candidates:
-        rows = [(escape(text),) for text in summary.best_candidates]
+        rows = [(text,) for text in summary.best_candidates]
         parts.append(f"<section><h2>The best candidates, and why not</h2>{html_table(rows, ('of the last search',))}</section>")
     return "\n".join([*parts, map_section])
 
 
 def _overview(own: LocalizationFolder, result: LocalizationResult) -> str:
-    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    figure = Figure(figsize=(5.8, 5.1), layout="constrained")
     axes = figure.subplots()
     places = result.saved.local_maps
     each = max(_POINTS // len(places), 50)
@@ -89,17 +89,18 @@ def _overview(own: LocalizationFolder, result: LocalizationResult) -> str:
 def _timeline(own: LocalizationFolder) -> str:
     log = read_row_log(own.log, LOG_COLUMNS)
     seconds = (log.time_ns - log.time_ns[0]) * 1e-9 if len(log) else np.zeros(0)
-    figure = Figure(figsize=(10.0, 4.5), layout="constrained")
+    figure = Figure(figsize=(7.3, 4.2), layout="constrained")
     share, sigma = figure.subplots(2, 1, sharex=True)
     compared = np.isfinite(log.column("matched_share"))
     share.plot(seconds[compared], 100.0 * log.column("matched_share")[compared], color=INK, linewidth=1.0)
     for name, color in _COLORS.items():
         at = log.status == name
         share.plot(seconds[at], np.full(np.count_nonzero(at), -5.0), "s", markersize=4, color=color, label=name)
-    share.set(ylabel="what stands, in the map [%]", ylim=(-10.0, 105.0))
+    share.set(ylabel="found in the map [%]", ylim=(-10.0, 105.0))
     share.legend(framealpha=0.9, fontsize=9)
     sigma.plot(seconds, 100.0 * log.column("sigma_position"), color=INK, linewidth=1.0)
     sigma.set(xlabel="time [s]", ylabel="σ of the position [cm]")
     plain(share)
     plain(sigma)
-    return f"<section><h2>Status</h2>{picture(figure, 'status over time')}</section>"
+    text = "How much of what stands about the robot is found in the map, and how well the position in it is known."
+    return f"<section><h2>Status</h2><p>{text}</p>{picture(figure, 'status over time')}</section>"

@@ -24,14 +24,15 @@ function stack(layout) {
   if (panels.length < 2 || !panels.every(([x]) => x && x.x)) return;
   panels.sort(([x1, y1], [x2, y2]) => y2.y[0] - y1.y[0] || x1.x[0] - x2.x[0]);
   const titles = (layout.annotations || []).filter(title => title.xref === 'paper').sort((a, b) => b.y - a.y || a.x - b.x);
-  const share = 1 / panels.length;
+  const share = 1 / panels.length, rows = new Set(panels.map(([, y]) => y.y[0].toFixed(3))).size;
+  layout.height = Math.max(260, 0.8 * Math.max(layout.height || 450, 360) / rows) * panels.length;
+  const pixel = 1 / (layout.height - (layout.margin?.t ?? 100) - (layout.margin?.b ?? 80));
   panels.forEach(([x, y], row) => {
     const top = 1 - row * share;
     x.x = [0, 1];
-    y.y = [top - share * 0.82, top - share * 0.04];
-    if (titles[row]) Object.assign(titles[row], {x: 0.5, y: top - share * 0.03, yanchor: 'bottom'});
+    y.y = [top - share + 56 * pixel, top - 26 * pixel];  // below it ticks and a title of the axis, above it its own
+    if (titles[row]) Object.assign(titles[row], {x: 0.5, y: top - 24 * pixel, yanchor: 'bottom'});
   });
-  layout.height = Math.max(layout.height || 450, 360) * panels.length * 0.8;
 }
 
 function slim(data, layout) {

@@ -216,6 +216,6 @@ def evidence_table(found: Iterable[Mapping[str, str]], config: Path) -> str:
     head = "<tr><th>reading</th><th>found</th><th></th><th>evidence</th></tr>"
     settings = escape(config.read_text(encoding="utf-8", errors="replace")) if config.is_file() else ""
     return (
-        f"<section><h2>How the recording was read</h2><table>{head}{evidence}</table>"
+        f'<section><h2>How the recording was read</h2><table class="evidence">{head}{evidence}</table>'
         f"<details><summary>config.yaml</summary><pre>{settings}</pre></details></section>"
     )

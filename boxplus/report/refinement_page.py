@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
+from boxplus.report.figures import plain_figure
 from boxplus.report.palette import DASHES, FAINT, INK, XYZ
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.runs.refinement.folder import RefineFolder
@@ -77,7 +78,8 @@ def _from_above(result: RefineResult) -> str:
     figure = go.Figure()
     for T, name, color, dash in ((result.T_before, "the run", FAINT, "dash"), (result.T_after, "refined", INK, "solid")):
         figure.add_trace(go.Scatter(x=T[:, 4], y=T[:, 5], name=name, mode="lines", line={"color": color, "dash": dash}))
-    figure.update_layout(xaxis_title="x [m]", yaxis_title="y [m]", yaxis_scaleanchor="x", height=520, margin={"t": 10})
+    figure.update_layout(xaxis_title="x [m]", yaxis_title="y [m]", yaxis_scaleanchor="x")
+    plain_figure(figure, 520)
     return figure_section("Trajectory from above", "The run, and what refining makes of it.", figure)
 
 
@@ -88,7 +90,8 @@ def _shifts(result: RefineResult) -> str:
         shift = 1e3 * (result.T_after[:, 4 + axis] - result.T_before[:, 4 + axis])
         line = {"color": XYZ[axis], "width": 1.4, "dash": DASHES.get(XYZ[axis], "solid")}
         figure.add_trace(go.Scatter(x=seconds, y=shift, name=name, mode="lines", line=line))
-    figure.update_layout(xaxis_title="time [s]", yaxis_title="shift [mm]", height=360, margin={"t": 10})
+    figure.update_layout(xaxis_title="time [s]", yaxis_title="shift [mm]")
+    plain_figure(figure, 360)
     return figure_section(
         "By how much every pose moved", "Along the axes of the world; the first pose stays where it is.", figure
     )

@@ -52,7 +52,10 @@ details { margin-top: 8px; } summary { cursor: pointer; color: var(--faint); }
   .figures { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px; }
   .figures div { padding: 9px 10px; overflow-wrap: anywhere; } table { display: block; overflow-x: auto; }
   .figures b { font-size: 18px; } td.key { white-space: normal; width: auto; padding-right: 12px; }
-  td { min-width: 64px; overflow-wrap: break-word; }
+  td { min-width: 64px; overflow-wrap: break-word; } td:nth-child(n + 5):last-child { min-width: 220px; }
+  table.evidence tr { display: grid; grid-template-columns: 1fr 1fr auto; padding: 4px 0; border-bottom: 1px solid var(--line); }
+  table.evidence td { border: 0; padding: 0 12px 0 0; overflow-wrap: anywhere; }
+  table.evidence td:last-child { grid-column: 1 / -1; } table.evidence th { display: none; }
 }
 @media print { body { background: white; } section { break-inside: avoid; } }
 """
@@ -77,7 +80,7 @@ _SCRIPTS = Template("""<script id="plotly" type="text/plain">$library</script>
 <script>$code</script>""")
 
 _CONFIG = {"displaylogo": False, "responsive": True, "displayModeBar": False}
-_DPI = 80
+_DPI = 110
 _CONFIG_3D = {"displaylogo": False, "responsive": True, "displayModeBar": True, "scrollZoom": True}
 
 

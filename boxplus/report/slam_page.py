@@ -96,7 +96,7 @@ def _from_above(
 ) -> Figure:
     """Points, path and loops within corners (2, 2); pictures of the same corners lie on each other."""
     width, height = corners[1] - corners[0]
-    figure = Figure(figsize=(11.0, float(np.clip(11.0 * height / width, 3.0, 14.0))))
+    figure = Figure(figsize=(8.0, float(np.clip(8.0 * height / width, 2.2, 10.2))))
     axes = figure.add_axes((0.06, 0.05, 0.93, 0.9))
     axes.scatter(cloud[:, 0], cloud[:, 1], s=0.3, linewidths=0, color=_PLACE, rasterized=True)
     axes.plot(*path.T, color=INK, linewidth=1.2, marker=".", markersize=3)
@@ -119,7 +119,7 @@ def _earth(result: SlamResult) -> str:
         fixes = list(csv.DictReader(file))
     lla = [[float(row[name]) for name in ("latitude_deg", "longitude_deg", "height_m")] for row in fixes]
     p, used = EnuFrame(*facts.origin).to_enu(lla), np.array([row["used"] == "1" for row in fixes])
-    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    figure = Figure(figsize=(5.8, 5.1), layout="constrained")
     axes = figure.subplots()
     axes.plot(*result.outcome.placed.T_map[:, 4:6].T, color=INK, linewidth=1.2, marker=".", label="local maps")
     axes.scatter(p[used, 0], p[used, 1], s=12.0, color=_PLACE, linewidths=0, label="fixes used")
@@ -127,7 +127,7 @@ def _earth(result: SlamResult) -> str:
     axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
     axes.legend(framealpha=0.9, fontsize=9)
     plain(axes)
-    rows = [(str(count), escape(reason)) for reason, count in facts.left_out.items()]
+    rows = [(str(count), reason) for reason, count in facts.left_out.items()]
     left_out = html_table(rows, ("fixes", "not used because")) if rows else ""
     where = f"{facts.origin[0]:.7f}°, {facts.origin[1]:.7f}°, {facts.origin[2]:.2f} m above the ellipsoid of WGS84"
     text = (
@@ -185,7 +185,7 @@ def _both_maps(result: SlamResult, loop: Loop) -> Figure:
     """From above and from the side, the query over the place as it was registered."""
     place = _some(result.maps[loop.place].points)
     query = se3.act(loop.T_place_query, _some(result.maps[loop.query].points))
-    figure = Figure(figsize=(10.0, 6.0), layout="constrained")
+    figure = Figure(figsize=(7.3, 4.4), layout="constrained")
     above, side = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
     for axes, (i, j), names in ((above, (0, 1), ("x [m]", "y [m]")), (side, (0, 2), ("x [m]", "z [m]"))):
         axes.scatter(place[:, i], place[:, j], s=1.0, linewidths=0, color=_PLACE)

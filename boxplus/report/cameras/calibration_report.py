@@ -31,7 +31,7 @@ def write_calibration_report(path: Path, summary: CalibrationSummary, found: Cam
     parts.append(
         figure_section(
             "Coverage and errors by view",
-            "Left: where corners were seen; the lens is extrapolated over the rest. Right: root mean square error of every view, "
+            "Corners: where they were seen; the lens is extrapolated over the rest. Views: root mean square error of every view, "
             "against the angle between camera and target; views near 0 deg say little of the focal length.",
             _coverage(found),
         )
@@ -49,7 +49,7 @@ def write_calibration_report(path: Path, summary: CalibrationSummary, found: Cam
     parts.append(
         figure_section(
             "Residuals, and the target as they see it",
-            "Left: residuals of all corners that count. Right: where the residuals would have the target's corners, enlarged; "
+            "First the residuals of all corners that count, then where the residuals would have the target's corners, enlarged; "
             f"{found.on_target.rms_m * 1e3:.3f} mm (rms), which explains {found.on_target.share:.0%} of the squared residuals.",
             _scatter_and_target(found),
             _lens_table(summary),
@@ -127,7 +127,15 @@ def _titles(found: CameraCalibration) -> list[str]:
 
 def _image_axes(figure: go.Figure, size: tuple[int, int], row: int, col: int) -> None:
     figure.update_xaxes(range=[-0.5, size[0] - 0.5], row=row, col=col, showgrid=False, constrain="domain")
-    figure.update_yaxes(range=[size[1] - 0.5, -0.5], row=row, col=col, showgrid=False, scaleanchor=f"x{_axis(row, col)}")
+    figure.update_yaxes(
+        range=[size[1] - 0.5, -0.5],
+        row=row,
+        col=col,
+        showgrid=False,
+        scaleanchor=f"x{_axis(row, col)}",
+        constrain="domain",
+        constraintoward="top",
+    )
 
 
 def _axis(row: int, col: int) -> str:
@@ -208,7 +216,9 @@ def _pattern(found: CameraCalibration) -> go.Figure:
         figure.update_xaxes(title_text=f"arrows: {factor:.0f} x", row=1, col=camera + 1)
         figure.update_xaxes(range=[-0.5, width - 0.5], showgrid=False, constrain="domain", row=1, col=camera + 1)
         anchor = "x" if camera == 0 else f"x{camera + 1}"
-        figure.update_yaxes(range=[height - 0.5, -0.5], showgrid=False, scaleanchor=anchor, row=1, col=camera + 1)
+        figure.update_yaxes(
+            range=[height - 0.5, -0.5], showgrid=False, scaleanchor=anchor, constrain="domain", row=1, col=camera + 1
+        )
     return _styled(figure, 380)
 
 

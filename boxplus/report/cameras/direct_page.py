@@ -43,9 +43,10 @@ def _body(data: Run) -> str:
         warnings_section(warning_lines(summary.warnings)),
         figure_section(
             "Landmarks and trajectory",
-            f"{len(data.map_points):,} of {summary.landmarks:,} points of keyframes whose depth is known to a tenth, in the "
-            "frame of the first camera: x right, y down, z ahead. Drag to turn, scroll to zoom, click in the legend to hide.",
-            figures.map_and_trajectory(data, "m" if is_metric else "unit"),
+            f"{len(data.map_points):,} of {summary.landmarks:,} points of keyframes whose depth is known to a tenth, to the "
+            "right of the first camera (x), ahead of it (z) and up (−y). Drag to turn, scroll to zoom, click in the legend to "
+            "hide.",
+            figures.map_and_trajectory(_upright(data), "m" if is_metric else "unit", ("right", "ahead", "up")),
         ),
         figure_section(
             "Status and residuals",
@@ -91,7 +92,7 @@ def _course(data: Run) -> go.Figure:
     figures.add_status(figure, data, rows)
     overlap, gain = 100.0 * data.log.column("overlap"), 100.0 * np.exp(data.log.column("a"))
     for row, (name, values, unit) in enumerate(
-        (("σ of residuals", data.log.column("sigma"), "grey"), ("overlap", overlap, "%"), ("gain", gain, "%")), 2
+        (("σ of residuals", data.log.column("sigma"), "grey"), ("overlap", overlap, "overlap %"), ("gain", gain, "gain %")), 2
     ):
         figures.add_line(figure, data.seconds[rows], values[rows], name, SERIES[row - 2], row=row)
         figure.update_yaxes(title_text=unit, row=row, col=1)
@@ -107,13 +108,17 @@ def _streams(data: Run) -> str:
     return f"<section><h2>Cameras</h2>{''.join(lines)}</section>"
 
 
+def _upright(data: Run) -> Run:
+    """To the right of the first camera, ahead of it and up, where it has x to the right, y down and z ahead."""
+    turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return replace(data, position=data.position @ turned, map_points=(data.map_points @ turned).astype(np.float32))
+
+
 def _trajectory_picture(data: Run) -> Figure:
     """From above, for a first camera that looks ahead."""
-    summary, turned = data.summary, np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    points = (data.map_points @ turned).astype(np.float32)
-    seen = replace(data, position=data.position @ turned, map_points=points)
+    summary = data.summary
     figure = close_trajectory_picture(
-        seen, f"{summary.path_length_m:.2f} {summary.length_unit} in {summary.duration_s:.1f} s, from above"
+        _upright(data), f"{summary.path_length_m:.2f} {summary.length_unit} in {summary.duration_s:.1f} s, from above"
     )
     figure.axes[0].set(xlabel="x, to the right of the first camera", ylabel="z, ahead of it")
     return figure

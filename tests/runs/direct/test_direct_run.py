@@ -29,6 +29,7 @@ from boxplus.runs.direct.summary import read_direct_summary
 from boxplus.runs.settings_file import load_settings
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.simulation.cameras import make_rig, simulate_cameras, write_camera_recording
+from tests.report.unpacked import figures_of
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room, drive, errors
 
 pytest.importorskip("cv2")
@@ -94,6 +95,7 @@ def test_a_run_writes_what_it_found(recorded: Path, tmp_path: Path) -> None:
     assert json.loads((out / "evaluation.json").read_text())["alignment"]["kind"] == "se3"
     assert load_settings(DirectRunConfig, out / "config.yaml").odometry.patches == 100
     page = (out / "report.html").read_text(encoding="utf-8")
+    assert any('"ahead [m]"' in figure and '"up [m]"' in figure for figure in figures_of(page))  # upright
     for shown in ("Status and residuals", "Landmarks and trajectory", "12 frames", "image: rgb, Pinhole", "ATE"):
         assert shown in page
     assert {path.name for path in (out / "plots").iterdir()} == {"trajectory.png", "residuals.png"}

@@ -103,6 +103,7 @@ def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> Non
     ]
     assert all((row["refusal"] == "") == (row["accepted"] == "1") for row in rows)
     page = finished.folder.report.read_text(encoding="utf-8")
+    assert "outside of the odometry&#x27;s time" in page  # escaped once
     for loop in loops:
         assert f"[{loop.query}, {loop.place}]" in page
     assert page.count("<img alt=") == 3 + sum(loop.measured > 0 for loop in loops)
