@@ -132,6 +132,19 @@ def poor_fit_sentence(fit: Fit, minima: Mapping[Start, float], fixed: int) -> st
     return f"{misfit(fit)}: {why}; --robust gnc tells false loop closures from true ones"
 
 
+def local_notes(fit: Fit, minima: Mapping[Start, float]) -> list[str]:
+    """A sentence where the fit is good, and yet the two best starts ended in different minima."""
+    if fit.is_poor or len(minima) < 2 or fit.dof == 0 or not {"chordal", "chordal_objective"} <= minima.keys():
+        return []
+    first, smooth = minima["chordal"], minima["chordal_objective"]
+    if not abs(first - smooth) > _SAME * min(first, smooth):
+        return []
+    return [
+        f"the noise in rotation leaves room for local minima that fit: the chordal start ended at χ² {first:.6g}, the minimum of "
+        f"the chordal objective at {smooth:.6g}; the lower is taken, and a lower one may exist"
+    ]
+
+
 def without_information(graph: PoseGraph) -> NDArray[np.bool_]:
     """(m,) edges whose information matrix is zero."""
     return np.asarray(~graph.information.any(axis=(1, 2)))

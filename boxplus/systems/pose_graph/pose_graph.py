@@ -27,6 +27,7 @@ from boxplus.systems.pose_graph.contradictions import contradictions
 from boxplus.systems.pose_graph.doubts import (
     Fit,
     disagree,
+    local_notes,
     misfit,
     poor_fit_sentence,
     repetition_notes,
@@ -191,6 +192,7 @@ def optimize_pose_graph(
     notes += undetermined_notes(graph, solution)
     if fit.is_slack:
         notes.append(slack_sentence(fit))
+    notes += local_notes(fit, minima)
     reasons = [text for text in (misreading(graph),) if text]
     if verdict is not None:
         reasons += _verdict_doubts(fit, verdict) + contradictions(graph, verdict, starts.bridges)

@@ -84,12 +84,12 @@ class Starts:
             first, solution: the start that was followed, and where it led.
             known: starts by name; receives those that are tried.
             minima: the objective at the end of every start; receives those that are tried.
-            enough: objective below which nothing further is tried; None where the first one was low enough, and a better
-                minimum is looked for by smooth means alone.
+            enough: objective below which nothing further is tried; None where the first one was low enough, and only the
+                minimum of the chordal objective is tried.
         """
         best = (first, solution)
         names: list[Start] = ["chordal_objective", "file", "chordal", "spanning_tree", "graduated"]
-        for name in names if enough is not None else names[:2]:
+        for name in names if enough is not None else names[:1]:
             if enough is not None and min(minima.values()) <= enough:
                 break
             if name in minima or (name == "file" and self._graph.poses is None) or self._stopped:
