@@ -22,6 +22,7 @@ from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_unce
 from boxplus.systems.bundle_adjustment.lens import lens_notes
 from boxplus.systems.bundle_adjustment.plausibility import (
     input_notes,
+    mirror_notes,
     outlier_notes,
     sigma_doubt,
     sigma_notes,
@@ -127,6 +128,8 @@ def adjust_bundle(
     notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
     is_given = "sigma_px" in config.model_fields_set
     notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
+    seen = np.unique(point_of)
+    notes += mirror_notes(reconstruction.points[seen], adjusted.points[seen])
     notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution.cost, left)
     contradicted = sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     return BundleAdjustmentResult(

@@ -19,6 +19,8 @@ _FEW = 10  # observations from which on a spread means something
 _OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says: one that was assumed, and one that was given
 _CONTRADICTED = 25.0  # times what a given sigma promises of χ²
 _SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from
+_FAR = 4.0  # times the median distance from the middle
+_CLEARLY = 0.3  # times what is left of the points after a rotation, that a mirror image has to leave
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
 
 
@@ -61,6 +63,30 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
             "same unit?"
         )
     return said
+
+
+def mirror_notes(before: NDArray[np.float64], after: NDArray[np.float64]) -> list[str]:
+    """A sentence where the adjusted points (n, 3) are a mirror image of those of the input (n, 3), but for place, turn and size.
+
+    A mirrored scene explains pixels with one axis flipped as well as the true one explains the true pixels.
+    """
+    apart = [np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in (before, after)]
+    # Far points would decide alone.
+    near = np.all([np.isfinite(d) & (d <= _FAR * np.nanmedian(d)) for d in apart], axis=0)
+    if np.count_nonzero(near) < _FEW:
+        return []
+    x, y = (p[near] - p[near].mean(axis=0) for p in (before, after))
+    x, y = (p / max(float(np.sqrt((p * p).mean())), 1e-300) for p in (x, y))
+    U, d, Vt = np.linalg.svd(y.T @ x)
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    total = float((x * x).sum())
+    rotated, mirrored = (max(1.0 - (float(d[:2].sum()) + s * float(d[2])) / total, 0.0) for s in (sign, -sign))
+    if not mirrored < _CLEARLY * rotated:
+        return []
+    return [
+        "the result is a mirror image of the input: is one axis of the pixels flipped (BAL counts y upwards, all others "
+        "downwards), or were the points?"
+    ]
 
 
 def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_given: bool) -> list[str]:

@@ -186,3 +186,42 @@ def test_any_sigma_gives_the_same_values(sigma):
 
 def test_every_refusal_is_of_one_family():
     assert issubclass(InputError, BoxplusError) and issubclass(NotFiniteError, BoxplusError)
+
+
+def test_a_sigma_that_was_meant_is_held_to_more():
+    start = reconstruction(66, "gbp")
+    assert not [note for note in adjust_bundle(start).notes if "sigma" in note]
+    note_of(start, "the errors are those of sigma", config=BundleAdjustmentConfig(sigma_px=SIGMA / 3.0))
+    assert "times what sigma" in adjust_bundle(start, BundleAdjustmentConfig(sigma_px=SIGMA / 10.0)).doubt
+    assert adjust_bundle(start, BundleAdjustmentConfig(sigma_px=SIGMA)).doubt is None
+
+
+def test_pixels_counted_from_a_corner_are_asked_about():
+    start = reconstruction(67, "bal")
+    spread = np.abs(start.pixels).max(axis=0)
+    assert "from a corner" in note_of(replace(start, pixels=start.pixels + spread), "on one side of the principal point")
+    assert not [note for note in adjust_bundle(start).notes if "principal point" in note]
+
+
+def test_pixels_with_a_flipped_axis_give_a_mirror_image_which_is_told():
+    start = reconstruction(70, "bal", cameras=10)
+    assert "is one axis of the pixels flipped" in note_of(replace(start, pixels=start.pixels * [1.0, -1.0]), "a mirror image")
+    assert not [note for note in adjust_bundle(start).notes if "mirror" in note]
+
+
+@pytest.mark.parametrize("wrong", [0.8, 1.15])
+def test_a_wrong_focal_length_that_is_held_is_told(wrong):
+    start = reconstruction(68, "colmap")
+    intrinsics = start.camera_params[0] * [wrong, wrong, 1.0, 1.0]
+    told = note_of(replace(start, camera_params=(intrinsics,)), "other intrinsics than those held")
+    assert f"instead of {intrinsics[0]:.5g} px for camera 3" in told and "--refine-intrinsics" in told
+    for seed in range(68, 71):
+        assert not [note for note in adjust_bundle(reconstruction(seed, "colmap")).notes if "intrinsics" in note]
+
+
+def test_few_wrong_matches_without_a_robust_loss_are_told():
+    start = reconstruction(69, "gbp")
+    pixels = start.pixels.copy()
+    pixels[::40] += 60.0
+    told = note_of(replace(start, pixels=pixels), "times the typical error")
+    assert "wrong matches" in told
