@@ -20,7 +20,7 @@ from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.point_store import PointStore
-from boxplus.systems.refinement.slices import cut, slices_that_fit
+from boxplus.systems.refinement.slices import Slice, cut, slices_that_fit
 
 _LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has
 
@@ -72,6 +72,7 @@ class _Collector:
         self._T: list[NDArray[np.float64]] = []
         self._state: list[NDArray[np.float64]] = []
         self._is_end: list[bool] = []
+        self._newest: NDArray[np.float32] | None = None  # points of the latest slice, to which the next one adds
         self._next = 0
 
     def run(self, events: Iterable[Scan | ImuSamples], should_stop: Callable[[], bool]) -> FinishedRun:
@@ -109,9 +110,17 @@ class _Collector:
                 self._T.append(part.T_world_imu)
                 self._state.append(np.concatenate([part.v_world, after.bias_accel, after.bias_gyro]))
                 self._is_end.append(part.is_end)
-                self._store.append(part.p_lidar if self._rows.status[number] != "lost" else part.p_lidar[:0])
+                self._keep(part, is_placed=self._rows.status[number] != "lost")
+
+    def _keep(self, part: Slice, *, is_placed: bool) -> None:
+        """Its points and, where it is known where they belong, those it has for the slice before, which is whole then."""
+        if self._newest is not None:
+            self._store.append(np.concatenate([self._newest, part.p_lidar_before]) if is_placed else self._newest)
+        self._newest = part.p_lidar if is_placed else part.p_lidar[:0]
 
     def _finished(self) -> FinishedRun:
+        if self._newest is not None:
+            self._store.append(self._newest)
         found, asked = sum(self._is_end), len(self._rows.time_ns)
         if found < max(_LEAST_FOUND * asked, 2):
             raise InputError(

@@ -176,11 +176,11 @@ def _anchored(state: RefinedState, first: Floats) -> RefinedState:
 
 
 def _bending(run: FinishedRun) -> Floats:
-    """Covariances (N, 6, 6) of what the gyroscope's own noise turns the middle of a slice by, against its end."""
+    """Covariances (N, 6, 6) of what the gyroscope's own noise turns the points of a slice by, on the mean, about its pose."""
     seconds = np.diff(run.time_ns, prepend=run.time_ns[0]) * 1e-9
     seconds[0] = seconds[1]
     covariance = np.zeros((len(run), 6, 6))
-    turn = (run.noise.gyro / _MARGIN) ** 2 * seconds / 3.0
+    turn = (run.noise.gyro / _MARGIN) ** 2 * seconds / 12.0  # half of the points on either side
     covariance[:, np.arange(3), np.arange(3)] = turn[:, None]
     return covariance
 

@@ -24,6 +24,7 @@ _JUDGED = 5  # of so many points one takes no part and judges the result
 _LEAST_FACING = 0.05  # squared cosine of the angle at which a plane is seen
 _SMOOTH = 0.005  # m, thickness of a plane that is never too rough
 _LEAST_SIGMA = 0.002  # m, of a distance from a plane
+_SAME_POSITION, _SAME_TURN, _SAME_SECONDS = 0.02, 0.004, 0.2  # m, rad: standing still, which weighs as much as so many seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,13 +80,31 @@ def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: R
     return planes, np.where(is_rough, 0.0, 1.0 / variance)
 
 
+def weights_of_slices(run: FinishedRun) -> Floats:
+    """(N,) what the points of a slice count: less than one where the body stands still for longer than 0.2 s.
+
+    The same rays meet the same spots again and again, and planes are found through what they meet: a sector of the scan and its
+    planes may be tilted together, and every further turn at rest would make that seem as certain as if something new were seen.
+    """
+    T, weights, begin = run.T_world_imu, np.ones(len(run)), 0
+    seconds, turn = (run.time_ns - run.time_ns[0]) * 1e-9, np.cos(0.5 * _SAME_TURN)
+    for k in range(1, len(run) + 1):
+        is_there = (
+            k < len(run) and np.linalg.norm(T[k, 4:] - T[begin, 4:]) <= _SAME_POSITION and abs(T[k, :4] @ T[begin, :4]) >= turn
+        )
+        if not is_there:
+            weights[begin:k] = min(_SAME_SECONDS / max(float(seconds[k - 1] - seconds[begin]), _SAME_SECONDS), 1.0)
+            begin = k
+    return weights
+
+
 def keyframe_clusters(
     run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap, information: Floats
 ) -> KeyframeClusters:
     """What every keyframe sees with the scans around it, of the planes that two keyframes see."""
     relative = se3.compose(se3.inverse(T_lidar[keyframes.scan[keyframes.of_scan]]), T_lidar)
     R_key, p_key = quaternion.to_matrix(relative[:, :4]), relative[:, 4:]
-    total = np.zeros((len(planes), 4, 4))
+    total, weights = np.zeros((len(planes), 4, 4)), weights_of_slices(run)
     keyframe: list[Ints] = []
     plane: list[Ints] = []
     clusters: list[Floats] = []
@@ -103,7 +122,7 @@ def keyframe_clusters(
             close(current)
             current = int(keyframes.of_scan[k])
         found, own = planes.clusters_of(points, R, p)
-        total[found] += _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
+        total[found] += weights[k] * _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
     close(current)
     all_planes = np.concatenate(plane)
     often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)
@@ -113,12 +132,12 @@ def keyframe_clusters(
 def scan_forms(run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats) -> Floats:
     """Q (N, 13, 13) of every scan on the planes (P,), for `PoseQuadratic` about the poses' positions; none where it is zero."""
     R_L, p_L = quaternion.to_matrix(T_imu_lidar[:4]), T_imu_lidar[4:]
-    forms = np.zeros((len(run), 13, 13))
+    forms, weights = np.zeros((len(run), 13, 13)), weights_of_slices(run)
     for k, R, p, points in _placed(run, lidar_poses(T_world_imu, T_imu_lidar), judging=False):
         found, own = planes.clusters_of(points, R, p)
         seen = information[found] > 0.0
         found = found[seen]
-        body = _moved(own[seen], R_L, np.broadcast_to(p_L, (len(found), 3))) * information[found, None, None]
+        body = _moved(own[seen], R_L, np.broadcast_to(p_L, (len(found), 3))) * (weights[k] * information[found, None, None])
         normals = planes.planes[found, :3]
         offsets = np.einsum("ki,ki->k", normals, T_world_imu[k, 4:] - planes.centres[found]) + planes.planes[found, 3]
         add_plane_forms(body, normals, offsets, forms[k])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from boxplus.errors import InputError
 from boxplus.evaluation.nees import nees
@@ -23,6 +24,7 @@ from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import choose_keyframes
 from boxplus.systems.refinement.refinement import Refinement, refine
+from boxplus.systems.refinement.sightings import weights_of_slices
 from tests.systems.slam.drives import ate
 
 LIDAR = SpinningLidar(channels=16, azimuth_steps=300, vertical_fov_deg=(-25.0, 25.0))
@@ -33,6 +35,7 @@ class Case:
     events: list[Scan | ImuSamples]
     rows: OdometryRows
     config: LioConfig
+    simulation: Simulation
     T_true: NDArray[np.float64]  # of the rows
     run: FinishedRun
     refined: Refinement
@@ -59,10 +62,10 @@ def case() -> Case:
     T_true = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
     refinement = RefinementConfig()  # type: ignore[call-arg]
     run = collect(events, rows, config, refinement)
-    return Case(events, rows, config, T_true, run, refine(run, refinement))
+    return Case(events, rows, config, simulation, T_true, run, refine(run, refinement))
 
 
-def test_scans_are_cut_into_slices_that_keep_every_point(case: Case) -> None:
+def test_scans_are_cut_into_slices_that_keep_every_point_but_of_the_first_scan(case: Case) -> None:
     run = case.run
     assert run.is_end.sum() == len(case.rows.time_ns)
     np.testing.assert_array_equal(run.time_ns[run.is_end], case.rows.time_ns)
@@ -71,8 +74,34 @@ def test_scans_are_cut_into_slices_that_keep_every_point(case: Case) -> None:
     ends = np.flatnonzero(run.is_end)
     expected = np.stack([np.append(quaternion.from_matrix(s.R_world_imu[None])[0], s.p_world_imu) for s in case.rows.states])
     np.testing.assert_allclose(np.abs(run.T_world_imu[ends]), np.abs(expected), atol=1e-12)
+    scans = [event for event in case.events if isinstance(event, Scan) and event.end_ns in set(case.rows.time_ns.tolist())]
+    first = scans[0]
+    late = int((first.time_ns >= first.end_ns - (first.end_ns - first.start_ns) // 8).sum())
+    assert abs(sum(map(len, run.points)) - sum(map(len, scans[1:])) - late) <= 0.01 * len(first)
+
+
+def test_points_lie_around_the_pose_of_their_slice(case: Case) -> None:
+    """Seen from where the LiDAR truly was then, each is where it truly was, but for noise and what the IMU bent."""
+    run, truth = case.run, case.simulation.ground_truth(case.run.time_ns)
     scans = [event for event in case.events if isinstance(event, Scan)]
-    assert sum(map(len, run.points)) == sum(len(scan) for scan in scans if scan.end_ns in set(case.rows.time_ns.tolist()))
+    p, t = np.concatenate([scan.p_lidar for scan in scans]).astype(np.float64), np.concatenate([s.time_ns for s in scans])
+    own = np.searchsorted((run.time_ns[1:] + run.time_ns[:-1]) // 2, t, side="left")
+    R_lidar, p_lidar = case.simulation.T_imu_lidar[:3, :3], case.simulation.T_imu_lidar[:3, 3]
+    for k in (1, 6, len(run) // 2, len(run) - 2):
+        there = case.simulation.ground_truth(t[own == k])
+        world = np.einsum("nij,nj->ni", there.R_world_imu, p[own == k] @ R_lidar.T + p_lidar) + there.p_world_imu
+        expected = ((world - truth.p_world_imu[k]) @ truth.R_world_imu[k] - p_lidar) @ R_lidar
+        assert len(expected) == len(run.points[k])
+        far, _ = cKDTree(expected).query(run.points[k])
+        assert np.median(far) < 0.002 and far.max() < 0.02
+
+
+def test_standing_still_weighs_as_a_moment_does(case: Case) -> None:
+    """A body in motion counts in full; one that stays for seconds as 0.2 s, however long."""
+    assert np.median(weights_of_slices(case.run)) == 1.0
+    still = replace(case.run, T_world_imu=np.tile(case.run.T_world_imu[:1], (len(case.run), 1)))
+    seconds = (case.run.time_ns[-1] - case.run.time_ns[0]) * 1e-9
+    np.testing.assert_allclose(weights_of_slices(still), 0.2 / seconds)
 
 
 def test_slices_lie_on_the_way_between_the_scans(case: Case) -> None:
