@@ -35,6 +35,21 @@ class Comparison:
         return "against --gt", self.line
 
 
+def read_ground_truth(path: Path | None) -> Trajectory | None:
+    """The trajectory to compare with, read before a run: a file that cannot be used is better refused then.
+
+    Raises:
+        InputError: it cannot be read, or has no times.
+    """
+    from boxplus.formats.trajectory import read_trajectory
+
+    if path is None:
+        return None
+    truth = read_trajectory(path)
+    truth.times  # noqa: B018 - refuses a file without them
+    return truth
+
+
 def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment: AlignmentKind) -> Comparison:
     """Write `evaluation.json`. Where that is not possible the run is as good as without it: nothing is raised.
 

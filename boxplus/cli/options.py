@@ -54,7 +54,7 @@ MountingOption = Annotated[
     typer.Option(
         "--T-imu-lidar",
         help="Pose of the LiDAR in the IMU frame (p_imu = T p_lidar): 16 numbers row by row, 'xyz_qwxyz: x y z qw qx qy qz', "
-        "'xyz_qxyzw: …', 'xyz_rpy_deg: x y z roll pitch yaw', or a file with one of these.",
+        "'xyz_qxyzw: …', 'xyz_rpy_deg: x y z roll pitch yaw', 'xyz: x y z' without a turn, or a file with one of these.",
         metavar="POSE",
         rich_help_panel=SETTINGS,
     ),

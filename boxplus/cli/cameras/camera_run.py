@@ -62,13 +62,12 @@ def run_cameras(
     Raises:
         BoxplusError: bad input, or results that cannot be written.
     """
-    from boxplus.cli.ground_truth import compare_with
+    from boxplus.cli.ground_truth import compare_with, read_ground_truth
     from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.formats.trajectory import read_trajectory
     from boxplus.recordings.cameras.open import open_camera_recording
     from boxplus.runs.cameras.folder import claim_camera_folder
 
-    truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+    truth = read_ground_truth(ground_truth)
     with (
         stop_on_interrupt(terminal.announce_stop) as should_stop,
         open_camera_recording(recording, options) as opened,

@@ -94,10 +94,10 @@ def lio(
     could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other; of several
     recordings, one failed or is not to be trusted), 130 interrupted (results up to there are complete).
     """
+    from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.lidar.several import run_several, several_recordings
     from boxplus.cli.outcome import Outcome, reported
     from boxplus.cli.run_terminal import RunTerminal
-    from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config
 
     kept: dict[str, object] = {"save": False} if no_map else {}
@@ -112,7 +112,7 @@ def lio(
         should_stop: Callable[[], bool] | None = None,
         standing: Standing | None = None,
     ) -> None:
-        truth = None if ground_truth is None else read_trajectory(ground_truth)  # a wrong file is better refused before the run
+        truth = read_ground_truth(ground_truth)
         summary, comparison = run(
             recording,
             folder,

@@ -69,17 +69,17 @@ def refine_command(
         run_config = run_config.model_copy(update={"refinement": run_config.refinement.model_copy(update=both)})
     folder = output or Path(f"{run.resolve()}_refined")
 
+    from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
-    from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.refinement.folder import claim_refine_folder
     from boxplus.runs.refinement.refine_run import read_odometry_run, refine_run
     from boxplus.runs.run_loop import Progress
 
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
     with reported(run, folder, as_json=as_json) as outcome:
-        truth = None if ground_truth is None else read_trajectory(ground_truth)
+        truth = read_ground_truth(ground_truth)
         odometry = read_odometry_run(run)  # before a folder is made
         with (
             stop_on_interrupt(terminal.announce_stop) as should_stop,

@@ -55,6 +55,9 @@ def test_a_ground_truth_of_another_day_does_not_cost_the_run(folder: Path, tmp_p
     assert read_summary(tmp_path / "out" / "run.json").state == "finished"
     result = call("lio", folder / "monday.bag", "-o", tmp_path / "none", "--gt", tmp_path / "nowhere.tum")
     assert result.exit_code == 2 and not (tmp_path / "none").exists()  # refused before the run
+    (tmp_path / "kitti.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    result = call("lio", folder / "monday.bag", "-o", tmp_path / "none", "--gt", tmp_path / "kitti.txt")
+    assert result.exit_code == 2 and "time stamps" in result.stderr and not (tmp_path / "none").exists()
 
 
 def test_of_a_folder_the_failed_one_is_listed_and_the_other_unharmed(folder: Path, tmp_path: Path) -> None:
