@@ -85,6 +85,28 @@ def _block(seed: int) -> Case:
     return city(2, 2, seed=seed), route, DriftConfig(channels=24, azimuth_steps=240), 8.0
 
 
+def _two_corridors(seed: int) -> Case:
+    """Twice through two neighbouring ones of four corridors that are the same."""
+    x, y = 31.5, 12.0 * int(np.random.default_rng([seed, 9]).integers(0, 3))
+    route = [[-x, y], [x, y], [x, y + 12], [-x, y + 12], [-x, y], [x, y], [x, y + 12], [x - 25, y + 12]]
+    return parallel_corridors(), route, DriftConfig(**INDOORS), 3.5
+
+
+def _two_storeys(seed: int) -> Case:
+    """A lap on the lower floor and two on the upper one."""
+    x, y = 36.0 / 2 - 1.5, 24.0 / 2 - 1.5
+    lap = [[-x, -y], [x, -y], [x, y], [-x, y]]
+    route = [[*p, 0.0] for p in [*lap, [-x, -y + 2]]] + [[*p, 4.0] for p in [*lap, *lap, [-x, -y + 2]]]
+    return storeys(count=2, seed=seed), route, DriftConfig(**INDOORS), 3.5
+
+
+def _aisles(seed: int) -> Case:
+    """Three aisles of a car park and back through the first two."""
+    j = 8.0 * int(np.random.default_rng([seed, 8]).integers(1, 4))
+    route = [[8, j], [72, j], [72, j + 8], [8, j + 8], [8, j + 16], [72, j + 16], [72, j], [8, j], [8, j + 8], [40, j + 8]]
+    return car_park(), route, DriftConfig(speed=3.0, corner_radius=3.0, max_range=40.0, vertical_fov_deg=(-20.0, 20.0)), 3.5
+
+
 WORLDS: dict[str, Callable[[int], Case]] = {
     "block": _block,
     "long": _long,
@@ -92,6 +114,9 @@ WORLDS: dict[str, Callable[[int], Case]] = {
     "car_park": _car_park,
     "storeys": _storeys,
     "corridors": _corridors,
+    "two_corridors": _two_corridors,
+    "two_storeys": _two_storeys,
+    "aisles": _aisles,
 }
 
 
@@ -192,12 +217,12 @@ def _ate(p: NDArray[np.float64], q: NDArray[np.float64]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", default=",".join(WORLDS), help="comma-separated")
-    parser.add_argument("--seeds", default="11:15", help="first:last, the last one excluded")
+    parser.add_argument("--seeds", default="11:15", help="first:last:step, the last one excluded")
     parser.add_argument("--drift", type=float, default=1.0, help="factor of the drift; what is claimed of it stays")
     options = parser.parse_args()
-    first, last = (int(text) for text in options.seeds.split(":"))
+    seeds = range(*(int(text) for text in options.seeds.split(":")))
     for name in options.worlds.split(","):
-        summarize(name, [run(name, seed, options.drift) for seed in range(first, last)])
+        summarize(name, [run(name, seed, options.drift) for seed in seeds])
 
 
 if __name__ == "__main__":
