@@ -50,7 +50,7 @@ class InertialWatch:
         self._squares: deque[float] = deque(maxlen=_SEGMENTS)
         self._off = 0.0
         self._begin: tuple[Floats, Floats, Floats] | None = None
-        self._imu: Preintegration | None = None
+        self._steps: list[Preintegration] = []  # since the begin; integrated as one when the segment is over
 
     @property
     def ratio(self) -> float:
@@ -76,11 +76,11 @@ class InertialWatch:
             step: what the IMU measured since the frame before, one interval; None where that is not to be relied on.
         """
         if self._begin is not None and step is not None:
-            self._imu = step if self._imu is None else self._imu.append(step).merge(0)
-            if 1e-9 * float(self._imu.intervals_ns[0, 1] - self._imu.intervals_ns[0, 0]) < _SEGMENT_S:
+            self._steps.append(step)
+            if 1e-9 * float(step.intervals_ns[0, 1] - self._steps[0].intervals_ns[0, 0]) < _SEGMENT_S:
                 return
-            self._compare(*self._begin, self._imu, pose, covariance)
-        self._begin, self._imu = (pose.copy(), state.copy(), covariance.copy()), None
+            self._compare(*self._begin, _as_one(self._steps), pose, covariance)
+        self._begin, self._steps = (pose.copy(), state.copy(), covariance.copy()), []
 
     def _compare(self, pose_0: Floats, state_0: Floats, P: Floats, imu: Preintegration, pose: Floats, covariance: Floats) -> None:
         """Note how far the end of a segment is from where the IMU comes to."""
@@ -96,3 +96,17 @@ class InertialWatch:
         S = J @ P @ J.T + R @ imu.covariance[0, :3, :3] @ R.T + axes * np.maximum(value, _LEAST_WAY**2) @ axes.T
         self._squares.append(float(off @ np.linalg.solve(S, off)) / 3.0)
         self._off = float(np.linalg.norm(off))
+
+
+def _as_one(steps: list[Preintegration]) -> Preintegration:
+    """The interval from the begin of the first step to the end of the last, at the biases of the first."""
+    time_ns, kept = np.unique(np.concatenate([step.time_ns for step in steps]), return_index=True)
+    return Preintegration.integrate(
+        time_ns,
+        np.concatenate([step.gyro for step in steps])[kept],
+        np.concatenate([step.accel for step in steps])[kept],
+        noise=steps[0].noise,
+        intervals_ns=[steps[0].intervals_ns[0, 0], steps[-1].intervals_ns[0, 1]],
+        bias_accel=steps[0].bias_accel[0],
+        bias_gyro=steps[0].bias_gyro[0],
+    )

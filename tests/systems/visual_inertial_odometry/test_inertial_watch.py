@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
-from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
+from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch, _as_one
 from tests.systems.visual_inertial_odometry.simulated_rays import (
     IMAGE_EVERY,
     NOISE,
@@ -54,6 +56,18 @@ def test_little_time_and_silence_say_nothing() -> None:
     assert watch.ratio == 0.0 and watch.contradiction is None
     sound, silent = watched(1, 1.25), watched(1, 1.25, silent=100)
     assert silent.ratio > 0.0 and silent.ratio != sound.ratio
+
+
+def test_the_steps_of_a_segment_are_integrated_as_one() -> None:
+    flight = Flight(2, 3.0)
+    ends = flight.time_ns[100:400:IMAGE_EVERY]
+    samples = flight.time_ns, flight.gyro, flight.accel
+    biases = {"bias_accel": flight.bias_accel[100], "bias_gyro": flight.bias_gyro[100]}
+    steps = [Preintegration.integrate(*samples, noise=NOISE, intervals_ns=[pair], **biases)[[0]] for pair in pairwise(ends)]
+    whole = Preintegration.integrate(*samples, noise=NOISE, intervals_ns=[ends[[0, -1]]], **biases)
+    joined = _as_one(steps)
+    for name in ("alpha", "beta", "gamma_wxyz", "covariance"):
+        assert np.array_equal(getattr(joined, name), getattr(whole, name))
 
 
 def stretched(its: Rig, scale: float) -> Rig:
