@@ -17,6 +17,7 @@ from boxplus.systems.pose_graph.start import components
 
 _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as that
 _WIDTHS = (1, 3, 10, 30)  # steps that a slip is spread over
+_ALONE = 0.1  # share of the odometry that no kept loop closure checks, from which on that is told
 _WITNESSES = 3  # loop closures that agree with each other by more than chance
 _OBJECTING = 2  # loop closures that may have been kept by chance, or bent; more of them confirm the odometry
 
@@ -41,6 +42,22 @@ def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]
             "these lie is not known"
         )
     return [*said, *(text for text in (_bent(graph, verdict), _slip(graph, verdict)) if text)]
+
+
+def unconfirmed_notes(graph: PoseGraph, verdict: LoopVerdict) -> list[str]:
+    """A sentence where a good part of the odometry is spanned by refused loop closures and by none that was kept."""
+    rank = odometry_order(graph)
+    low, high = np.sort(rank[graph.edges], axis=1).T
+    kept, refused = (verdict.is_loop & which for which in (verdict.is_kept, ~verdict.is_kept))
+    n = len(graph.ids)
+    alone = (_spanned(low[refused], high[refused], n) > 0) & (_spanned(low[kept], high[kept], n) == 0)
+    if not alone.sum() > _ALONE * n:
+        return []
+    of = np.cumsum(alone)[high - 1] > np.where(low > 0, np.cumsum(alone)[low - 1], 0)
+    return [
+        f"{alone.mean():.0%} of the odometry is confirmed by no loop closure that was kept, and {np.count_nonzero(of & refused)} "
+        "refused ones span it: whether it slipped there or these are false cannot be told"
+    ]
 
 
 def _bent(graph: PoseGraph, verdict: LoopVerdict) -> str | None:

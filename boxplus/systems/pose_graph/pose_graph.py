@@ -23,7 +23,7 @@ from boxplus.optimization.outliers.convex_start import convex_cost
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.certificate import Certificate, certify
-from boxplus.systems.pose_graph.contradictions import contradictions
+from boxplus.systems.pose_graph.contradictions import contradictions, unconfirmed_notes
 from boxplus.systems.pose_graph.doubts import (
     Fit,
     disagree,
@@ -195,6 +195,7 @@ def optimize_pose_graph(
     notes += local_notes(fit, minima)
     reasons = [text for text in (misreading(graph),) if text]
     if verdict is not None:
+        notes += unconfirmed_notes(graph, verdict)
         reasons += _verdict_doubts(fit, verdict) + contradictions(graph, verdict, starts.bridges)
     elif fit.is_poor:
         told = poor_fit_sentence(fit, minima, len(graph.fixed))

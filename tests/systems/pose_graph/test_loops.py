@@ -103,6 +103,16 @@ def test_odometry_that_slipped_is_a_doubt_that_names_it(dimension, slip):
         assert result.doubt is not None and ("140" in result.doubt or "slipped" in result.doubt)
 
 
+def test_odometry_that_only_refused_loops_span_is_told():
+    dense = simulate_pose_graph(poses=300, seed=1, false_share=0.5)
+    assert not [note for note in optimize_pose_graph(dense.graph, GNC).notes if "confirmed by no" in note]
+    few = simulate_pose_graph(poses=100, loops=6, block=2, seed=1)
+    few.graph.measurements[50, 1:] += 5.0
+    result = optimize_pose_graph(few.graph, GNC)
+    refused = few.is_loop & ~result.loops.is_kept
+    assert refused.any() and (result.doubt is not None or any("confirmed by no" in note for note in result.notes))
+
+
 def test_odometry_alone_is_a_doubt_where_all_loops_were_refused():
     simulated = simulate_pose_graph(poses=100, loops=4, block=2, seed=1, false_share=1.0)
     result = optimize_pose_graph(simulated.graph, GNC)
