@@ -14,6 +14,9 @@ of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has th
 Points that lie on one surface share what is wrong with it, and say less than as many independent ones would: v and n can be
 counted several times for that.
 
+What two poses share is in neither of them against the other. Both equations stay as they are when the same motion is taken off e
+and d: with the error e₀ of an earlier pose off both, they give the covariance of e − e₀, beginning with 0 and d − e₀.
+
 The local map is what has been taken in within about one lever arm of the points: what lies farther back is not compared any more.
 """
 
@@ -28,6 +31,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.degeneracy import PoseDirections, strong_covariance
 from boxplus.filtering.nav_state import MEASURED, P, R
 
+_FIRST, _MARKED = 0, 1  # the pose that errors are counted against
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)
 
@@ -63,6 +67,8 @@ class Correction:
 class MapDatum:
     """Joint covariance (12, 12) of the errors of pose and map, as small motions about the IMU: [θ, p] along the world's axes.
 
+    Twice: against the first pose, and against the one that was marked last.
+
     Args:
         x: (36,) first state; cov: (24, 24) its covariance. The first scan makes the map at this pose.
         shared_errors: how many times the covariance of a scan counts, since its points are not independent.
@@ -71,8 +77,8 @@ class MapDatum:
     def __init__(self, x: NDArray[np.float64], cov: NDArray[np.float64], shared_errors: float = 1.0) -> None:
         self._shared = shared_errors
         self._filter = _along_world(cov[_POSE, _POSE], x)
-        self._joint = np.zeros((12, 12))
-        self._joint[_POSE, _POSE] = self._filter
+        self._joint = np.zeros((2, 12, 12))
+        self._joint[_FIRST, _POSE, _POSE] = self._filter
         self._p_world_imu = x[P : P + 3].copy()
         self._local_points = 0.0
         self._new_share = 0.0
@@ -96,16 +102,16 @@ class MapDatum:
         both = np.kron(np.eye(2), move)
         joint = both @ self._joint @ both.T
         prior = _along_world(cov_prior[_POSE, _POSE], x)
-        joint[_POSE, _POSE] += positive_part(prior - move @ self._filter @ move.T)
+        joint[:, _POSE, _POSE] += positive_part(prior - move @ self._filter @ move.T)
         if correction is not None:
-            joint[_MAP, _MAP] += self._shared * self._new_share * _along_world(correction.alone, x)
+            joint[:, _MAP, _MAP] += self._shared * self._new_share * _along_world(correction.alone, x)
             self._new_share = 0.0
             self._local_points *= math.exp(-float(np.linalg.norm(shift)) / correction.lever_arm)
             step = np.eye(12)
             step[_POSE, _MAP] = _along_world(correction.gain, x)
             step[_POSE, _POSE] -= step[_POSE, _MAP]
             joint = step @ joint @ step.T
-            joint[_POSE, _POSE] += self._shared * _along_world(correction.noise, x)
+            joint[:, _POSE, _POSE] += self._shared * _along_world(correction.noise, x)
         self._joint, self._filter, self._p_world_imu = joint, _along_world(cov[_POSE, _POSE], x), x[P : P + 3].copy()
 
     def insert(self, points: int) -> None:
@@ -121,9 +127,24 @@ class MapDatum:
         """An error of covariance (6, 6), [θ about the IMU's axes, p along the world's], that pose and map share at x (36,)."""
         self._joint += np.kron(np.ones((2, 2)), _along_world(excess, x))
 
+    def mark(self) -> None:
+        """Count `covariance_since_mark` against the present pose from now on."""
+        step = np.eye(12)
+        step[_POSE, _POSE] = 0.0
+        step[_MAP, _POSE] = -np.eye(6)
+        self._joint[_MARKED] = step @ self._joint[_MARKED] @ step.T
+
     def pose_covariance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6, 6) covariance of the pose at x (36,) against the first pose: [θ about the IMU's axes, p along the world's]."""
-        return _turned(self._joint[_POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
+        return _turned(self._joint[_FIRST, _POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
+
+    def covariance_since_mark(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6, 6) covariance of the pose at x (36,) against the one marked last (the first one before any), likewise.
+
+        Of the motion e − e₀ about the present position, e₀ what the error of the marked pose moves there: a heading that is off
+        since long before is in neither the turn nor the way between the two.
+        """
+        return _turned(self._joint[_MARKED, _POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
 
 
 def _along_world(M: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

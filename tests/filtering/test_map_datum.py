@@ -118,3 +118,74 @@ def test_an_error_that_pose_and_map_share_stays_with_both(seed: int) -> None:
         before = cov
         cov, _ = (_scan(each, np.random.default_rng(scan), x, before, 1e-2) for each in (plain, datum))
     np.testing.assert_allclose(datum.pose_covariance(x) - plain.pose_covariance(x), excess, rtol=1e-6, atol=1e-9)
+
+
+@settings(max_examples=20)
+@given(seeds, st.floats(0.0, 2.0), st.floats(0.0, 0.5))
+def test_what_all_poses_share_is_not_between_two(seed: int, step: float, turn: float) -> None:
+    """On the way and in turns: neither what pose and map share from the first scan on, nor from the mark."""
+    between = []
+    for shared in (1e-12, 0.1):
+        random = np.random.default_rng(seed)
+        x, cov = _state(np.eye(3), np.zeros(3)), 1e-6 * np.eye(24)
+        datum = MapDatum(x, cov)
+        datum.insert(500)
+        datum.widen(shared * np.eye(6), x)
+        for k in range(12):
+            R = so3.exp(np.array([0.0, 0.1 * np.sin(k), turn * k]))
+            x = _state(R, np.array([step * k, 0.2 * k, 0.0]))
+            cov = _scan(datum, random, x, cov, 1e-3)
+            if k == 5:
+                datum.widen(shared * np.eye(6), x)
+                datum.mark()
+                np.testing.assert_allclose(datum.covariance_since_mark(x), np.zeros((6, 6)), atol=1e-9)
+            datum.insert(100)
+        between.append(datum.covariance_since_mark(x))
+    np.testing.assert_allclose(between[0], between[1], rtol=1e-4, atol=1e-9)
+    assert (np.linalg.eigvalsh(between[0]) > 0.0).all()
+
+
+def test_sampled_errors_between_two_poses_spread_as_it_says() -> None:
+    """Errors drawn through the equations of `map_datum` on a way that turns, the error of the marked pose moved along."""
+    random, runs, marked_at = np.random.default_rng(2), 20000, 3
+    x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
+    datum = MapDatum(x, cov)
+    e = 1e-4 * random.normal(size=(runs, 6))
+    datum.insert(100)
+    d, local, new = e.copy(), 100.0, 1.0
+    marked, turn_before = e, np.eye(6)
+    for k in range(1, 9):
+        R, shift = so3.exp(np.array([0.0, 0.0, 0.3 * k])), np.array([1.0, 0.5 * np.sin(k), 0.1])
+        x = _state(R, x[9:12] + shift)
+        move = np.block([[np.eye(3), np.zeros((3, 3))], [-so3.hat(shift), np.eye(3)]])
+        e, d, marked = e @ move.T, d @ move.T, marked @ move.T
+        turn = np.kron(np.diag([1.0, 0.0]), R) + np.kron(np.diag([0.0, 1.0]), np.eye(3))
+        A = _information(random)
+        # The filter's own prior, moved as `follow` moves it, and noise of the IMU.
+        along = move @ _turned(cov[:6, :6], turn_before) @ move.T
+        cov_prior = cov.copy()
+        cov_prior[:6, :6] = _turned(along, turn.T) + 1e-5 * np.eye(6)
+        cov = _updated(cov_prior, A)
+        correction = Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0))
+        datum.follow(x, cov_prior, cov, correction)
+        noise = np.linalg.cholesky(turn @ np.linalg.inv(A[:6, :6]) @ turn.T)
+        d = d + np.sqrt(new) * random.normal(size=(runs, 6)) @ noise.T
+        G = turn @ cov[:6, :6] @ A[:6, :6] @ turn.T
+        w = np.sqrt(1e-5) * random.normal(size=(runs, 6))
+        e = (e + w) @ (np.eye(6) - G).T + (d + random.normal(size=(runs, 6)) @ noise.T) @ G.T
+        if k == marked_at:
+            datum.mark()
+            marked = e
+        local = local * np.exp(-np.linalg.norm(shift) / correction.lever_arm) + 100.0
+        new = 100.0 / local
+        datum.insert(100)
+        d = (1.0 - new) * d + new * e
+        turn_before = turn
+    for errors, expected in ((e, datum.pose_covariance(x)), (e - marked, datum.covariance_since_mark(x))):
+        sampled, expected = np.cov(errors.T), _turned(expected, turn)
+        scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+        np.testing.assert_allclose(sampled / scale, expected / scale, atol=0.05)
+
+
+def _turned(M: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    return turn @ M @ turn.T

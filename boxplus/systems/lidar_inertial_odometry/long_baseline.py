@@ -6,7 +6,7 @@ So every few seconds the newest scan is registered to a map of a few scans only,
 estimate; both sets of scans are placed as the filter has placed them. How far the registration moves is the error that
 has come up in between, but for
 
-    C = S + D        S: covariance of this registration,   D: by how much the covariance of the pose has grown
+    C = S + D        S: covariance of this registration,   D: of the newest pose against the one a baseline ago
 
 What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
 four standard deviations. Directions of the new scan that the old ones do not determine stay where the estimate has them.
@@ -48,12 +48,12 @@ class Drift:
     Attributes:
         excess: (6, 6) covariance beyond what was stated: [θ about the IMU's axes, p along the world's].
         deviations: how far the newest scan lies from where the old ones want it, in standard deviations.
-        text: a sentence where that is beyond four, else empty.
+        warnings: a sentence where that is beyond four.
     """
 
     excess: NDArray[np.float64]
     deviations: float
-    text: str
+    warnings: list[str]
 
 
 class LongBaseline:
@@ -67,69 +67,57 @@ class LongBaseline:
         self._config = config.model_copy(update={"threads": 1})
         self._recent: deque[NDArray[np.float64]] = deque(maxlen=_MAP_SCANS)
         self._old: list[NDArray[np.float64]] = []
-        self._old_covariance: NDArray[np.float64] = np.zeros((6, 6))
         self._old_ns = 0
 
     def follow(
         self,
         time_ns: int,
         x: NDArray[np.float64],
-        pose_covariance: NDArray[np.float64],
         p_lidar: NDArray[np.float32],
         p_world: NDArray[np.float64],
         datum: MapDatum,
-    ) -> list[str]:
-        """Take a scan as `add` does, and widen the `datum` by what comes out; returns what is to be told."""
-        drift = self.add(time_ns, x, pose_covariance, p_lidar, p_world)
-        if drift is None:
-            return []
-        datum.widen(drift.excess, x)
-        return [drift.text] if drift.text else []
-
-    def add(
-        self,
-        time_ns: int,
-        x: NDArray[np.float64],
-        pose_covariance: NDArray[np.float64],
-        p_lidar: NDArray[np.float32],
-        p_world: NDArray[np.float64],
     ) -> Drift | None:
         """Take a scan that the filter has placed; what came out where a baseline has passed.
 
         Args:
             time_ns: of the state.
-            x: (36,) packed state after the scan; pose_covariance: (6, 6) against the first pose.
+            x: (36,) packed state after the scan.
             p_lidar: (n, 3) the points it was measured with, LiDAR frame at `time_ns`.
             p_world: (m, 3) the points it brings to the map.
+            datum: at this state; it is widened by what comes out, and marked by the scans that the next ones are compared with.
         """
         self._recent.append(p_world)
         if time_ns - self._old_ns < _BASELINE_NS and self._old:
             return None
         if len(self._recent) < _MAP_SCANS:
             return None
-        drift = self._compare(x, pose_covariance, p_lidar) if self._old else None
-        self._old, self._old_covariance, self._old_ns = list(self._recent), pose_covariance.copy(), time_ns
+        seconds = (time_ns - self._old_ns) * 1e-9
+        drift = self._compare(x, datum.covariance_since_mark(x), p_lidar, seconds) if self._old else None
+        if drift is not None:
+            datum.widen(drift.excess, x)
+        self._old, self._old_ns = list(self._recent), time_ns
+        datum.mark()
         return drift
 
     def _compare(
-        self, x: NDArray[np.float64], pose_covariance: NDArray[np.float64], p_lidar: NDArray[np.float32]
+        self, x: NDArray[np.float64], between: NDArray[np.float64], p_lidar: NDArray[np.float32], seconds: float
     ) -> Drift | None:
         found = register_to(self._old, x, p_lidar, self._config)
         if found is None:
             return None
         delta, registration = found
-        C = registration + positive_part(pose_covariance - self._old_covariance)
+        C = registration + between
         squared = [float(delta[part] @ np.linalg.solve(C[part, part], delta[part])) for part in (slice(0, 3), slice(3, 6))]
         deviations = float(np.sqrt(max(squared)))
-        text = ""
+        warnings = []
         if deviations > _TOLD:
-            text = (
-                f"scans {_BASELINE_NS * 1e-9:g} s apart do not fit each other as they were placed: by "
+            warnings.append(
+                f"scans {seconds:.3g} s apart do not fit each other as they were placed: by "
                 f"{np.linalg.norm(delta[3:]) * 100:.1f} cm and {np.degrees(np.linalg.norm(delta[:3])):.2f} deg, "
                 f"{deviations:.0f} standard deviations: the estimate drifts, where single scans do not show it (few rings, a "
                 "repeating pattern, foliage, or T_imu_lidar); covariance widened"
             )
-        return Drift(positive_part(np.outer(delta, delta) - C), deviations, text)
+        return Drift(positive_part(np.outer(delta, delta) - C), deviations, warnings)
 
 
 def register_to(

@@ -232,8 +232,8 @@ class LidarInertialOdometry(Snapshots):
         map_points_world = state.to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
-            cov = self._mounting.widened(self._datum.pose_covariance(self._x), self._x)
-            self._warnings += self._long_baseline.follow(self._time_ns, self._x, cov, points, map_points_world, self._datum)
+            drift = self._long_baseline.follow(self._time_ns, self._x, points, map_points_world, self._datum)
+            self._warnings += drift.warnings if drift is not None else []
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
