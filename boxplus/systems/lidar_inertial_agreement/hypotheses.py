@@ -58,10 +58,15 @@ _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A contradiction between the sensors, or between them and what was declared."""
+    """A contradiction between the sensors, or between them and what was declared.
+
+    Attributes:
+        axis: about the IMU's axes, about which a mounting was found to be off that an estimator goes on correcting.
+    """
 
     cause: Cause
     text: str
+    axis: tuple[float, float, float] | None = None
 
 
 def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None) -> list[Finding]:
@@ -89,26 +94,6 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     if findings[0] is None and not shows_mounting(agreement):
         findings.append(_of_planes(agreement))
     return [finding for finding in findings if finding is not None]
-
-
-def mounting_in_use(agreement: Agreement, T_in_use: NDArray[np.float64]) -> Finding | None:
-    """What the rotations contradict of a mounting that nobody declared, but that an estimator goes on with.
-
-    Args:
-        agreement: from `compare_sensors`.
-        T_in_use: (4, 4) T_imu_lidar, assumed or estimated.
-    """
-    rotation = agreement.rotation
-    if rotation is None or not judges_rotation(agreement):
-        return None
-    angle, seen = apart(rotation, T_in_use[:3, :3])
-    if not seen.any() or angle < apart_allowed(rotation):
-        return None
-    return Finding(
-        "extrinsic",
-        f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the mounting in use, which nobody gave: it "
-        f"began too far from the right one; give --T-imu-lidar (found: R_imu_lidar = {matrix_text(rotation.R_imu_lidar)})",
-    )
 
 
 def _path_counts(agreement: Agreement) -> bool:

@@ -26,11 +26,11 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges_rotation,
     lengths_known,
     lengths_of_many,
-    mounting_in_use,
     shows_mounting,
     slope_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.registration import thinned
 
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
@@ -174,7 +174,9 @@ class Watch:
             before = self.contradiction
             if findings and (before is None or findings[0].cause != before.cause):
                 self.contradiction = news = findings[0]
-            elif not findings and before is not None and judges(before.cause, agreement):
+            elif findings and findings[0].axis is not None:
+                self.contradiction = findings[0]  # a mounting that is being corrected: about the axis it is off now
+            elif not findings and before is not None and _clears(before, agreement):
                 self.contradiction = None
         self._due_ns = end_ns + round(wait * 1e9)
         return None if news is None else news.text
@@ -195,6 +197,11 @@ class Watch:
             self._slopes.append(slope)
             self._slopes_until_ns = int(agreement.path.time_ns[-1])
         return lengths_of_many(self._slopes)
+
+
+def _clears(finding: Finding, agreement: Agreement) -> bool:
+    """Whether a comparison that found nothing wrong would have found this."""
+    return judges(finding.cause, agreement) if finding.axis is None else shows_about(agreement, finding.axis)
 
 
 def clock_drift(earlier: Agreement, later: Agreement) -> Finding | None:

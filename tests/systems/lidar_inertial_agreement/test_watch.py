@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement import watch
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
@@ -65,3 +66,43 @@ def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float
     else:
         assert following.contradiction is not None and following.contradiction.cause == "extrinsic"
         assert "under the mounting in use, which nobody gave" in following.contradiction.text
+
+
+def test_a_guess_that_was_corrected_does_not_stay_contradicted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a platform that turns about one axis, by what this axis shows; a stretch that shows another one clears nothing."""
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=T)
+    assert seen.rotation is not None
+    rotation = replace(seen.rotation, R_imu_lidar=T[:3, :3].copy())
+    unknown = ["z"]
+
+    def compare(scans: Sequence[Scan], *_: Any, **__: Any) -> Agreement:
+        covariance = rotation.covariance.copy()
+        covariance[:3, :3] = np.diag([9.0 if axis in unknown else 0.005**2 for axis in "xyz"])
+        time_ns = np.linspace(scans[0].start_ns, scans[-1].end_ns, len(seen.path)).astype(np.int64)
+        shown = replace(rotation, covariance=covariance)
+        return replace(seen, path=replace(seen.path, time_ns=time_ns), rotation=shown, translation=None)
+
+    monkeypatch.setattr(watch, "compare_sensors", compare)
+    following = watch.Watch(CONFIG, None)
+    wrong = T.copy()
+    wrong[:3, :3] = so3.exp(np.array([np.deg2rad(20.0), 0.0, 0.0])) @ T[:3, :3]
+    still, said, clock = (np.zeros(3), np.zeros(3)), [], 0
+
+    def go_on(T_in_use: np.ndarray, scans_more: int) -> bool:
+        nonlocal clock
+        for _ in range(scans_more):
+            news = following.add(scans[0].shifted(clock * 100_000_000), imu, T_in_use, still)
+            said.extend([] if news is None else [news])
+            clock += 1
+        return following.contradiction is not None
+
+    assert go_on(wrong, 100)
+    unknown[:] = ["x"]
+    assert go_on(T, 200)
+    unknown[:] = ["z"]
+    assert not go_on(T, 300)
+    following.finish()
+    assert len(said) == 1 and not following.mounting_borne_out
