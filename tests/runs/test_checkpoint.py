@@ -115,6 +115,28 @@ def test_a_killed_process_goes_on(tmp_path: Path) -> None:
     assert_same(killed, out)
 
 
+def rewritten(path: Path, *without: str, **texts: str) -> None:
+    """A checkpoint with other texts, or without some."""
+    with np.load(path) as stored:
+        kept = {name: stored[name] for name in stored.files if name not in without}
+    np.savez(path, **kept | {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()})
+
+
+def test_a_checkpoint_of_other_code_is_refused(tmp_path: Path) -> None:
+    """Its objects may lack what this code expects of them."""
+    out = tmp_path / "out"
+    stopped_after(out, 40)
+    rewritten(out / "checkpoint.npz", program="boxplus 9.9.9, code 0123")
+    with pytest.raises(
+        InputError, match=r"of this version of boxplus \(boxplus .*, code .*\) – got one of boxplus 9.9.9, code 0123"
+    ):
+        run_odometry(walk(), out, resume=True)
+    rewritten(out / "checkpoint.npz", "program")  # from before it was written down
+    with pytest.raises(InputError, match=r"one of an earlier boxplus \(.*\) – start the run anew"):
+        run_odometry(walk(), out, resume=True)
+    assert read_summary(out / "run.json").state == "interrupted"
+
+
 def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     stopped_after(out, 40)
@@ -170,7 +192,8 @@ def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
 )
 def test_a_checkpoint_makes_nothing_but_objects_of_boxplus(tmp_path: Path, name: str) -> None:
     tree = {"dict": [["x", {"object": name, "attributes": {}}]]}
-    np.savez(tmp_path / "state.npz", tree=np.frombuffer(json.dumps(tree).encode(), np.uint8))
+    write_state(tmp_path / "state.npz", {})
+    rewritten(tmp_path / "state.npz", tree=json.dumps(tree))
     with pytest.raises(InputError, match="expected the checkpoint of a run"):
         read_state(tmp_path / "state.npz")
     with pytest.raises(TypeError, match=r"holds no pathlib"):

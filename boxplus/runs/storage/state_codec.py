@@ -1,10 +1,14 @@
 """Objects of boxplus as a file of arrays and JSON, and back: what a checkpoint is made of.
 
 Reading one runs no code of the file, as unpickling would: only classes of boxplus are made, without calling anything of them.
+An object is what the code made of it that wrote the file: other code may expect other attributes, and nothing would say so before
+it asks for one. A file is therefore read by the code alone that wrote it.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import importlib
 import json
 import threading
@@ -18,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+import boxplus
 from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 
@@ -36,22 +41,31 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     """
     encoder = _Encoder()
     tree = encoder.encode(state)
-    text = np.frombuffer(json.dumps(tree).encode(), np.uint8)
+    text, program = (np.frombuffer(words.encode(), np.uint8) for words in (json.dumps(tree), _program()))
     with atomic_file(path) as file:
         arrays: dict[str, Any] = {f"a{k}": values for k, values in enumerate(encoder.arrays)}
-        np.savez(file, tree=text, **arrays)
+        np.savez(file, tree=text, program=program, **arrays)
 
 
 def read_state(path: Path) -> dict[str, Any]:
     """What `write_state` wrote.
 
     Raises:
-        InputError: missing, damaged, or of another version of boxplus.
+        InputError: missing, damaged, or written by another version of boxplus.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
+            program = stored["program"].tobytes().decode() if "program" in stored.files else "an earlier boxplus"
+            if program != _program():
+                raise InputError(
+                    f"the checkpoint of a run, of this version of boxplus ({_program()})",
+                    f"one of {program} ({path})",
+                    "start the run anew, or go on with the boxplus that it began with",
+                )
             tree = json.loads(stored["tree"].tobytes())
-            found = _Decoder([stored[f"a{k}"] for k in range(len(stored.files) - 1)]).decode(tree)
+            found = _Decoder([stored[f"a{k}"] for k in range(len(stored.files) - 2)]).decode(tree)
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(
             "the checkpoint of a run, of this version of boxplus",
@@ -61,6 +75,16 @@ def read_state(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise InputError("the checkpoint of a run", f"something else in {path}", "start the run anew")
     return found
+
+
+@functools.cache
+def _program() -> str:
+    """Which boxplus this is: its version, and a digest of its code, which changes between versions."""
+    package = Path(boxplus.__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        digest.update(source.relative_to(package).as_posix().encode() + b"\0" + source.read_bytes())
+    return f"boxplus {boxplus.__version__}, code {digest.hexdigest()[:12]}"
 
 
 class _Encoder:
