@@ -91,8 +91,9 @@ def lio(
 
     No configuration is needed: topics, times and units are found from the data, with the evidence printed. Of several recordings
     one that fails leaves the others unharmed, and a table at the end says how each came out. Exit codes: 0 done, 1 the results
-    could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other; of several
-    recordings, one failed or is not to be trusted), 130 interrupted (results up to there are complete).
+    could not be written, 2 bad input, 3 finished, but not to be trusted (the sensors contradict each other, nobody gave the
+    mounting and the motion never bore it out, a long gap; of several recordings, one failed or is not to be trusted), 130
+    interrupted (results up to there are complete).
     """
     from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.lidar.several import run_several, several_recordings
