@@ -35,7 +35,7 @@ class LiveOdometry:
         self.info, self.publish, self.warn = info, publish, warn
         self.parse = CLOUD_PARSERS[type_of(info, info.lidar_topic)]
         self.options, self.tally, self.contradiction = bp.RecordingOptions(), Tally(), None
-        self.odometry = bp.LidarInertialOdometry(bp.LioConfig(T_imu_lidar=info.T_imu_lidar.tolist(), threads=2))
+        self.odometry = bp.LidarInertialOdometry(bp.LioConfig(T_imu_lidar=info.T_imu_lidar.tolist(), threads=2), live=True)
 
     def on_imu(self, data):
         try:

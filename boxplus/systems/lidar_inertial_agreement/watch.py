@@ -1,8 +1,9 @@
 """The agreement of both sensors, watched while an estimator runs.
 
 Every few seconds the last scans are registered without the IMU and compared with it (`compare_sensors`), on a thread beside the
-estimator; the verdict is taken up a fixed number of scans later, so that the run does not depend on the machine. Where the
-estimator itself has a suspicion the comparison comes at once, and its verdict sooner.
+estimator; the verdict is taken up a fixed number of scans later, and waited for, so that the run does not depend on the machine;
+live, where a scan must not wait, at the first scan after these at which it is there. Where the estimator itself has a suspicion
+the comparison comes at once, and its verdict sooner.
 """
 
 from __future__ import annotations
@@ -51,17 +52,18 @@ class Watch:
     Args:
         config: of the odometry.
         T_declared: T_imu_lidar (4, 4) as given; None where it is estimated while running.
+        live: take a verdict up when it is there instead of waiting for it.
 
     Attributes:
         contradiction: what the newest comparison that could decide found wrong; None while the sensors agree.
         mounting_borne_out: whether rotations have shown the mounting about all axes, and it was the one in use.
     """
 
-    def __init__(self, config: RegistrationConfig, T_declared: NDArray[np.float64] | None) -> None:
+    def __init__(self, config: RegistrationConfig, T_declared: NDArray[np.float64] | None, *, live: bool = False) -> None:
         self.contradiction: Finding | None = None
         self.mounting_borne_out = False
         self._config = config.model_copy(update={"threads": 1})
-        self._T_declared = T_declared
+        self._T_declared, self._live = T_declared, live
         self._scans: deque[Scan] = deque()
         self._imu: deque[ImuSamples] = deque()
         self._expected: deque[Twist] = deque()
@@ -111,7 +113,8 @@ class Watch:
             self._due_ns = scan.start_ns + round(_WINDOW_S * 1e9)
         self._scans_since += 1
         news = None
-        if self._pending is not None and self._scans_since >= self._take_up_after:
+        taken_up = self._pending is not None and self._scans_since >= self._take_up_after
+        if self._pending is not None and taken_up and not (self._live and not self._pending.done()):
             news = self._take_up(self._pending.result())
             self._pending = None
         self._blind_scans = len(self._scans) if blind else max(self._blind_scans - 1, 0)

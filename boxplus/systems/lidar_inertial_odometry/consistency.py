@@ -58,13 +58,13 @@ class Consistency:
 
     Args:
         config: of the odometry.
-        T_declared: T_imu_lidar (4, 4) as given; None where it is estimated while running.
+        live: no scan waits for the comparison of the sensors.
     """
 
-    def __init__(self, config: LioConfig, T_declared: NDArray[np.float64] | None) -> None:
+    def __init__(self, config: LioConfig, *, live: bool = False) -> None:
         self._min_matched_share = config.min_matched_share
         self._max_imu_gap = config.max_imu_gap
-        self._watch = Watch(config, T_declared)
+        self._watch = Watch(config, config.T_declared, live=live)
         self._turned = 0.0
         self._corrected = 0.0
         self._innovation = 0.0

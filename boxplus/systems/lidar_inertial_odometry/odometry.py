@@ -55,6 +55,7 @@ class LidarInertialOdometry(Snapshots):
 
     Args:
         config: the settings; every one has a default.
+        live: no scan waits for the comparison of the sensors; when a contradiction is told depends on the machine then, no pose.
 
     Example:
         >>> with bp.open_recording("flight.bag") as recording:
@@ -65,8 +66,8 @@ class LidarInertialOdometry(Snapshots):
         'ok'
     """
 
-    def __init__(self, config: LioConfig | None = None) -> None:
-        self.config = config or LioConfig()
+    def __init__(self, config: LioConfig | None = None, *, live: bool = False) -> None:
+        self.config, self._live = config or LioConfig(), live
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self.start: Start | None = None
         self.start_problem: str | None = None
@@ -79,7 +80,7 @@ class LidarInertialOdometry(Snapshots):
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
         self._weak_spell = WeakSpell(self.config.weak_threshold)
-        self._consistency, self._long_baseline = Consistency(self.config, self.config.T_declared), LongBaseline(self.config)
+        self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
@@ -163,7 +164,7 @@ class LidarInertialOdometry(Snapshots):
         self._next_try = 0
         self._consistency.finish()
         self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
-        self._consistency, self._long_baseline = Consistency(self.config, self.config.T_declared), LongBaseline(self.config)
+        self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self.start, self._standstill = None, None
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)

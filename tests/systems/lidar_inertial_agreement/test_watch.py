@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -106,3 +107,26 @@ def test_a_guess_that_was_corrected_does_not_stay_contradicted(monkeypatch: pyte
     assert not go_on(T, 300)
     following.finish()
     assert len(said) == 1 and not following.mounting_borne_out
+
+
+def test_live_no_scan_waits_for_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison ends when it may; until then scans go through, and after it the next one brings the verdict."""
+    simulation = handheld(4)
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=simulation.T_imu_lidar)
+    may_end = threading.Event()
+
+    def compare(*_: Any, **__: Any) -> Agreement:
+        assert may_end.wait(60.0)
+        return seen
+
+    monkeypatch.setattr(watch, "compare_sensors", compare)
+    wrong = turned(simulation.T_imu_lidar, 20.0, seed=3)
+    following = watch.Watch(CONFIG, None, live=True)
+    still = np.zeros(3), np.zeros(3)
+    for k in range(200):
+        assert following.add(scans[0].shifted(k * 100_000_000), imu, wrong, still) is None
+    assert following.contradiction is None
+    may_end.set()
+    told = following.finish()
+    assert told is not None and following.contradiction is not None and following.contradiction.text == told

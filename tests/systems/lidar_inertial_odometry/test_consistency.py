@@ -17,7 +17,7 @@ PERIOD_NS = 100_000_000
 
 def follow(shares: list[float]) -> tuple[Consistency, list[str]]:
     """The shares of the points that lie on their planes, a scan each at 10 Hz."""
-    consistency, told = Consistency(LioConfig(), None), []
+    consistency, told = Consistency(LioConfig()), []
     for number, share in enumerate(shares):
         frame: Any = SimpleNamespace(scan=SimpleNamespace(start_ns=number * PERIOD_NS, end_ns=(number + 1) * PERIOD_NS))
         told += consistency._fit(frame, share)
@@ -44,7 +44,7 @@ def test_biases_that_no_sensor_in_order_has_are_named_once(gyro: float, accel: f
     """The gyroscope of EuRoC's flights has 0.085 rad/s and is in order; what is not known yet is not held against it."""
     x = NavState.identity().pack()
     x[BW], x[BA + 1] = gyro, accel
-    consistency = Consistency(LioConfig(), None)
+    consistency = Consistency(LioConfig())
     found = consistency._biases(x, sigma**2 * np.eye(TANGENT)) + consistency._biases(x, sigma**2 * np.eye(TANGENT))
     assert len(found) == told
     assert all("T_imu_lidar is wrong" in text for text in found)
@@ -55,7 +55,7 @@ def test_a_bias_that_changes_by_more_than_any_sensor_does_is_a_contradiction(
     first: float, then: float, contradicted: bool
 ) -> None:
     """One that was large from the start is that of a bad sensor, and a warning."""
-    consistency, x, told = Consistency(LioConfig(), None), NavState.identity().pack(), []
+    consistency, x, told = Consistency(LioConfig()), NavState.identity().pack(), []
     for accel in (first, then, then):
         x[BA + 1] = accel
         told += consistency._biases(x, np.zeros((TANGENT, TANGENT)))
@@ -70,7 +70,7 @@ def test_corrections_beyond_noise_are_named_once_after_two_seconds(off_m: float,
     x[P] += off_m
     directions = SimpleNamespace(weak=np.zeros(6, bool), vectors=np.eye(6), lever_arm=1.0)
     posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
-    consistency, found = Consistency(LioConfig(), None), []
+    consistency, found = Consistency(LioConfig()), []
     for number in range(40):
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
         found.append(consistency._innovate(frame, prior, 1e-8 * np.eye(TANGENT), posterior))
