@@ -30,8 +30,8 @@ _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
 _UNIT_ADVICE = "give --gyro-unit"
 _UNKNOWN = (
     "nobody gave T_imu_lidar, and the motion did not show it: {assumed}, and the path and its covariance are wrong by as much as "
-    "the mounting is; give --T-imu-lidar (for axes that are parallel: --T-imu-lidar 'xyz_rpy_deg: 0 0 0 0 0 0'), or turn the "
-    "platform about all axes"
+    "the mounting is; give --T-imu-lidar (for axes that are parallel: --T-imu-lidar 'xyz_rpy_deg: X Y Z 0 0 0', X Y Z the "
+    "LiDAR's place as seen from the IMU in metres; what is given is taken for exact), or turn the platform about all axes"
 )
 _MOST_POINTS = 20_000
 """Of a scan that is kept for the estimate; 12 s of scans stay below 50 MB."""
