@@ -124,6 +124,39 @@ def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
 
 
 @compiles
+def test_what_is_loaded_needs_no_compiler(tmp_path: Path) -> None:
+    """Most of Numba is its compiler; a process that compiles nothing must not import it, and still allocate and raise."""
+    (tmp_path / "program.py").write_text("""
+import sys
+import numpy as np
+from boxplus._jit import kernel
+
+@kernel
+def doubled(x):
+    if len(x) == 0:
+        raise ValueError("nothing to double")
+    out = np.empty(len(x))
+    for i in range(len(x)):
+        out[i] = 2.0 * np.sin(x[i])
+    return out, np.dot(out, out)
+
+print(round(doubled(np.ones(2))[1], 3), "numba.cpython.charseq" in sys.modules)
+try:
+    doubled(np.empty(0))
+except ValueError as error:
+    print(error)
+""")
+
+    def run() -> list[str]:
+        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": ""}
+        program = [sys.executable, str(tmp_path / "program.py")]
+        return subprocess.run(program, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+
+    assert run() == ["5.665 True", "nothing to double"]
+    assert run() == ["5.665 False", "nothing to double"]
+
+
+@compiles
 def test_a_file_under_another_module_name_has_kernels_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(_PROGRAM)
     as_a_module = "import importlib.util as u; s = u.spec_from_file_location({0!r}, {1!r}); m = u.module_from_spec(s); "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 
 
@@ -53,7 +54,5 @@ def nees_band(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
     """
     if dof < 1 or runs < 1 or not 0.0 < confidence < 1.0:
         raise InputError("dof ≥ 1, runs ≥ 1 and 0 < confidence < 1", f"{dof}, {runs} and {confidence}", "correct the arguments")
-    from scipy.stats import chi2
-
     tail = 0.5 * (1.0 - confidence)
-    return float(chi2.ppf(tail, dof * runs) / runs), float(chi2.ppf(1.0 - tail, dof * runs) / runs)
+    return float(chi_square_quantile(tail, dof * runs) / runs), float(chi_square_quantile(1.0 - tail, dof * runs) / runs)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from boxplus.errors import InputError, NotFiniteError
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.variables import VariableRows, Variables
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +32,7 @@ class LinearizedProblem:
         cost: ½ Σ ρ(‖W r‖²).
     """
 
-    jacobian: sparse.csr_array
+    jacobian: csr_array
     residuals: NDArray[np.float64]
     weights: NDArray[np.float64]
     cost: float
@@ -43,8 +46,10 @@ class LinearizedProblem:
         return np.asarray(self.jacobian.T @ (self.weights * self.residuals))
 
     @property
-    def hessian(self) -> sparse.csr_array:
+    def hessian(self) -> csr_array:
         """(n, n) Jᵀ diag(w) J, sparse: Gauss-Newton's, with the losses as weights (iteratively reweighted least squares)."""
+        from scipy import sparse
+
         return sparse.csr_array(self.jacobian.T @ sparse.diags_array(self.weights) @ self.jacobian)
 
     def rows(self, group: Group) -> slice:
@@ -123,6 +128,8 @@ def linearize(blocks: Sequence[Variables], groups: Sequence[Group], values: Sequ
     if width == 0:
         raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
     entries, rows, columns = (np.concatenate([part[k] for part in parts]) if parts else np.zeros(0) for k in range(3))
+    from scipy import sparse
+
     jacobian = sparse.coo_array((entries, (rows.astype(np.int64), columns.astype(np.int64))), shape=(first, width)).tocsr()
     return LinearizedProblem(
         jacobian,

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 from boxplus.optimization.losses import GemanMcClure, Squared, Truncated
 from boxplus.optimization.minimizers.minimize import Callback
@@ -245,10 +246,8 @@ def _first_weights(groups: list[Group], given: Mapping[str, ArrayLike] | None) -
 
 
 def _threshold(group: Group, given: float | None) -> float:
-    from scipy.stats import chi2
-
     if given is None:
-        return math.sqrt(float(chi2.ppf(_PROBABILITY, group.residual.dim)))
+        return math.sqrt(chi_square_quantile(_PROBABILITY, group.residual.dim))
     if not (math.isfinite(given) and given > 0.0):
         raise InputError("a positive inlier threshold", f"{given}", "give it in standard deviations of the residual, such as 3.0")
     return float(given)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_cdf, chi_square_quantile
+
 _TAIL = 0.9  # quantile of the inliers' distribution above which kept residuals are compared with how many there should be
 _NEAR = 1.2  # a refused residual up to this many thresholds is a close call
 
@@ -43,12 +45,10 @@ def inlier_report(
     squares: NDArray[np.float64], dim: int, threshold: float, kept_ones: NDArray[np.bool_] | None = None
 ) -> InlierReport:
     """Of ‖W r‖² (N,) of residuals with `dim` rows, kept up to `threshold` standard deviations or as `kept_ones` (N,) says."""
-    from scipy.stats import chi2
-
     within = squares <= threshold**2 if kept_ones is None else kept_ones
     kept = int(np.count_nonzero(within))
-    tail = float(chi2.ppf(_TAIL, dim))
-    inside = float(chi2.cdf(threshold**2, dim))
+    tail = chi_square_quantile(_TAIL, dim)
+    inside = chi_square_cdf(threshold**2, dim)
     expected = kept * max(1.0 - _TAIL / inside, 0.0) if inside > 0.0 else 0.0
     excess = max(np.count_nonzero(within & (squares > tail)) - expected, 0.0)
     return InlierReport(

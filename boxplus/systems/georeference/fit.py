@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3
@@ -87,11 +88,9 @@ def fit(
         attached: N fixes, p_enu: (N, 3) where they are. T_enu_map: (7,) the start, believed: (N,) the fixes it rests on.
         lever: (3,) given; None: estimated about zero.
     """
-    from scipy.stats import chi2
-
     spacing = float(np.median(np.diff(attached.time_ns))) * 1e-9
     inflation = math.sqrt(max(config.correlation / spacing, 1.0))
-    threshold = math.sqrt(float(chi2.ppf(config.inlier, 3)))
+    threshold = math.sqrt(chi_square_quantile(config.inlier, 3))
     noise_scale = 1.0
     start = [graph.T_map, T_enu_map[None], np.zeros((1, 3)) if lever is None else lever[None], np.zeros((1, 1))]
     for _ in range(_ROUNDS):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import se3
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.systems.localization.config import LocalizationConfig
@@ -123,10 +124,8 @@ class Tracker:
         return share > self._config.most_seen_through
 
     def _innovation(self, xi: Floats, covariance: Floats, measured: int) -> tuple[float, float]:
-        from scipy.stats import chi2
-
         S = self.covariance + covariance
-        limit = math.sqrt(float(chi2.ppf(self._config.innovation, measured)))
+        limit = math.sqrt(chi_square_quantile(self._config.innovation, measured))
         return math.sqrt(max(float(xi @ np.linalg.solve(S, xi)), 0.0)), limit
 
     def _surroundings(self) -> Surface | None:

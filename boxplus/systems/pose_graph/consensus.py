@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 
@@ -101,9 +102,7 @@ def _variances(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _limits(is_spatial: bool) -> NDArray[np.float64]:
     """Squares of the rotation's and the translation's length that true pairs exceed once in a thousand, for unit variances."""
-    from scipy.stats import chi2
-
-    return np.array([float(chi2.ppf(_KEEP, dof)) for dof in ((3, 3) if is_spatial else (1, 2))])
+    return np.array([chi_square_quantile(_KEEP, dof) for dof in ((3, 3) if is_spatial else (1, 2))])
 
 
 def _positions(T: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile, chi_square_sf
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.systems.pose_graph.bridges import Bridge
 from boxplus.systems.pose_graph.consensus import Crossings
@@ -62,21 +63,19 @@ def unconfirmed_notes(graph: PoseGraph, verdict: LoopVerdict) -> list[str]:
 
 def _bent(graph: PoseGraph, verdict: LoopVerdict) -> str | None:
     """Where the loop closures that were kept bend the odometry, over one step or several, by more than its noise."""
-    from scipy.stats import chi2
-
     rank, dim = odometry_order(graph), graph.information.shape[1]
     steps = np.flatnonzero(~verdict.is_loop & (np.abs(np.diff(rank[graph.edges], axis=1))[:, 0] == 1))
     steps = steps[np.argsort(rank[graph.edges[steps]].min(axis=1), kind="stable")]
     squared = verdict.innovations[steps] ** 2
     if not len(steps):
         return None
-    scale = max(float(np.median(squared)) / float(chi2.median(dim)), 1.0)
+    scale = max(float(np.median(squared)) / chi_square_quantile(0.5, dim), 1.0)
     total = np.concatenate([[0.0], np.cumsum(squared / scale)])
     best, told = _STRANGE / len(steps), None
     for width in (width for width in _WIDTHS if width <= len(steps)):
         sums = total[width:] - total[:-width]
         most = int(np.argmax(sums))
-        chance = float(chi2.sf(sums[most], width * dim))
+        chance = chi_square_sf(sums[most], width * dim)
         if chance < best:
             best = chance
             ends = graph.edges[steps[most : most + width]]

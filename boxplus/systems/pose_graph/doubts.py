@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_cdf, chi_square_exceeded, chi_square_quantile
 from boxplus._jit import kernel
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.solution import Solution
@@ -63,9 +64,7 @@ class Fit:
     @property
     def is_slack(self) -> bool:
         """Whether the information promises far more noise than there is."""
-        from scipy.stats import chi2
-
-        return self.chi2 < _SLACK * self.dof and float(chi2.cdf(self.chi2, self.dof)) < _SURE
+        return self.chi2 < _SLACK * self.dof and chi_square_cdf(self.chi2, self.dof) < _SURE
 
     @property
     def sentence(self) -> str:
@@ -104,12 +103,10 @@ def slack_sentence(fit: Fit) -> str:
 
 def standing_out(squared: NDArray[np.float64], dim: int) -> NDArray[np.bool_]:
     """(k,) which of these squared errors no noise explains, judged by the typical one where that is larger than promised."""
-    from scipy.stats import chi2
-
     if not len(squared):
         return np.zeros(0, dtype=np.bool_)
-    scale = max(float(np.median(squared)) / float(chi2.median(dim)), 1.0)
-    return np.asarray(squared > scale * float(chi2.isf(_STRANGE / len(squared), dim)))
+    scale = max(float(np.median(squared)) / chi_square_quantile(0.5, dim), 1.0)
+    return np.asarray(squared > scale * chi_square_exceeded(_STRANGE / len(squared), dim))
 
 
 def disagree(minima: Mapping[Start, float]) -> bool:

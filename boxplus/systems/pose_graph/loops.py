@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import SingularProblemError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.losses import Squared
@@ -72,11 +73,9 @@ def judge_loops(
     Raises:
         SingularProblemError: see `Problem.solve`.
     """
-    from scipy.stats import chi2
-
     problem, poses = problem_with_loops_apart(graph, is_loop)
     group = problem.groups[-1]
-    search, keep = (math.sqrt(float(chi2.ppf(p, group.residual.dim))) for p in (_SEARCH, _KEEP))
+    search, keep = (math.sqrt(chi_square_quantile(p, group.residual.dim)) for p in (_SEARCH, _KEEP))
     # Odometry that holds everything together speaks first; else the loops are needed from the beginning.
     whole = len(np.unique(components(with_edges(graph, ~is_loop)))) == len(np.unique(components(graph)))
     found = graduate(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Squared
@@ -124,10 +125,8 @@ class _Graph:
 
     def solve(self) -> tuple[NDArray[np.bool_], Solution]:
         """Which encounters are kept, and the minimum with them."""
-        from scipy.stats import chi2
-
         options = SolverOptions(initial_damping=_DAMPING)
-        threshold = math.sqrt(float(chi2.ppf(_INLIER, 6)))
+        threshold = math.sqrt(chi_square_quantile(_INLIER, 6))
         found = graduate(self.problem, self.encounters, loss="truncated", inlier_threshold=threshold, options=options)
         self.encounters.set_loss(Squared())
         kept = found.inliers["encounters"]

@@ -13,6 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
@@ -160,10 +161,8 @@ class _Anchors:
 
 def _anchored(count: int, meetings: list[Meeting], config: SessionsConfig) -> tuple[_Anchors, list[Meeting]]:
     """A first placement along the meetings with most encounters, and the meetings that contradict it refused."""
-    from scipy.stats import chi2
-
     anchors, decided = _Anchors(count), list(meetings)
-    limit = float(np.sqrt(chi2.ppf(config.slam.innovation, 6)))
+    limit = float(np.sqrt(chi_square_quantile(config.slam.innovation, 6)))
     for k in sorted(range(len(meetings)), key=lambda k: (-len(meetings[k].accepted), k)):
         meeting = meetings[k]
         if meeting.T_place_query is None or meeting.covariance is None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import se3
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Loop
@@ -45,9 +46,7 @@ def cycle_error(
 
 def agree(a: Loop, b: Loop, odometry: OdometryChain, config: SlamConfig, of_places: OdometryChain | None = None) -> bool:
     """Whether the cycle of two loops closes as well as those of true ones do."""
-    from scipy.stats import chi2
-
-    return cycle_error(a, b, odometry, config.odometry_scale, of_places) ** 2 <= float(chi2.ppf(config.innovation, 6))
+    return cycle_error(a, b, odometry, config.odometry_scale, of_places) ** 2 <= chi_square_quantile(config.innovation, 6)
 
 
 def largest_clique(adjacent: NDArray[np.bool_]) -> list[int]:

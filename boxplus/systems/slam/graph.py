@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Squared
@@ -168,6 +169,4 @@ def close_graph(
 
 
 def _threshold(dof: int) -> float:
-    from scipy.stats import chi2
-
-    return math.sqrt(float(chi2.ppf(_INLIER, dof)))
+    return math.sqrt(chi_square_quantile(_INLIER, dof))

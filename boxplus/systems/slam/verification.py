@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.slam.config import SlamConfig
@@ -100,12 +101,10 @@ def _deformation(query: LocalMap, place: LocalMap, T_place_query: Floats) -> Flo
 
 def _far_off(loop: Loop, odometry: RelativePoses, config: SlamConfig) -> str | None:
     """Whether no registration could bring the motion of the density images to where the odometry says one is."""
-    from scipy.stats import chi2
-
     T_odo, S_odo = odometry.between(loop.place, loop.query)
     xi = se3.log(se3.compose(se3.inverse(loop.T_start), T_odo))
     S = config.odometry_scale**2 * S_odo + np.diag(np.repeat([_BASIN_ROTATION**2, _BASIN_POSITION**2], 3))
-    far, limit = mahalanobis(xi, S), math.sqrt(float(chi2.ppf(config.innovation, 6)))
+    far, limit = mahalanobis(xi, S), math.sqrt(chi_square_quantile(config.innovation, 6))
     if far <= limit:
         return None
     metres = float(np.linalg.norm(loop.T_start[4:] - T_odo[4:]))
@@ -114,13 +113,11 @@ def _far_off(loop: Loop, odometry: RelativePoses, config: SlamConfig) -> str | N
 
 
 def _innovation(loop: Loop, found: Registration, odometry: RelativePoses, config: SlamConfig) -> tuple[float, float]:
-    from scipy.stats import chi2
-
     T_odo, S_odo = odometry.between(loop.place, loop.query)
     xi = se3.log(se3.compose(se3.inverse(found.T_target_source), T_odo))
     # Along what was not measured, the registration stayed where it began; the covariance says so, and nothing is asked there.
     S = config.odometry_scale**2 * S_odo + found.covariance
-    limit = math.sqrt(float(chi2.ppf(config.innovation, max(loop.measured, 1))))
+    limit = math.sqrt(chi_square_quantile(config.innovation, max(loop.measured, 1)))
     return mahalanobis(xi, S), limit
 
 
