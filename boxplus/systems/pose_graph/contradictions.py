@@ -56,8 +56,8 @@ def unconfirmed_notes(graph: PoseGraph, verdict: LoopVerdict) -> list[str]:
         return []
     of = np.cumsum(alone)[high - 1] > np.where(low > 0, np.cumsum(alone)[low - 1], 0)
     return [
-        f"{alone.mean():.0%} of the odometry is confirmed by no loop closure that was kept, and {np.count_nonzero(of & refused)} "
-        "refused ones span it: whether it slipped there or these are false cannot be told"
+        f"{alone.mean():.0%} of the odometry is confirmed by no loop closure that was kept, refused ones "
+        f"that span it: {np.count_nonzero(of & refused)}; whether it slipped there or these are false cannot be told"
     ]
 
 
