@@ -18,7 +18,8 @@ from boxplus.runs.inspection.stretches import gather_scans, lively_stretches
 from boxplus.runs.run_loop import versions
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, Calibration, calibrate
-from boxplus.systems.lidar_inertial_agreement.hypotheses import Cause, contradictions, judges_rotation
+from boxplus.systems.lidar_inertial_agreement.finding import Cause
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _STRETCH_S, _STRETCHES = 8.0, 5

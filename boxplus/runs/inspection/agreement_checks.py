@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from boxplus.recordings.info import Evidence, RecordingInfo
 from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart
+from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
-    Cause,
-    Finding,
     contradictions,
     judges_clocks,
     judges_lengths,

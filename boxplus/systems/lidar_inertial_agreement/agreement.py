@@ -28,6 +28,7 @@ from boxplus.systems.lidar_inertial_agreement.backwards import surer_path
 from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
 
@@ -38,6 +39,8 @@ _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
 _SLOPE_DOUBTFUL = 0.03
 _SCAN_NS = 100_000_000
+FEET_PER_METRE = 3.28084
+_THICK_M = 0.08  # median misfit of a path: of sound ones the foliage of a forest reaches 5 cm
 ROTATION_KNOWN_RAD = 0.05
 _DECLARED_ARM_STD = 0.02  # m
 
@@ -55,6 +58,7 @@ class Agreement:
         gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
             unit.
         planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
+        in_feet: the accelerations again with the points taken for feet; None where they are not as thick as feet would be.
     """
 
     path: LidarPath
@@ -64,6 +68,7 @@ class Agreement:
     imu_rate_hz: float
     gyro_power: float
     planes: PlaneTilt | None = None
+    in_feet: TranslationFit | None = None
 
 
 def compare_sensors(
@@ -89,6 +94,25 @@ def compare_sensors(
             that disagrees with it is measured by: one that explains the scans worse is not compared with anything.
     """
     imu = usable(imu)
+    found = _compare(scans, imu, with_cells_for_all(scans, config), T_expected, T_declared, refine, expected)
+    if not _as_thick_as_feet(found):
+        return found
+    # Cells and thresholds are made for metres.
+    metres = [replace(scan, p_lidar=(scan.p_lidar / FEET_PER_METRE).astype(np.float32)) for scan in scans]
+    again = _compare(metres, imu, with_cells_for_all(metres, config), T_expected, T_declared, True, None)
+    return replace(found, in_feet=again.translation)
+
+
+def _compare(
+    scans: Sequence[Scan],
+    imu: ImuSamples,
+    config: RegistrationConfig,
+    T_expected: NDArray[np.float64] | None,
+    T_declared: NDArray[np.float64] | None,
+    refine: bool,
+    expected: Sequence[Twist] | None,
+) -> Agreement:
+    """`compare_sensors` with points in metres."""
     T_guess = T_declared if T_declared is not None else T_expected
     guesses = [] if T_guess is None else gyro_guesses(imu, T_guess[:3, :3])
     path = lidar_path(scans, config, guesses, expected=expected)
@@ -122,6 +146,12 @@ def compare_sensors(
     if T_declared is None:
         return found
     return replace(found, planes=plane_tilt(found.path, scans, imu, T_declared[:3, :3], config))
+
+
+def _as_thick_as_feet(found: Agreement) -> bool:
+    """Whether points lie about their planes as those of a LiDAR in feet do, and the accelerations show no lengths."""
+    thick = len(found.path) > 0 and float(np.median(found.path.misfit)) > _THICK_M
+    return thick and (found.translation is None or found.translation.explained < _EXPLAINED)
 
 
 def _compared(

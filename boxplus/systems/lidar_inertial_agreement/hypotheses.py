@@ -6,29 +6,26 @@ decide, nothing is said. Every finding is a sentence for a user: what was seen, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart, apart_allowed, unit_of
+from boxplus.systems.lidar_inertial_agreement.agreement import (
+    ROTATION_KNOWN_RAD,
+    Agreement,
+    apart,
+    apart_allowed,
+    unit_of,
+)
+from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
+from boxplus.systems.lidar_inertial_agreement.lengths import (
+    MISFIT_M,
+    SLOPE_FLOOR,
+    SLOPE_KNOWN,
+    feet_finding,
+    slope_finding,
+)
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
-
-Cause = Literal[
-    "gyro_unit",
-    "gyro_sign",
-    "gyro_scale",
-    "not_together",
-    "extrinsic",
-    "mirrored",
-    "time_offset",
-    "clock_drift",
-    "force_sign",
-    "length_scale",
-]
 
 _LEAST_SEEN = 0.5  # of the pairs of scans, all three rotations
 _GOOD_PATH_M = 0.15  # median misfit of registrations that can be believed
@@ -41,32 +38,14 @@ _REVERSED = 0.6  # a sign is told from its opposite by less than a scale from an
 _SCALE_OFF = 0.12
 _OFFSET_OK_S = 0.014
 _OFFSET_STD_S = 0.012
-_SLOPE_OFF = 0.07
-_SLOPE_FLOOR, _SLOPE_OF_MANY_FLOOR = 0.02, 0.03
-_FITS_OF_MANY, _FEWEST_SLOPES = 0.7, 2
-_SLOPE_WELL_KNOWN = 0.033
-_MISFIT_M = 0.03
-_SLOPE_KNOWN = 0.3
+_SLOPE_OF_MANY_FLOOR = 0.03
+_FITS_OF_MANY = 0.7
 _FARTHEST_REVERSED = 4.5  # feet, and a third of it
-_FEET = 3.28084
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MOUNTED = 0.95  # share of the turning that a mounting explains
 _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A contradiction between the sensors, or between them and what was declared.
-
-    Attributes:
-        axis: about the IMU's axes, about which a mounting was found to be off that an estimator goes on correcting.
-    """
-
-    cause: Cause
-    text: str
-    axis: tuple[float, float, float] | None = None
 
 
 def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None) -> list[Finding]:
@@ -88,6 +67,8 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     if found is not None:
         return [found]  # what follows from it is not worth a sentence of its own
     findings = [_of_mounting(rotation, T_declared), _of_scale(rotation), _of_clocks(rotation, agreement.imu_rate_hz)]
+    if agreement.in_feet is not None:
+        findings.append(feet_finding(agreement.in_feet))
     if translation is not None:
         findings.append(_of_lengths(agreement, translation))
         findings.append(_of_turn(rotation, translation, T_declared))
@@ -101,7 +82,7 @@ def _path_counts(agreement: Agreement) -> bool:
     path, rotation = agreement.path, agreement.rotation
     if rotation is None or float(np.median(path.misfit)) > _GOOD_PATH_M:
         return False
-    return rotation.intervals > _LEAST_SEEN * (len(path) - 1)
+    return rotation.covered > _LEAST_SEEN
 
 
 def judges_rotation(agreement: Agreement) -> bool:
@@ -122,15 +103,15 @@ def judges_lengths(agreement: Agreement) -> bool:
     translation = agreement.translation
     if translation is None or not _path_counts(agreement) or _lags(agreement):
         return False
-    fits = translation.explained > _FITS and translation.sigma < _MISFIT_M
-    return fits and float(np.hypot(translation.slope_std, _SLOPE_FLOOR)) < _SLOPE_KNOWN
+    fits = translation.explained > _FITS and translation.sigma < MISFIT_M
+    return fits and float(np.hypot(translation.slope_std, SLOPE_FLOOR)) < SLOPE_KNOWN
 
 
 def _lags(agreement: Agreement) -> bool:
-    """Whether the path misses a rotation that the gyroscope shows: then it misses accelerations as well."""
+    """Whether the path misses a rotation that the gyroscope shows, then it misses accelerations as well, or knows it coarsely."""
     rotation = agreement.rotation
     if rotation is None or rotation.explained > _FITS:
-        return False
+        return rotation is not None and rotation.coarse
     turning = float(np.sqrt(agreement.gyro_power)) / max(unit_of(rotation.scale), 1.0)
     return turning > float(_TURNING_RAD_S)
 
@@ -225,9 +206,9 @@ def _of_mirror(
 
 
 def _reversed(translation: TranslationFit) -> bool:
-    if translation.explained < _REVERSED or translation.sigma > _MISFIT_M:
+    if translation.explained < _REVERSED or translation.sigma > MISFIT_M:
         return False
-    std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
+    std = float(np.hypot(translation.slope_std, SLOPE_FLOOR))
     # Many times as far as anything accelerates: a path that has gone astray. A flipped sign leaves the size: half of it is a
     # motion that does not determine the mounting.
     return -_FARTHEST_REVERSED < translation.slope < -0.6 and translation.slope + 5.0 * std < 0.0
@@ -243,10 +224,10 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
         f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the given T_imu_lidar (known to "
         f"{np.degrees(np.linalg.norm(rotation.rotation_std[0][seen])):.1f} deg)"
     )
-    inverse, _ = apart(rotation, T_declared[:3, :3].T)
-    if inverse < 0.3 * angle:
+    inverse, mirrored = apart(rotation, T_declared[:3, :3].T)[0], _from_mirrored(rotation, T_declared[:3, :3])
+    if inverse < min(0.3 * angle, mirrored):
         advice = f"its inverse fits to {np.degrees(inverse):.1f} deg: T_imu_lidar maps LiDAR coordinates to IMU coordinates"
-    elif abs(angle - np.pi) < _HALF_TURN_RAD:
+    elif abs(angle - np.pi) < _HALF_TURN_RAD or mirrored < apart_allowed(rotation):
         advice = "half a turn: the gyroscope's sign is flipped, the points are mirrored, or T_imu_lidar is of another mounting"
     else:
         advice = (
@@ -256,11 +237,17 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
     return Finding("extrinsic", f"{text}; {advice}")
 
 
+def _from_mirrored(rotation: RotationFit, R_imu_lidar: NDArray[np.float64]) -> float:
+    """How far a turning is from that of points with one axis of the other sign, half a turn about it [rad]; the nearest one."""
+    half_turns = [2.0 * np.outer(axis, axis) - np.eye(3) for axis in np.eye(3)]
+    return min(apart(rotation, R_imu_lidar @ half_turn)[0] for half_turn in half_turns)
+
+
 def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
     """Where the platform hardly turns, accelerations show the mounting: coarsely, since gravity leaks with attitude."""
     if T_declared is None or (rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() > 1:
         return None
-    if translation.explained < _FITS or translation.sigma > _MISFIT_M or translation.slope < 0.0:
+    if translation.explained < _FITS or translation.sigma > MISFIT_M or translation.slope < 0.0:
         return None
     variance, axes = np.linalg.eigh(translation.covariance[TURN, TURN])
     seen = np.sqrt(variance) < _TURN_KNOWN_RAD
@@ -317,16 +304,16 @@ def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
 
 def _of_lengths(agreement: Agreement, translation: TranslationFit) -> Finding | None:
     slope = translation.slope
-    std = float(np.hypot(translation.slope_std, _SLOPE_FLOOR))
+    std = float(np.hypot(translation.slope_std, SLOPE_FLOOR))
     if _reversed(translation):
         text = (
             f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): its sign is "
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
         return Finding("force_sign", text)
-    if translation.explained < _FITS or translation.sigma > _MISFIT_M or _lags(agreement):
+    if translation.explained < _FITS or translation.sigma > MISFIT_M or _lags(agreement):
         return None
-    return _of_slope(slope, std)
+    return slope_finding(slope, std)
 
 
 def slope_of(agreement: Agreement) -> tuple[float, float] | None:
@@ -334,40 +321,10 @@ def slope_of(agreement: Agreement) -> tuple[float, float] | None:
     translation = agreement.translation
     if translation is None or not _path_counts(agreement) or _lags(agreement):
         return None
-    if translation.explained < _FITS_OF_MANY or translation.sigma > _MISFIT_M:
+    if translation.explained < _FITS_OF_MANY or translation.sigma > MISFIT_M:
         return None
     std = float(np.hypot(translation.slope_std, _SLOPE_OF_MANY_FLOOR))
-    return (translation.slope, std) if std < _SLOPE_KNOWN else None
-
-
-def lengths_of_many(slopes: Sequence[tuple[float, float]]) -> Finding | None:
-    """What several stretches say of the lengths, each by `slope_of`, where none of them decides alone."""
-    return _of_slope(*_mean(slopes), deviations=2.7) if len(slopes) >= _FEWEST_SLOPES else None
-
-
-def lengths_known(slopes: Sequence[tuple[float, float]]) -> bool:
-    """Whether lengths that are wrong by a tenth would have shown in these stretches."""
-    return len(slopes) >= _FEWEST_SLOPES and _mean(slopes)[1] < _SLOPE_WELL_KNOWN
-
-
-def _mean(slopes: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """The weighted mean and its standard deviation, widened where the stretches differ by more than theirs."""
-    slope, std = np.array(slopes).T
-    information = float((1.0 / std**2).sum())
-    mean = float((slope / std**2).sum()) / information
-    scatter = float((((slope - mean) / std) ** 2).sum()) / (len(slope) - 1)
-    return mean, float(np.hypot(np.sqrt(max(scatter, 1.0) / information), _SLOPE_FLOOR))
-
-
-def _of_slope(slope: float, std: float, deviations: float = 3.0) -> Finding | None:
-    if abs(slope - 1.0) < max(_SLOPE_OFF, deviations * std) or std > _SLOPE_KNOWN or slope < 0.0:
-        return None
-    name = " (feet are 3.28)" if abs(slope / _FEET - 1.0) < 0.25 else ""
-    return Finding(
-        "length_scale",
-        f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): the points "
-        f"are not in metres{name}, or the accelerometer's scale is wrong",
-    )
+    return (translation.slope, std) if std < SLOPE_KNOWN else None
 
 
 def matrix_text(R: NDArray[np.float64]) -> str:

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_agreement.agreement import ROTATION_KNOWN_RAD, Agreement, apart, apart_allowed
-from boxplus.systems.lidar_inertial_agreement.hypotheses import Finding, judges_rotation, matrix_text
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
+from boxplus.systems.lidar_inertial_agreement.hypotheses import judges_rotation, matrix_text
 
 
 def mounting_in_use(agreement: Agreement, T_in_use: NDArray[np.float64]) -> Finding | None:

@@ -1,8 +1,9 @@
-"""The plane that most of every scan shows against gravity: what is left to tell a mounting by where no motion is found.
+"""The plane that most of every scan shows, against gravity and gyroscope: what is left to tell by where no motion is found.
 
 A start fails where the LiDAR's path is not found, and then neither rotations nor accelerations can contradict a mounting. Every
 scan for itself still shows the ground, or the walls of a shaft, and these stand level or upright: most of them, if not as
-exactly as several orthogonal directions together (`plane_tilt`), which this cannot replace.
+exactly as several orthogonal directions together (`plane_tilt`), which this cannot replace. And it moves in the scans as the
+platform tilts, which the gyroscope has to show, whatever the mounting.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ _SEVERAL = 2  # stretches of the window by which gravity is found
 _MOST = 0.5  # of the planar points lie in the plane
 _STEEPEST_RAD = np.deg2rad(8.0)  # what roads climb, and what a walk's acceleration over a second or two tilts
 _DEVIATIONS = 3.0
+_SCANS_OF_TILT, _FEWEST_OF_TILT = 20, 10
+_LEAST_TILT_RAD, _TIMES = np.deg2rad(6.0), 4.0  # of the gyroscope, and over what the LiDAR sees
 
 
 def tilted_plane(
@@ -65,15 +68,61 @@ def tilted_plane(
     )
 
 
+def untilted_plane(scans: Sequence[Scan], imu: ImuSamples, config: RegistrationConfig) -> str | None:
+    """Whether the gyroscope tilts while what the LiDAR sees does not, under any mounting; a sentence, None where it may be sound.
+
+    A turn about a single axis leaves a direction where it is, and proves nothing; nor does a bias, which is such a turn.
+
+    Args:
+        scans, imu, config: as for `tilted_plane`.
+    """
+    inside = (imu.time_ns >= scans[0].start_ns) & (imu.time_ns <= scans[-1].end_ns)
+    if np.count_nonzero(inside) < _FEWEST_SAMPLES:
+        return None
+    attitude = GyroAttitude(imu.time_ns[inside], imu.gyro[inside])
+    axes: list[NDArray[np.float64]] = []
+    times_ns = []
+    for k in np.unique(np.linspace(0, len(scans) - 1, _SCANS_OF_TILT).astype(int)):
+        found = _main_plane(scans[k], config)
+        if found is not None:
+            axes.append(found if not axes or found @ axes[0] > 0.0 else -found)
+            times_ns.append((scans[k].start_ns + scans[k].end_ns) // 2)
+    if len(axes) < _FEWEST_OF_TILT:
+        return None
+    seen = _spread(float(np.linalg.norm(np.mean(axes, axis=0))))
+    # A direction of the world moves in the IMU's frame by no less than the one that moves least.
+    turned = _spread(float(np.linalg.svd(attitude.at(np.array(times_ns)).mean(axis=0), compute_uv=False)[0]))
+    if turned < _LEAST_TILT_RAD or turned < _TIMES * seen:
+        return None
+    return (
+        f"the plane that makes up most of a scan stays within {np.degrees(seen):.1f} deg (rms of {len(axes)} scans) of where the "
+        f"LiDAR sees it, while the gyroscope tilts every direction by {np.degrees(turned):.0f} deg at least: the IMU is not the "
+        "one of this LiDAR (--imu-topic, --lidar-topic), or its unit is wrong (--gyro-unit)"
+    )
+
+
+def _spread(resultant: float) -> float:
+    """The rms angle of unit vectors from their mean, by its length [rad]."""
+    return float(np.sqrt(2.0 * max(1.0 - resultant, 0.0)))
+
+
 def _tilts(scan: Scan, up_lidar: NDArray[np.float64], config: RegistrationConfig) -> list[float]:
     """The angle of a scan's main plane from level or from upright, the lesser of both [rad]; nothing where it has none."""
+    axis = _main_plane(scan, config)
+    if axis is None:
+        return []
+    along = min(abs(float(axis @ up_lidar)), 1.0)
+    return [float(min(np.arccos(along), np.arcsin(along)))]
+
+
+def _main_plane(scan: Scan, config: RegistrationConfig) -> NDArray[np.float64] | None:
+    """(3,) unit normal, LiDAR frame, of the plane that most planar points of a scan lie in; None where it has none."""
     points = VoxelFilter(config.map_cell, _MOST_POINTS)(scan.p_lidar)[1].astype(np.float64)
     if not len(points):
-        return []
+        return None
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     tree.insert(points, downsample=True)
-    along = [abs(float(axis @ up_lidar)) for axis, share in plane_directions(plane_normals(tree)) if share > _MOST]
-    return [float(min(np.arccos(min(value, 1.0)), np.arcsin(min(value, 1.0)))) for value in along]
+    return next((axis for axis, share in plane_directions(plane_normals(tree)) if share > _MOST), None)
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

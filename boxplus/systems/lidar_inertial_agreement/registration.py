@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,7 @@ _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and
 
 _ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on planes
 _LEAST_CELL = 4.0  # range_sigma: of points closer together noise makes planes
+_ASKED = 6  # scans of a stretch
 _LEAST_GAIN = 2.0  # surfaces fill cells of half the size with four times as many points, unless these are few
 
 
@@ -38,6 +41,12 @@ def with_cells_for(scan: Scan, config: RegistrationConfig) -> RegistrationConfig
     if cell == config.map_cell:
         return config
     return config.model_copy(update={"map_cell": cell, "scan_voxel": min(config.scan_voxel, cell)})
+
+
+def with_cells_for_all(scans: Sequence[Scan], config: RegistrationConfig) -> RegistrationConfig:
+    """The same for a stretch of scans: what the nearest of some of them asks for."""
+    some = {round(k) for k in np.linspace(0, len(scans) - 1, _ASKED)} if scans else set()
+    return min((with_cells_for(scans[k], config) for k in some), key=lambda found: found.map_cell, default=config)
 
 
 def align(

@@ -26,6 +26,8 @@ _ROUNDS = 8
 _LONGEST_GAP_NS = 200_000_000
 _NO_BETTER = 0.5
 _SEEN_RAD = 0.01  # of a registration, about its least known axis
+_LONG_S, _SEEN_LONG_RAD = 0.4, 0.05  # where most registrations know less: intervals over which that is as good a rate
+_MOST = 0.5
 _DEGREES = 180.0 / np.pi
 _LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration alone
 _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
@@ -49,6 +51,8 @@ class RotationFit:
         sigma_registration: what of the LiDAR's rates changes from scan to scan without a trend [rad/s], its noise at most.
         excitation: (3,) rms rates of the LiDAR along its principal axes, descending [rad/s].
         intervals: pairs of scans compared.
+        covered: share of the path that these pairs span, 0 to 1.
+        coarse: whether the pairs are scans farther apart, as neighbours did not know their attitudes well enough.
     """
 
     R_imu_lidar: NDArray[np.float64]
@@ -63,6 +67,8 @@ class RotationFit:
     sigma_registration: float
     excitation: NDArray[np.float64]
     intervals: int
+    covered: float
+    coarse: bool
 
     @property
     def rotation_std(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -88,18 +94,13 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         imu: finite samples in order of time.
         R_expected: (3, 3) R_imu_lidar to stay close to where the motion does not tell; the identity when None.
     """
-    # A first pose defines the frame of its segment; of every other one all three rotations must have been seen.
-    seen = np.linalg.eigvalsh(path.information[:, :3, :3])[:, 0] > 1.0 / _SEEN_RAD**2
-    seen[1:] |= path.segment[1:] != path.segment[:-1]
-    pairs = np.flatnonzero((path.segment[1:] == path.segment[:-1]) & seen[1:])
     attitude = GyroAttitude(imu.time_ns, imu.gyro)
-    begin_ns, end_ns = path.time_ns[pairs], path.time_ns[pairs + 1]
-    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0) & ~_across_gap(imu.time_ns, begin_ns, end_ns)
-    pairs, begin_ns, end_ns = pairs[inside], begin_ns[inside], end_ns[inside]
-    if len(pairs) < FEWEST_INTERVALS:
+    pairs = _pairs(path, imu, attitude)
+    if len(pairs.first) < FEWEST_INTERVALS:
         return None
+    begin_ns, end_ns = path.time_ns[pairs.first], path.time_ns[pairs.last]
     step_s = (end_ns - begin_ns)[:, None] * 1e-9
-    turned = np.swapaxes(path.R_path_lidar[pairs], 1, 2) @ path.R_path_lidar[pairs + 1]
+    turned = np.swapaxes(path.R_path_lidar[pairs.first], 1, 2) @ path.R_path_lidar[pairs.last]
     rate_lidar = so3.log(turned) / step_s
     expected = np.eye(3) if R_expected is None else R_expected
 
@@ -126,13 +127,16 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     if candidates[0].explained > best_fit.explained - _NO_BETTER * (1.0 - best_fit.explained):
         best_fit = candidates[0]
     R, scale, bias, offset = best_fit.R, best_fit.scale, best_fit.bias, best_fit.offset_s
-    H, weight, residual = best_fit.H, best_fit.weight, best_fit.residual
-    freedom = max(3.0 * weight.sum() - 8.0, 1.0)
-    variance = max(float((weight * (residual**2).sum(axis=1)).sum()) / freedom, _LEAST_SIGMA**2 / 9.0)
+    weight, residual = best_fit.weight, best_fit.residual
+    # Intervals that overlap count once.
+    H: NDArray[np.float64] = best_fit.H / pairs.overlap
+    count = float(weight.sum()) / pairs.overlap
+    squares = float((weight * (residual**2).sum(axis=1)).sum()) / pairs.overlap
+    variance = max(squares / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0)
     wide = np.diag(1.0 / np.array([np.pi, np.pi, np.pi, 10.0, 10.0, 10.0, 3.0, 1.0]) ** 2)
-    covariance = np.linalg.inv(H / variance + wide) + np.diag(_FLOOR**2)
+    covariance = np.asarray(np.linalg.inv(H / variance + wide) + np.diag(_FLOOR**2), dtype=np.float64)
     centred = rate_lidar - rate_lidar.mean(axis=0)
-    power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(pairs))[::-1], 0.0)
+    power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
     total = float((centred**2).sum())
     # A flipped sign is looked for with clocks as they are: at some other offset anything fits a little.
     final, unshifted = exact(offset), exact(0.0)
@@ -141,8 +145,6 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     # Of both: a gyroscope that turns while the LiDAR rests fits no better than the other way round.
     both = float(((final - final.mean(axis=0)) ** 2).sum()) + proper.scale**2 * total
     together = max(1.0 - 2.0 * float((proper.residual**2).sum()) / max(both, 1e-12), 0.0)
-    second = np.diff(rate_lidar, n=2, axis=0) / np.sqrt(6.0)
-    jitter = float(np.sqrt(np.median((second**2).sum(axis=1)))) if len(second) else 0.0
     return RotationFit(
         R,
         offset,
@@ -153,10 +155,65 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         explained,
         mirrored,
         together,
-        jitter,
+        pairs.jitter,
         np.sqrt(power),
-        len(pairs),
+        len(pairs.first),
+        pairs.covered,
+        pairs.overlap > 1,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Poses `first` and `last` (K,) of a path between which rotations are compared.
+
+    Attributes:
+        overlap: how many of the intervals lie over each other.
+        covered: share of the path that they span.
+        jitter: what of the rates between them changes from scan to scan without a trend [rad/s].
+    """
+
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+    overlap: int
+    covered: float
+    jitter: float
+
+
+def _pairs(path: LidarPath, imu: ImuSamples, attitude: GyroAttitude) -> _Pairs:
+    """Neighbouring scans; where most of them do not know their attitudes well enough, scans that are farther apart."""
+    known = np.linalg.eigvalsh(path.information[:, :3, :3])[:, 0]
+    # A first pose defines the frame of its segment; of every other one all three rotations must have been seen.
+    begins = np.append(True, path.segment[1:] != path.segment[:-1])
+    seen = (known > 1.0 / _SEEN_RAD**2) | begins
+    first = np.arange(max(len(path) - 1, 0))
+    near = _covered(path, imu, attitude, first[seen[1:]], 1)
+    if near.covered > _MOST or len(path) < 3:
+        return near
+    count = max(round(_LONG_S / (float(np.median(np.diff(path.time_ns))) * 1e-9)), 2)
+    seen = (known > 1.0 / _SEEN_LONG_RAD**2) | begins
+    first = np.arange(0, max(len(path) - count, 0), count // 2)
+    far = _covered(path, imu, attitude, first[seen[first] & seen[first + count]], count)
+    return far if far.covered > _MOST else near
+
+
+def _covered(path: LidarPath, imu: ImuSamples, attitude: GyroAttitude, first: NDArray[np.intp], count: int) -> _Pairs:
+    """Poses `count` scans apart, beginning with `first` (K,), within a segment and where the gyroscope covers what is between."""
+    first = first[path.segment[first] == path.segment[first + count]]
+    begin_ns, end_ns = path.time_ns[first], path.time_ns[first + count]
+    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0) & ~_across_gap(imu.time_ns, begin_ns, end_ns)
+    first, overlap = first[inside], min(count, 2)
+    neighbours = first if count == 1 else np.flatnonzero(path.segment[1:] == path.segment[:-1])
+    covered = count * len(first) / overlap / max(len(path) - 1, 1)
+    return _Pairs(first, first + count, overlap, covered, _jitter(path, neighbours) / count)
+
+
+def _jitter(path: LidarPath, first: NDArray[np.intp]) -> float:
+    """What of the turn rates from each of some scans to the next changes without a trend [rad/s]."""
+    step_s = (path.time_ns[first + 1] - path.time_ns[first])[:, None] * 1e-9
+    rate = so3.log(np.swapaxes(path.R_path_lidar[first], 1, 2) @ path.R_path_lidar[first + 1]) / step_s
+    second = np.diff(rate, n=2, axis=0) / np.sqrt(6.0)
+    return float(np.sqrt(np.median((second**2).sum(axis=1)))) if len(second) else 0.0
 
 
 def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

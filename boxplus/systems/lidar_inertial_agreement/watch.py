@@ -19,17 +19,16 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
-    Finding,
     contradictions,
     judges,
     judges_clocks,
     judges_rotation,
-    lengths_known,
-    lengths_of_many,
     shows_mounting,
     slope_of,
 )
+from boxplus.systems.lidar_inertial_agreement.lengths import lengths_known, lengths_of_many
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.registration import thinned

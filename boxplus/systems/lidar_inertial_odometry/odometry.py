@@ -36,6 +36,7 @@ from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
+from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
 from boxplus.systems.lidar_inertial_odometry.unknown_mounting import UnknownMounting
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
@@ -75,22 +76,20 @@ class LidarInertialOdometry(Snapshots):
         self._waiting: list[Frame] = []
         self._next_try, self._time_ns = 0, 0  # scans that wait, and the instant of the state
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
-        self._box = SlidingBox(self.config.box_side, self.config.detection_range)
-        self._excitation = RotationExcitation()
+        self._box, self._excitation = SlidingBox(self.config.box_side, self.config.detection_range), RotationExcitation()
         self._standstill: Standstill | None = None
         self._unshown = UnshownMotion()
         self._weak_spell = WeakSpell(self.config.weak_threshold)
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
-        self._saturation = Saturation()
+        self._saturation, self._unstarted = Saturation(), UnstartedScans(self.config)
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._datum = MapDatum(NavState.identity().pack(), self._cov, _SHARED_ERRORS)
-        self._mounting = UnknownMounting(NavState.identity().pack(), self.config)
+        self._mounting, self._noise = UnknownMounting(NavState.identity().pack(), self.config), ObservedNoise(self.config)
         self._gap: str | None = None
-        self._noise = ObservedNoise(self.config)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -126,7 +125,9 @@ class LidarInertialOdometry(Snapshots):
         """No more data will come: process what still waits for IMU samples."""
         estimates = self._advance(self._sequencer.frames(flush=True))
         if self.start is None and self._waiting:
-            estimates += self._try_start(final=True)
+            estimates += self._try_start()
+            self._forget(len(self._waiting))
+            self.start_problem = self._unstarted.named(self.start_problem)
         self._consistency.finish()
         return estimates
 
@@ -171,19 +172,19 @@ class LidarInertialOdometry(Snapshots):
         self._excitation = RotationExcitation()
         return after_gap(frame)
 
-    def _try_start(self, *, final: bool = False) -> list[Estimate]:
+    def _try_start(self) -> list[Estimate]:
         """Find the first state, then process every scan that waited for it, but for those before it."""
-        found = find_start(self._waiting, self.config, final=final)
+        found = find_start(self._waiting, self.config)
         if isinstance(found, str):
             self.start_problem = found
             # The oldest scans make room, so that a start that takes long stays cheap.
-            self._forget(len(self._waiting) - (0 if final else _LONGEST_START_SCANS))
+            self._forget(len(self._waiting) - _LONGEST_START_SCANS)
             self._next_try = len(self._waiting) + 1 + int(_FEWEST_NEW * len(self._waiting))
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
         self._forget(sum(frame.scan.end_ns < found.time_ns for frame in self._waiting))
-        self.start, self.start_problem = found, None
+        self.start, self.start_problem, self._unstarted = found, None, UnstartedScans(self.config)
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov), _SHARED_ERRORS)
@@ -200,7 +201,7 @@ class LidarInertialOdometry(Snapshots):
 
     def _forget(self, oldest: int) -> None:
         """Scans that no start will begin with."""
-        self._sequencer.rejected["scan before a start could be found"] += max(oldest, 0)
+        self._sequencer.rejected["scan before a start could be found"] += self._unstarted.add(self._waiting[: max(oldest, 0)])
         del self._waiting[: max(oldest, 0)]
 
     def _process(self, frame: Frame) -> Estimate:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from boxplus.manifolds import so3
 from boxplus.simulation import Fault, faults
 from boxplus.systems.lidar_inertial_agreement import agreement as agreement_module
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
@@ -15,9 +16,9 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     judges_clocks,
     judges_lengths,
     judges_rotation,
-    lengths_of_many,
     slope_of,
 )
+from boxplus.systems.lidar_inertial_agreement.lengths import lengths_of_many
 from boxplus.systems.lidar_inertial_agreement.watch import clock_drift
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, turned
 
@@ -148,12 +149,6 @@ def test_stretches_together_show_lengths() -> None:
     assert found is not None and "the points are not in metres" in found.text
 
 
-def test_stretches_that_differ_among_themselves_show_no_lengths() -> None:
-    assert lengths_of_many([(0.85, 0.05)]) is None
-    assert lengths_of_many([(0.85, 0.05), (0.86, 0.05), (0.84, 0.05)]) is not None
-    assert lengths_of_many([(0.60, 0.05), (1.10, 0.05), (0.85, 0.05)]) is None
-
-
 def test_a_path_that_misses_a_rotation_shows_no_lengths() -> None:
     """From rest a registration may lag behind: it misses the accelerations as well as the turn."""
     simulation = handheld(4)
@@ -187,3 +182,30 @@ def test_a_mounting_that_explains_little_replaces_none(monkeypatch: pytest.Monke
         monkeypatch.setattr(agreement_module, "compare_rotations", lambda *_, fit=fit: fit)
         compared = compare_sensors(*data(simulation), CONFIG, T_declared=T)
         assert np.array_equal(compared.R_imu_lidar, T[:3, :3]) == kept
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_points_that_may_be_mirrored_are_said_to_be(axis: int) -> None:
+    """Half a turn about an axis of the points, and more about one that the motion does not show."""
+    simulation = handheld(3)
+    T = simulation.T_imu_lidar
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=T)
+    assert agreement.rotation is not None
+    covariance = agreement.rotation.covariance.copy()
+    covariance[:3, :3] = np.diag([1e-4, 1e-4, 1.0])
+    half_turn = 2.0 * np.outer(np.eye(3)[axis], np.eye(3)[axis]) - np.eye(3)
+    R = so3.exp(np.array([0.0, 0.0, 0.5])) @ T[:3, :3] @ half_turn
+    seen = replace(agreement, rotation=replace(agreement.rotation, R_imu_lidar=R, covariance=covariance), translation=None)
+    found = contradictions(seen, T)
+    assert [finding.cause for finding in found] == ["extrinsic"]
+    assert "the points are mirrored" in found[0].text
+    other = replace(seen.rotation, R_imu_lidar=so3.exp(np.array([1.2, 0.0, 0.0])) @ T[:3, :3])
+    assert "mirrored" not in contradictions(replace(seen, rotation=other), T)[0].text
+
+
+def test_attitudes_known_coarsely_show_no_lengths() -> None:
+    simulation = handheld(4)
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)
+    assert agreement.rotation is not None and judges_lengths(agreement)
+    coarse = replace(agreement, rotation=replace(agreement.rotation, coarse=True))
+    assert not judges_lengths(coarse) and slope_of(coarse) is None and slope_of(agreement) is not None

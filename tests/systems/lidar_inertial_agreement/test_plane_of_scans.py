@@ -13,7 +13,7 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
-from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane
+from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane, untilted_plane
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 LIDAR = SpinningLidar(channels=24, azimuth_steps=120, rate_hz=5.0)
@@ -67,3 +67,26 @@ def test_nothing_is_said_without_a_plane_or_samples() -> None:
     scans, imu = data(over(sites.open_field(seed=1), level(1), 1))
     assert tilted_plane(scans, ImuSamples(imu.time_ns[:5], imu.gyro[:5], imu.accel[:5]), leaning, CONFIG) is None
     assert tilted_plane(scans[:2], imu, leaning, CONFIG) is None
+
+
+def _gyro(motion: Trajectory, samples: ImuSamples) -> ImuSamples:
+    """The samples with the rates of another motion."""
+    other = Simulation(Scenario("other", worlds.room(), motion, LIDAR, ImuModel(), np.eye(4)), 5, 3.0)
+    rates = data(other)[1]
+    index = np.clip(np.searchsorted(rates.time_ns, samples.time_ns), 0, len(rates) - 1)
+    return ImuSamples(samples.time_ns, rates.gyro[index], samples.accel)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyroscope_that_tilts_while_the_ground_does_not_is_another_ones(seed: int) -> None:
+    swinging = manoeuvres.handheld(5.0, LOW, HIGH, 1.0, 2.5, standstill_s=0.0, seed=seed)
+    for motion, foreign in ((level(seed), True), (swinging, False)):
+        simulation = Simulation(Scenario("tilt", sites.open_field(seed=seed), motion, LIDAR, ImuModel(), np.eye(4)), seed, 3.0)
+        scans, imu = data(simulation)
+        assert untilted_plane(scans, imu, CONFIG) is None
+        # What turns about one axis leaves it where it is: that may be the plane's normal, and may be a bias.
+        steady = ImuSamples(imu.time_ns, imu.gyro + np.array([0.3, -0.2, 0.1]), imu.accel)
+        assert not foreign or untilted_plane(scans, steady, CONFIG) is None
+        text = untilted_plane(scans, _gyro(swinging, imu), CONFIG)
+        assert (text is not None) == foreign
+        assert text is None or "the IMU is not the one of this LiDAR" in text

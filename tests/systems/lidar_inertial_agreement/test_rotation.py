@@ -37,3 +37,35 @@ def test_a_few_fast_turns_are_no_outliers(seed: int) -> None:
     assert np.degrees(np.linalg.norm(so3.log(fit.R_imu_lidar @ R_imu_lidar.T))) < 3.0
     assert fit.explained > 0.97
     assert fit.explained > fit.mirrored - 1e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("std", "known"), [(0.005, "well"), (0.02, "coarsely"), (0.2, "not")])
+def test_attitudes_known_coarsely_are_compared_over_longer_intervals(seed: int, sign: float, std: float, known: str) -> None:
+    random = np.random.default_rng(seed)
+    K, step_s, R_imu_lidar = 80, 0.05, so3.exp(random.normal(size=3))
+    t = np.arange(K)[:, None] * step_s
+    rate = np.deg2rad([25.0, 18.0, 12.0]) * np.sin(2.0 * np.pi * random.uniform(0.2, 0.6, 3) * t + random.uniform(0.0, 6.0, 3))
+    R = [np.eye(3)]
+    for turn in so3.exp(rate * step_s):
+        R.append(R[-1] @ turn)
+    # A registration to a map: the errors of attitudes do not add up.
+    R_path = np.array(R) @ so3.exp(0.3 * min(std, 0.02) * random.normal(size=(K + 1, 3)))
+    zeros = np.zeros(K + 1)
+    time_ns = (np.arange(K + 1) * step_s * 1e9).astype(np.int64)
+    information = np.tile(np.eye(6) / std**2, (K + 1, 1, 1))
+    path = LidarPath(time_ns, R_path, np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
+    imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
+    interval = np.clip((imu_ns - 1) // round(step_s * 1e9), 0, K - 1)
+    gyro = sign * rate[interval] @ R_imu_lidar.T
+    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
+    assert (fit is None) == (known == "not")
+    if fit is None:
+        return
+    assert fit.coarse == (known == "coarsely") and fit.covered > 0.9
+    assert (fit.explained if sign > 0.0 else fit.mirrored) > 0.95
+    if sign > 0.0:
+        off = fit.covariance[:3, :3]
+        error = so3.log(fit.R_imu_lidar @ R_imu_lidar.T)
+        assert error @ np.linalg.solve(off, error) < 16.3  # three components, one in a thousand

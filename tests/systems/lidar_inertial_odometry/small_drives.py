@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
+from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
-from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
+from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.motions import trajectories
-from boxplus.simulation.worlds import worlds
+from boxplus.simulation.worlds import sites, worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
@@ -58,3 +60,18 @@ def position_errors(simulation: Simulation, estimates: list[Estimate]) -> np.nda
     moved = (p - p[0]) @ R_align.T + truth.p_world_imu[0]
     errors: np.ndarray = np.linalg.norm(moved - truth.p_world_imu, axis=1)
     return errors
+
+
+def before_a_wall(reach_m: float) -> tuple[list[Frame], LioConfig]:
+    """At rest, with a cone of view that is full of one wall: a few dozen cells of 25 cm, each with hundreds of points."""
+    lidar = RosetteLidar(points_per_scan=4000, rate_hz=10.0, fov_deg=80.0)
+    motion = trajectories.at_rest(2.0, (1.6 - reach_m, -2.2, 1.3))
+    simulation = simulate(Scenario("wall", sites.stairwell(), motion, lidar, T_imu_lidar=np.eye(4)), duration_s=1.6)
+    first = frames(simulation.events())
+    assert len(VoxelFilter(0.25)(first[0].scan.p_lidar)[0]) < 100
+    return first, config(simulation)
+
+
+def turning_by(seen: list[Frame], rate: np.ndarray) -> list[Frame]:
+    """The frames with a gyroscope that turns by (3,) [rad/s] more."""
+    return [replace(f, imu=ImuSamples(f.imu.time_ns, f.imu.gyro + rate, f.imu.accel)) for f in seen]

@@ -15,17 +15,14 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses, usable
-from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
+from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
-from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane
 from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
-from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem_of
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
 _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
@@ -70,14 +67,13 @@ class Start:
     unshown_axes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def find_start(frames: Sequence[Frame], config: LioConfig, *, final: bool = False) -> Start | str:
+def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet.
 
     At rest means that the LiDAR does not move against what it sees, however much the IMU is shaken; only along what the scene
     does not determine a quiet IMU has to do. Moving, velocity and gravity come from a batch over the LiDAR's path and the
     accelerometer. A path that has once gone astray stays so: where there is no start over all scans, it is sought over the
-    newest of them, and `Start.time_ns` says with which scan it begins. Where it is `final` that there is none, what the
-    sensors contradict is named with it.
+    newest of them, and `Start.time_ns` says with which scan it begins.
 
     Raises:
         InputError: the accelerometer reports in g, was taken for one that does, or shows no gravity.
@@ -94,7 +90,7 @@ def find_start(frames: Sequence[Frame], config: LioConfig, *, final: bool = Fals
             return _start(_Beginning(newest, config))
         except _NotYet:
             pass
-    return ". ".join([refusal, *(_contradicted(seen) if final else [])])
+    return refusal
 
 
 def _start(seen: _Beginning) -> Start:
@@ -148,21 +144,6 @@ class _Beginning:
 
     def not_moving(self, why: str) -> _NotYet:
         return _NotYet(f"not at rest ({self.evidence}), and {why}{_WAITING}")
-
-
-def _contradicted(seen: _Beginning) -> list[str]:
-    """What the comparison of both sensors finds wrong, a sentence each."""
-    unit = span_problem_of(seen.scans)
-    if unit is not None:  # points put together at wrong times show no motion that anything could be compared with
-        return [unit]
-    T_declared = seen.config.T_declared
-    agreement = compare_sensors(seen.scans, seen.imu, seen.config, T_declared=T_declared)
-    found = [finding.text for finding in contradictions(agreement, T_declared)]
-    if found or T_declared is None:
-        return found
-    # Where no path is found, nothing of the above is decided: what every scan shows for itself is left.
-    tilted = tilted_plane(seen.scans, usable(seen.imu), T_declared[:3, :3], seen.registration)
-    return [] if tilted is None else [tilted]
 
 
 def _check_accelerometer(norm: float) -> None:
