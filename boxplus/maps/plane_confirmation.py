@@ -27,6 +27,39 @@ LEVERAGE = 3.0  # times the mean: about one plane in twenty exceeds it
 DENSE_CELLS = 4.0
 
 
+@kernel(inline=True)
+def leverage_into(
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    plane: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    h: NDArray[np.float64],
+    y: NDArray[np.float64],
+) -> float:
+    """The leverage of a plane with its weight, given the covariance (6, 6) of the pose.
+
+    Args:
+        x: (36,) state; p_lidar: (3,) the point, LiDAR frame; plane: (PLANE,).
+        h: (12,) receives the row of the point, y: (3,) where it lies in the world.
+    """
+    lidar = (np.float64(p_lidar[0]), np.float64(p_lidar[1]), np.float64(p_lidar[2]))
+    sx = x[RL] * lidar[0] + x[RL + 1] * lidar[1] + x[RL + 2] * lidar[2] + x[PL]
+    sy = x[RL + 3] * lidar[0] + x[RL + 4] * lidar[1] + x[RL + 5] * lidar[2] + x[PL + 1]
+    sz = x[RL + 6] * lidar[0] + x[RL + 7] * lidar[1] + x[RL + 8] * lidar[2] + x[PL + 2]
+    pose_row(x, lidar, (sx, sy, sz), (plane[0], plane[1], plane[2]), False, h)
+    half = 0.0
+    for i in range(6):
+        column = 0.5 * covariance[i, i] * h[i]
+        for j in range(i):
+            column += covariance[i, j] * h[j]
+        half += column * h[i]
+    y[0] = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P]
+    y[1] = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1]
+    y[2] = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2]
+    leverage: float = 2.0 * plane[WEIGHT] * half
+    return leverage
+
+
 @kernel
 def confirm_planes(
     view: IkdView,
@@ -60,29 +93,16 @@ def confirm_planes(
     """
     wanted = len(found_sq)
     near = np.empty((wanted, 3), dtype=np.float32)
-    h = np.zeros(12)
+    h, y = np.zeros(12), np.empty(3)
     refused = 0
     for n in range(len(fate)):
         if fate[n] != USED:
             continue
         plane = planes[n]
         u = (plane[0], plane[1], plane[2])
-        lidar = (np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2]))
-        sx = x[RL] * lidar[0] + x[RL + 1] * lidar[1] + x[RL + 2] * lidar[2] + x[PL]
-        sy = x[RL + 3] * lidar[0] + x[RL + 4] * lidar[1] + x[RL + 5] * lidar[2] + x[PL + 1]
-        sz = x[RL + 6] * lidar[0] + x[RL + 7] * lidar[1] + x[RL + 8] * lidar[2] + x[PL + 2]
-        pose_row(x, lidar, (sx, sy, sz), u, False, h)
-        half = 0.0
-        for i in range(6):
-            column = 0.5 * covariance[i, i] * h[i]
-            for j in range(i):
-                column += covariance[i, j] * h[j]
-            half += column * h[i]
-        if not 2.0 * plane[WEIGHT] * half > most_leverage:
+        if not leverage_into(x, p_lidar[n], plane, covariance, h, y) > most_leverage:
             continue
-        yx = np.float32(x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P] - origin[0])
-        yy = np.float32(x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1])
-        yz = np.float32(x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2])
+        yx, yy, yz = np.float32(y[0] - origin[0]), np.float32(y[1] - origin[1]), np.float32(y[2] - origin[2])
         if has_within(view, yx, yy, yz, np.float32(dense_sq), wanted, stack):
             continue
         found = knn(view, yx, yy, yz, np.float32(max_distance_sq), found_sq, stack)

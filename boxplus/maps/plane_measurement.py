@@ -25,6 +25,7 @@ from boxplus.filtering.plane_information import (
     USED,
     accumulate_planes,
 )
+from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
@@ -51,7 +52,8 @@ class PlaneMeasurement:
         config: noise, gates and threads.
         with_extrinsic: whether the extrinsic is measured.
         weight: factor of the information, below 1 where the points are not where they seem.
-        confirm: whether planes on which a direction hangs have to be borne out by more of the map (`plane_confirmation`).
+        confirm: whether planes on which something hangs are held against more of the map: false ones are refused
+            (`plane_confirmation`), curved ones bent (`curved_patches`).
     """
 
     def __init__(
@@ -86,13 +88,8 @@ class PlaneMeasurement:
         if matches:
             self._match(x)
         A, b, signal, noise, sums = total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
-        if matches and self._confirm and self._refuse_unconfirmed(x, A[:6, :6], int(sums[0])):
-            refused = self._fate == UNCONFIRMED
-            as_used = np.full(np.count_nonzero(refused), USED, dtype=np.uint8)
-            for whole, part in zip(
-                total, self._sums(x, self._p_lidar[refused], self._planes[refused], as_used, criterion=True), strict=True
-            ):
-                whole -= part
+        if matches and self._confirm:
+            self._look_closer(x, total)
         A += np.triu(A, 1).T
         if matches:  # in between the planes stay, and what they can tell
             signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
@@ -163,26 +160,26 @@ class PlaneMeasurement:
         accumulate_planes(x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, signal, noise, sums)
         return A, b, signal, noise, sums
 
-    def _refuse_unconfirmed(self, x: NDArray[np.float64], upper: NDArray[np.float64], used: int) -> bool:
-        """Whether planes were refused on which too much hangs (see `plane_confirmation`).
+    def _look_closer(self, x: NDArray[np.float64], total: tuple[NDArray[np.float64], ...]) -> None:
+        """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
 
         Args:
             x: (36,) packed state.
-            upper: (6, 6) information about the pose, upper triangle.
-            used: number of planes behind it.
+            total: what all planes add up to (`_sums`), brought up to date.
         """
-        config = self._config
+        config, A, used = self._config, total[0][:6, :6], max(int(total[4][0]), 1)
         try:
-            covariance = np.linalg.inv(upper + np.triu(upper, 1).T)
+            covariance = np.linalg.inv(A + np.triu(A, 1).T)
         except np.linalg.LinAlgError:  # nothing at all measures some direction
-            return False
-        refused: int = confirm_planes(
+            return
+        mean_leverage = 6.0 / used
+        refused = confirm_planes(
             self._tree.view(),
             self._tree.origin,
             x,
             self._p_lidar,
             covariance,
-            LEVERAGE * 6.0 / max(used, 1),
+            LEVERAGE * mean_leverage,
             config.max_neighbour_distance**2,
             (DENSE_CELLS * config.map_cell) ** 2,
             config.plane_threshold,
@@ -191,7 +188,39 @@ class PlaneMeasurement:
             np.zeros(CONFIRMING, dtype=np.float32),
             np.zeros(STACK_DEPTH + CONFIRMING, dtype=STACK),
         )
-        return refused > 0
+        if refused:
+            self._add(x, np.flatnonzero(self._fate == UNCONFIRMED), total, -1.0)
+        which, bent = np.empty(self.points, dtype=np.int64), np.empty((self.points, PLANE))
+        count = bend_planes(
+            self._tree.view(),
+            self._tree.origin,
+            x,
+            self._p_lidar,
+            covariance,
+            MEAN_LEVERAGE * mean_leverage,
+            (FILLED_CELLS * config.map_cell) ** 2,
+            config.map_cell,
+            config.map_sigma**2,
+            self._planes,
+            self._fate,
+            which,
+            bent,
+            np.zeros(PATCH, dtype=np.float32),
+            np.zeros(STACK_DEPTH + PATCH, dtype=STACK),
+        )
+        if count:
+            self._add(x, which[:count], total, -1.0)
+            self._planes[which[:count]] = bent[:count]
+            self._add(x, which[:count], total, 1.0)
+
+    def _add(
+        self, x: NDArray[np.float64], which: NDArray[np.int64], total: tuple[NDArray[np.float64], ...], factor: float
+    ) -> None:
+        """Add what the planes `which` say to `total`, `factor` times."""
+        fate = np.full(len(which), USED, dtype=np.uint8)
+        parts = self._sums(x, self._p_lidar[which], self._planes[which], fate, criterion=True)
+        for whole, part in zip(total, parts, strict=True):
+            whole += factor * part
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config
