@@ -131,10 +131,9 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     # Intervals that overlap count once.
     H: NDArray[np.float64] = best_fit.H / pairs.overlap
     count = float(weight.sum()) / pairs.overlap
-    squares = float((weight * (residual**2).sum(axis=1)).sum()) / pairs.overlap
-    variance = max(squares / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0)
-    wide = np.diag(1.0 / np.array([np.pi, np.pi, np.pi, 10.0, 10.0, 10.0, 3.0, 1.0]) ** 2)
-    covariance = np.asarray(np.linalg.inv(H / variance + wide) + np.diag(_FLOOR**2), dtype=np.float64)
+    noise = (weight[:, None] * residual).T @ residual / pairs.overlap
+    variance = max(float(np.trace(noise)) / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0)
+    covariance = _covariance(H / variance, noise / variance, count) + np.diag(_FLOOR**2)
     centred = rate_lidar - rate_lidar.mean(axis=0)
     power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
     total = float((centred**2).sum())
@@ -214,6 +213,32 @@ def _jitter(path: LidarPath, first: NDArray[np.intp]) -> float:
     rate = so3.log(np.swapaxes(path.R_path_lidar[first], 1, 2) @ path.R_path_lidar[first + 1]) / step_s
     second = np.diff(rate, n=2, axis=0) / np.sqrt(6.0)
     return float(np.sqrt(np.median((second**2).sum(axis=1)))) if len(second) else 0.0
+
+
+def _covariance(H: NDArray[np.float64], noise: NDArray[np.float64], count: float) -> NDArray[np.float64]:
+    """(8, 8) of the estimate, of which the rates that are turned carry noise themselves (errors in variables).
+
+    Noise looks like turning about every axis: where a platform turns about one only, it would make the mounting about that axis
+    known. What it adds to the information of the rotation is taken off again, with three standard deviations of that sum; with
+    the rest S₀ the rotation has the covariance S₀⁻¹ S S₀⁻¹, and all else what it has for a known rotation, and
+    what follows from it.
+
+    Args:
+        H: (8, 8) information of [θ, bias, log scale, offset]; noise: (3, 3) sum of squares of what is left of the rates about the
+            IMU's axes, over the same variance; count: of the rates.
+    """
+    H = H + np.diag(1.0 / np.array([np.pi, np.pi, np.pi, 10.0, 10.0, 10.0, 3.0, 1.0]) ** 2)
+    rest = np.linalg.inv(H[3:, 3:])
+    follows = np.vstack([np.eye(3), -rest @ H[3:, :3]])
+    S = H[:3, :3] - H[:3, 3:] @ rest @ H[3:, :3]
+    added = (1.0 + 3.0 * np.sqrt(2.0 / max(count, 1.0))) * (np.trace(noise) * np.eye(3) - noise)
+    values, axes = np.linalg.eigh(S - added)
+    inverse = (axes / np.maximum(values, 1.0 / np.pi**2)) @ axes.T
+    values, axes = np.linalg.eigh(inverse @ S @ inverse)
+    rotation = (axes * np.minimum(values, np.pi**2)) @ axes.T
+    covariance: NDArray[np.float64] = follows @ rotation @ follows.T
+    covariance[3:, 3:] += rest
+    return covariance
 
 
 def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -8,32 +8,40 @@ import pytest
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_agreement.rotation import compare_rotations
+from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
+
+STEP_S = 0.1
+
+
+def compared(rate: np.ndarray, noise: np.ndarray, R_imu_lidar: np.ndarray, random: np.random.Generator) -> RotationFit:
+    """Of a LiDAR that turns at `rate` (K, 3) and is registered with `noise` (K, 3), against an exact gyroscope."""
+    K = len(rate)
+    R = [np.eye(3)]
+    for turn in so3.exp((rate + noise * random.normal(size=(K, 3))) * STEP_S):
+        R.append(R[-1] @ turn)
+    zeros = np.zeros(K + 1)
+    time_ns = (np.arange(K + 1) * STEP_S * 1e9).astype(np.int64)
+    information = np.tile(1e6 * np.eye(6), (K + 1, 1, 1))
+    path = LidarPath(time_ns, np.array(R), np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
+    imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
+    interval = np.clip((imu_ns - 1) // round(STEP_S * 1e9), 0, K - 1)  # a sample holds until the next
+    gyro = rate[interval] @ R_imu_lidar.T
+    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
+    assert fit is not None
+    return fit
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_few_fast_turns_are_no_outliers(seed: int) -> None:
     """A platform that turns to and fro and swerves now and then: registration knows less of swerves; they show the mounting."""
     random = np.random.default_rng(seed)
-    K, step_s, R_imu_lidar = 120, 0.1, so3.exp(random.normal(size=3))
+    K, R_imu_lidar = 120, so3.exp(random.normal(size=3))
     rate = 0.25 * np.sin(np.arange(K) / 9.0)[:, None] * np.array([0.0, 0.0, 1.0])
     swerves = random.choice(K, 8, replace=False)
     rate[swerves] += [[0.4, 0.03, 0.1]]
     noise = np.full(K, 5e-4)
     noise[swerves] = 0.01
-    turned = so3.exp((rate + noise[:, None] * random.normal(size=(K, 3))) * step_s)
-    R = [np.eye(3)]
-    for turn in turned:
-        R.append(R[-1] @ turn)
-    zeros = np.zeros(K + 1)
-    time_ns = (np.arange(K + 1) * step_s * 1e9).astype(np.int64)
-    information = np.tile(1e6 * np.eye(6), (K + 1, 1, 1))
-    path = LidarPath(time_ns, np.array(R), np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
-    imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
-    interval = np.clip((imu_ns - 1) // round(step_s * 1e9), 0, K - 1)  # a sample holds until the next
-    gyro = rate[interval] @ R_imu_lidar.T
-    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
-    assert fit is not None
+    fit = compared(rate, noise[:, None], R_imu_lidar, random)
     assert np.degrees(np.linalg.norm(so3.log(fit.R_imu_lidar @ R_imu_lidar.T))) < 3.0
     assert fit.explained > 0.97
     assert fit.explained > fit.mirrored - 1e-3
@@ -69,3 +77,23 @@ def test_attitudes_known_coarsely_are_compared_over_longer_intervals(seed: int, 
         off = fit.covariance[:3, :3]
         error = so3.log(fit.R_imu_lidar @ R_imu_lidar.T)
         assert error @ np.linalg.solve(off, error) < 16.3  # three components, one in a thousand
+
+
+@pytest.mark.parametrize("count", [40, 120])
+@pytest.mark.parametrize("second", [0.0, 0.005, 0.02, 0.2])
+def test_the_mounting_is_as_far_off_as_it_says(count: int, second: float) -> None:
+    """Turning about one axis, and about a second one less than registration knows, or more: noise is no turning."""
+    known, off = [], []
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        R_imu_lidar = so3.exp(random.normal(size=3))
+        phase = np.arange(count)[:, None] * STEP_S * random.uniform(0.8, 1.5, 3) + random.uniform(0.0, 6.0, 3)
+        rate = np.array([0.0, second, 0.25]) * np.sin(phase)
+        fit = compared(rate, np.array([0.016, 0.016, 0.004]), R_imu_lidar, random)
+        std, axes = fit.rotation_std
+        off.append(np.abs(axes.T @ so3.log(fit.R_imu_lidar @ R_imu_lidar.T)) / std)
+        known.append(std)
+    assert np.max(off) < 5.0
+    largest = np.degrees(np.array(known).max(axis=1))
+    assert (largest > 40.0).all() if second < 0.01 else True
+    assert np.median(largest) < 2.0 if second > 0.1 else True
