@@ -6,6 +6,7 @@ and a continued fraction above (Press et al., Numerical Recipes, 2007, section 6
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -23,6 +24,7 @@ def chi_square_sf(x: float, dof: float) -> float:
     return _incomplete_gamma(0.5 * dof, 0.5 * x)[1]
 
 
+@functools.lru_cache(maxsize=256)  # graphs ask for the same few, once a pair of closures
 def chi_square_quantile(probability: float, dof: float) -> float:
     """What χ² of `dof` degrees of freedom stays below with this probability."""
     if probability > 0.5:  # where the share above has more digits

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, align
 from boxplus.evaluation.association import Association
+from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
 
@@ -31,7 +32,7 @@ def alignment_doubts(
         translation: (M,) errors [m]. rotation: (M, 3) rotation vectors from the estimate's to the true orientations [rad].
     """
     doubts = []
-    rmse = _rms(translation)
+    rmse = rms(translation)
     about_line = alignment.kind in ("se3", "sim3") and alignment.spread_m[1] < rmse
     if about_line:
         doubts.append(
@@ -63,7 +64,7 @@ def alignment_doubts(
 
 def reading_doubts(association: Association, alignment: Alignment, translation: NDArray[np.float64]) -> list[str]:
     """Whether files agree far better read in another way: order of the quaternion, inverted poses, another scale."""
-    estimate, truth, rmse = association.estimate, association.ground_truth, _rms(translation)
+    estimate, truth, rmse = association.estimate, association.ground_truth, rms(translation)
     return [
         *_orientation_doubts(estimate, truth, alignment, rmse),
         *_inversion_doubts(estimate, truth, alignment, rmse),
@@ -112,7 +113,7 @@ def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignm
         except InputError:
             continue
         moved = found.apply(replace(one, p=p, covariance=None, lines=None)).p
-        error = _rms(np.linalg.norm(moved - other.p, axis=1))
+        error = rms(np.linalg.norm(moved - other.p, axis=1))
         if error < _CLEARLY * rmse:
             yield (
                 f"the poses of the {name} seem to be those of the world in the body: inverted, the ATE is {error:.4g} m instead "
@@ -127,7 +128,7 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
         rigid, found = align(estimate.p, truth.p), align(estimate.p, truth.p, "sim3")
     except InputError:
         return
-    rmse, error = (_rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
+    rmse, error = (rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
     if error < min(_SCALED * rmse, _FITS * rigid.spread_m[0]) and abs(found.scale - 1.0) > _SCALE:
         yield (
             f"{found.scale:.4g} times as large the estimate has an ATE of {error:.4g} m instead of {rmse:.4g} m: a wrong scale "
@@ -140,14 +141,10 @@ def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> fl
     between = np.swapaxes(R_other, 1, 2) @ R_one
     U, _, Vt = np.linalg.svd(between.mean(axis=0))
     mean = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
-    return float(np.degrees(_rms(np.linalg.norm(so3.log(mean.T @ between), axis=1))))
+    return float(np.degrees(rms(np.linalg.norm(so3.log(mean.T @ between), axis=1))))
 
 
 def _turned_deg(trajectory: Trajectory) -> float:
     """The largest turn from the first orientation [degrees]."""
     R = trajectory.R
     return float(np.degrees(np.linalg.norm(so3.log(R[0].T @ R), axis=1).max()))
-
-
-def _rms(errors: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(errors**2)))

@@ -18,7 +18,7 @@ from boxplus.evaluation.ate import rotation_differences, translation_errors
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
-from boxplus.evaluation.statistics import Statistics
+from boxplus.evaluation.statistics import Statistics, rms
 from boxplus.evaluation.time_offset import TimeOffset
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
@@ -223,9 +223,9 @@ def evaluate(
             other = matches(association.offset_s + noticed.offset_s)
             moved = _find_alignment(other, alignment, align_by_first).apply(other.estimate)
             errors = translation_errors(projected(moved, plane), projected(other.ground_truth, plane))
-            warnings.append(_clock_doubt(noticed, other.offset_s, _rms(translation), _rms(errors)))
+            warnings.append(_clock_doubt(noticed, other.offset_s, rms(translation), rms(errors)))
         except InputError:
-            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, _rms(translation), None))
+            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, rms(translation), None))
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
@@ -320,7 +320,3 @@ def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: flo
     if rmse_with < _BETTER * rmse:
         return f"{motions}: with --offset {offset_s:.3f} the ATE is {rmse_with:.4g} m instead of {rmse:.4g} m"
     return f"{motions}, but the ATE is no better with that ({rmse_with:.4g} m, now {rmse:.4g} m): no offset is advised"
-
-
-def _rms(errors: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(errors**2)))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus._extras import require
 from boxplus.evaluation.evaluation import Evaluation
+from boxplus.evaluation.statistics import rms
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.formats.trajectory import Trajectory
 
@@ -91,7 +92,7 @@ def _errors(evaluation: Evaluation) -> Figure:
     absolute = ((evaluation.translation_error_m, "translation [m]"), (evaluation.rotation_error_deg, "rotation [°]"))
     for axes, (values, name) in zip(figure.axes, absolute, strict=False):
         axes.plot(at, values, color=_ESTIMATE, linewidth=0.9)
-        rmse = float(np.sqrt(np.mean(values**2)))
+        rmse = rms(values)
         axes.axhline(rmse, color=TRUTH, linewidth=0.8, linestyle="--", label=f"rmse {rmse:.4g}")
         axes.set_ylabel(f"absolute error,\n{name}")
         axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0.0)

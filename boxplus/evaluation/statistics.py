@@ -8,6 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def rms(errors: NDArray[np.float64]) -> float:
+    """Root mean square of all given errors, at least one, in their unit."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
 @dataclass(frozen=True, slots=True)
 class Statistics:
     """Figures of N errors, in the unit of the errors; `std` is that of the errors about their mean (divided by N)."""
@@ -25,7 +30,7 @@ class Statistics:
         """The figures of (N,) errors, N ≥ 1."""
         return cls(
             count=len(errors),
-            rmse=float(np.sqrt(np.mean(errors**2))),
+            rmse=rms(errors),
             mean=float(np.mean(errors)),
             median=float(np.median(errors)),
             std=float(np.std(errors)),

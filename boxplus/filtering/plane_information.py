@@ -22,6 +22,8 @@ _TILT_VARIANCE = 0.1**2
 # Variance of a plane's normal [rad²] beyond which the plane counts less and less: its points lie on little more than a line,
 # and a normal that noise has chosen holds the sensor where it first saw that line.
 _SURE_TILT = 0.1**2
+# How often the variance of a plane's five points counts: once for the point itself, and by a fifth for their mean.
+MISFITS = 1.2
 
 
 @kernel(inline=True)
@@ -138,7 +140,7 @@ def accumulate_planes(
         t1 = plane[9] * yx + plane[10] * yy + plane[11] * yz - plane[12]
         # The misfit of the plane's own points says how far to trust it; the Cauchy weight, how far to trust the point.
         spread_sq = t0 * t0 + t1 * t1
-        variance = range_variance + 0.2 * map_variance + _TILT_VARIANCE * spread_sq + plane[4] * (1.2 + spread_sq)
+        variance = range_variance + 0.2 * map_variance + _TILT_VARIANCE * spread_sq + plane[4] * (MISFITS + spread_sq)
         weight = 1.0 / (variance + z * z)
         tilt = 0.0
         for first in (5, 9):

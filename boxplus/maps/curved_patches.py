@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.filtering.plane_information import USED
+from boxplus.filtering.plane_information import MISFITS, USED
 from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn
 from boxplus.maps.plane_confirmation import leverage_into
@@ -159,8 +159,8 @@ def _fit_patch(
     bent[1] = (uy - b * ey - c * fy) * inverse_norm
     bent[2] = (uz - b * ez - c * fz) * inverse_norm
     bent[3] = bent[0] * y[0] + bent[1] * y[1] + bent[2] * y[2] + a * inverse_norm
-    # What accumulate_planes makes of it: 1.2 times this, and nothing for the tilt, as the tangent is taken where the point is.
-    bent[4] = variance * (1.0 + inverse[0, 0]) / 1.2
+    # What accumulate_planes makes of it: MISFITS times this, and nothing for the tilt (the tangent is taken at the point).
+    bent[4] = variance * (1.0 + inverse[0, 0]) / MISFITS
     # Cov(b, c) = σ² C: its Cholesky factor, along e and f.
     first = math.sqrt(inverse[1, 1])
     mixed = inverse[2, 1] / first
