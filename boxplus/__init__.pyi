@@ -77,6 +77,7 @@ from .systems.direct_alignment.tracking import track as track
 from .systems.direct_odometry.config import DirectOdometryConfig as DirectOdometryConfig
 from .systems.direct_odometry.depth.sensed_depth import StereoPair as StereoPair
 from .systems.direct_odometry.direct_odometry import DirectOdometry as DirectOdometry
+from .systems.lidar_inertial_odometry.config import LidarOdometryConfig as LidarOdometryConfig
 from .systems.lidar_inertial_odometry.config import LioConfig as LioConfig
 from .systems.lidar_inertial_odometry.estimate import Estimate as Estimate
 from .systems.lidar_inertial_odometry.odometry import LidarInertialOdometry as LidarInertialOdometry

@@ -8,6 +8,8 @@ of its module. A stale kernel is impossible, and editing one file recompiles onl
 What is read back is unpickled, and so can run any code. It is therefore read only from folders and files that nobody but
 this user (or root) can write to, and only if it still has the checksum it was written with. Whatever fails is compiled
 again, and a warning is logged, once.
+
+Functions of users have a key for every change of a constant. Of these the ones used last are kept.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ import logging
 import os
 import pickle
 import re
+import shutil
 import stat
 import sys
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -39,6 +43,9 @@ _IMPORT = re.compile(
 )
 _DIGEST_BYTES = 32
 _WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+_OF_A_USER = re.compile(r"user-[0-9a-f]{24}-[0-9a-f]{8}")
+_MOST_OF_USERS = 300  # functions, of 20 to 100 kB each
+_IN_USE_S = 3600.0  # another process may be about to read what was used within this
 
 
 def cache_root() -> Path:
@@ -267,6 +274,27 @@ def _replacing(path: str) -> Iterator[BinaryIO]:
         raise
 
 
+def _note_use(folder: Path) -> None:
+    """A user's function is used: the date of its folder says when, and those that were not used for long make room for it."""
+    with suppress(OSError):
+        os.utime(folder)
+    _forget_old(folder.parent)
+
+
+@functools.cache
+def _forget_old(kernels: Path) -> None:
+    """Remove what users compiled, the longest unused first, until no more is left than is kept; once in a process."""
+    used: list[tuple[float, Path]] = []
+    with suppress(OSError):
+        for entry in kernels.iterdir():
+            if _OF_A_USER.fullmatch(entry.name) and not entry.is_symlink():
+                used.append((entry.stat().st_mtime, entry))
+    used.sort(reverse=True)
+    for when, folder in used[_MOST_OF_USERS:]:
+        if time.time() - when > _IN_USE_S:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = [_KeyedLocator]  # noqa: RUF012
 
@@ -295,6 +323,8 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             self._impl_class = type("_Impl", (_KeyedCacheImpl,), {"_locator_classes": [locator_class]})
         super().__init__(py_func)  # type: ignore[no-untyped-call]
         locator = self._impl.locator
+        if key is not None:
+            _note_use(Path(locator.get_cache_path()))
         self._cache_file = _VerifiedFiles(  # type: ignore[no-untyped-call]
             cache_path=locator.get_cache_path(), filename_base=self._impl.filename_base, source_stamp=locator.get_source_stamp()
         )

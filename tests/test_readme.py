@@ -24,7 +24,7 @@ from boxplus.simulation import simulate, write_recording
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.localization.config import LocalizationConfig
-from boxplus.systems.slam.config import RegistrationConfig, SlamConfig
+from boxplus.systems.slam.config import LocalMapRegistrationConfig, SlamConfig
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from tests.small_problems import write_small_files
 
@@ -175,7 +175,7 @@ def test_every_page_is_in_the_index() -> None:
         ("slam", LocalMapConfig),
         ("slam", SlamConfig),
         ("slam", DescriptorConfig),
-        ("slam", RegistrationConfig),
+        ("slam", LocalMapRegistrationConfig),
         ("gnss", GeoreferenceConfig),
         ("localization", LocalizationConfig),
     ],

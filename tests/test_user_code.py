@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from numba.core import config as numba_config
 from numba.extending import overload
 
-from boxplus import _user_code
+from boxplus import _kernel_cache, _user_code
 from boxplus._jit import kernel, on_compilation
 from boxplus._user_code import UserCode, snapshot
 from boxplus.manifolds.euclidean import Euclidean
@@ -319,3 +320,37 @@ def test_losses_of_one_function_are_equal_and_follow_its_constants() -> None:
         return
     scope["C"] = 2.0
     assert first != UserLoss(scope["f"])
+
+
+@compiles
+def test_of_what_users_compiled_the_longest_unused_makes_room(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def made(constant: float) -> Any:
+        scope: dict[str, Any] = {"C": constant}
+        exec("def f(x):\n    return x[0] + C", scope)
+        return scope["f"]
+
+    def folders() -> set[str]:
+        return {path.name for path in (cache / "kernels").iterdir() if path.name.startswith("user-")}
+
+    kernels = cache / "kernels"
+    assert _value_and_compiled(made(1.0)) == (3.0, True)
+    own = folders()
+    old, kept = time.time() - 1e6, ["0123456789abcdef01234567-00000000", "user-of somebody else"]
+    for name in [*kept, *(f"user-{number:024x}-00000000" for number in range(8))]:
+        (kernels / name).mkdir(mode=0o700)
+        (kernels / name / "f.nbi").touch()
+        os.utime(kernels / name, (old, old))
+    for name in own:
+        os.utime(kernels / name, (old + 1.0, old + 1.0))
+    monkeypatch.setattr(_kernel_cache, "_MOST_OF_USERS", len(own) + 3)
+    _kernel_cache._forget_old.cache_clear()
+    assert _value_and_compiled(made(1.0)) == (3.0, False)
+    left = folders()
+    assert own < left and len(left - set(kept)) == len(own) + 3 and set(kept) <= {path.name for path in kernels.iterdir()}
+    assert all((kernels / name).stat().st_mtime > old + 1e5 for name in own)  # used again, and so the newest
+    # What another process may be about to read stays.
+    for number in range(8, 20):
+        (kernels / f"user-{number:024x}-00000000").mkdir(mode=0o700)
+    _kernel_cache._forget_old.cache_clear()
+    _value_and_compiled(made(1.0))
+    assert len(folders() - set(kept)) == len(own) + 12

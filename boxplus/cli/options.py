@@ -29,6 +29,15 @@ def without_report(wanted: bool) -> bool:
     return wanted
 
 
+def one_of_the_two(context: typer.Context, wanted: bool) -> bool:
+    """`--overwrite` and `--resume`: whichever is read last sees the other one."""
+    if wanted and (context.params.get("overwrite") or context.params.get("resume")):
+        from boxplus.runs.storage.output_folder import refuse_both
+
+        refuse_both(overwrite=True, resume=True)
+    return wanted
+
+
 RecordingArgument = Annotated[
     Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, or pcap.", metavar="RECORDING")
 ]
@@ -68,10 +77,17 @@ NoReportOption = Annotated[
     bool, typer.Option("--no-report", callback=without_report, help="Draw no report.", rich_help_panel=RESULTS)
 ]
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the results of an earlier run.", rich_help_panel=RESULTS)
+    bool,
+    typer.Option("--overwrite", callback=one_of_the_two, help="Replace the results of an earlier run.", rich_help_panel=RESULTS),
 ]
 ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="Go on with a run that was killed or interrupted.", rich_help_panel=RESULTS)
+    bool,
+    typer.Option(
+        "--resume",
+        callback=one_of_the_two,
+        help="Go on with a run that was killed or interrupted.",
+        rich_help_panel=RESULTS,
+    ),
 ]
 JsonOption = Annotated[
     bool,

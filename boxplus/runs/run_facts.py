@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -64,7 +65,7 @@ class WarningFacts(Part):
     first_s: float | None = Field(None, description="since the first estimate")
 
 
-class RunFacts(Part):
+class RunFacts(Part, ABC):
     """The facts of a run; each kind of run adds its own, with its `program`."""
 
     program: str
@@ -91,9 +92,9 @@ class RunFacts(Part):
     warnings: list[WarningFacts] = []
 
     @property
+    @abstractmethod
     def estimates(self) -> tuple[int, str]:
         """How many there are, and what one is for (`scans`, `frames`)."""
-        raise NotImplementedError
 
     @property
     def length_unit(self) -> str:
@@ -101,14 +102,14 @@ class RunFacts(Part):
         return "m"
 
     @property
+    @abstractmethod
     def progress(self) -> float:
         """Share of the recording that was read, 0 to 1."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def written(self) -> str:
         """What is complete up to the last estimate."""
-        raise NotImplementedError
 
     def write(self, path: Path) -> None:
         """Replace the file in one step.

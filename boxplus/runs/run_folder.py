@@ -11,7 +11,7 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import SUMMARY, output_folder
+from boxplus.runs.storage.output_folder import SUMMARY, output_folder, refuse_both
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -154,9 +154,10 @@ def claim_run_folder(folder: str | Path, *, overwrite: bool = False, resume: boo
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is
-            not set; no run to resume.
+            not set; no run to resume; both are asked for.
         OutputError: it cannot be created or cleared.
     """
+    refuse_both(overwrite, resume)
     run = RunFolder(Path(folder))
     if resume:
         with run.locked_to_resume("boxplus lio"):

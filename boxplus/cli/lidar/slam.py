@@ -11,6 +11,7 @@ from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
     ConfigOption,
+    GroundTruthOption,
     JsonOption,
     MountingOption,
     NoMapOption,
@@ -27,6 +28,8 @@ from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
+    from boxplus.cli.ground_truth import Comparison
+    from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.slam.result import SlamResult
     from boxplus.runs.slam.summary import GnssFacts
 
@@ -45,6 +48,7 @@ def slam(
     settings: SettingsOption = None,
     T_imu_lidar: MountingOption = None,
     threads: ThreadsOption = None,
+    ground_truth: GroundTruthOption = None,
     gnss_lever_arm: Annotated[
         str | None,
         typer.Option("--gnss-lever-arm", help="Antenna of the satellite receiver in the IMU frame, x,y,z [m]."),
@@ -78,6 +82,7 @@ def slam(
     forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
     folder = output or Path(f"{recording.resolve().stem}_slam")
 
+    from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
@@ -87,6 +92,7 @@ def slam(
 
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
     with reported(recording, folder, as_json=as_json) as outcome:
+        truth = read_ground_truth(ground_truth)
         with (
             viewing("LiveView", recording.name, view) as shown,
             stop_on_interrupt(terminal.announce_stop) as should_stop,
@@ -112,11 +118,24 @@ def slam(
 
                 with terminal.status("drawing the report"):
                     write_report(result)
-        summary, files = result.summary, ("report.html", "trajectory.tum", "loops.csv", "map.ply")
-        terminal.print_results(
-            result.odometry, _rows(result), folder, files, warnings=summary.warnings, doubt=summary.contradiction
-        )
+        summary, rows, comparison = result.summary, _rows(result), None
+        if truth is not None and summary.scans:
+            odometry, comparison = _compared(result, truth)
+            rows += [("odometry alone", odometry.line), comparison.row]
+        files = ("report.html", "trajectory.tum", "loops.csv", "map.ply", "evaluation.json")
+        terminal.print_results(result.odometry, rows, folder, files, warnings=summary.warnings, doubt=summary.contradiction)
         outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)
+        outcome.compare(comparison)
+
+
+def _compared(result: SlamResult, truth: Trajectory) -> tuple[Comparison, Comparison]:
+    """The odometry, and what closing loops made of it, each with an `evaluation.json` beside its trajectory."""
+    from boxplus.cli.ground_truth import compare_with
+
+    odometry, corrected = (
+        compare_with(truth, run.trajectory, run.evaluation, "se3") for run in (result.folder.odometry, result.folder)
+    )
+    return odometry, corrected
 
 
 def _rows(result: SlamResult) -> list[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,22 +10,22 @@ from pathlib import Path
 from typing import TypeVar
 
 from boxplus.runs.run_folder import OdometryFolder
-from boxplus.runs.storage.output_folder import output_folder
+from boxplus.runs.storage.output_folder import output_folder, refuse_both
 
 
 @dataclass(frozen=True, slots=True)
-class CameraRunFolder(OdometryFolder):
+class CameraRunFolder(OdometryFolder, ABC):
     """The paths of the results of a run with cameras."""
 
     @property
+    @abstractmethod
     def program(self) -> str:
         """Who writes here."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def pictures(self) -> tuple[str, ...]:
         """Names of the pictures in `plots`."""
-        raise NotImplementedError
 
     @property
     def frames(self) -> Path:
@@ -94,9 +95,10 @@ def claim_camera_folder(run: FolderT, *, overwrite: bool = False, resume: bool =
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
-            set; no run to resume.
+            set; no run to resume; both are asked for.
         OutputError: it cannot be created or cleared.
     """
+    refuse_both(overwrite, resume)
     if resume:
         with run.locked_to_resume(run.program):
             yield run

@@ -14,7 +14,7 @@ from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_folder import RunFolder, is_map_file
 from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import output_folder
+from boxplus.runs.storage.output_folder import output_folder, refuse_both
 
 PROGRAM = "boxplus slam"
 _LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")
@@ -121,9 +121,10 @@ def claim_slam_folder(folder: str | Path, *, overwrite: bool = False, resume: bo
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
-            set; no run to resume.
+            set; no run to resume; both are asked for.
         OutputError: it cannot be created or cleared.
     """
+    refuse_both(overwrite, resume)
     slam = SlamFolder(Path(folder))
     if resume:
         with slam.locked_to_resume(PROGRAM):

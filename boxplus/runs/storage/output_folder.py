@@ -14,6 +14,18 @@ from boxplus.runs.storage.folder_lock import LOCK, locked_folder
 SUMMARY = "run.json"
 
 
+def refuse_both(overwrite: bool, resume: bool) -> None:
+    """An earlier run is either replaced or gone on with.
+
+    Raises:
+        InputError: both are asked for.
+    """
+    if overwrite and resume:
+        raise InputError(
+            "overwrite or resume", "both", "to go on with the earlier run leave overwrite out; to begin anew, leave resume out"
+        )
+
+
 @contextmanager
 def output_folder(
     folder: str | Path,

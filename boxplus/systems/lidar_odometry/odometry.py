@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._stopwatch import Stopwatch
-from boxplus.errors import InputError
 from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import T_V, TANGENT
 from boxplus.maps.ikd_tree import IkdTree
@@ -25,7 +24,7 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Sequencer
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
@@ -34,15 +33,6 @@ from boxplus.systems.lidar_odometry.motion import DOF, VELOCITY, MotionBetween, 
 from boxplus.systems.lidar_odometry.observed_density import ObservedDensity
 from boxplus.systems.lidar_odometry.start import LidarStart, find_lidar_start
 
-_OF_THE_IMU = (
-    "T_imu_lidar",
-    "extrinsic_estimation",
-    "gyro_noise",
-    "accel_noise",
-    "gyro_bias_walk",
-    "accel_bias_walk",
-    "max_imu_gap",
-)
 _START_S = 0.5
 _LONGEST_START_SCANS = 30
 _LONGEST_GAP_S = 1.0  # nothing holds a velocity for longer
@@ -65,7 +55,7 @@ class LidarOdometry(Snapshots):
     the world is its frame at the end of the first scan, as nothing says where down is.
 
     Args:
-        config: the settings; those of the IMU must have their defaults.
+        config: the settings; in a `LioConfig`, as a run has it, those of the IMU must have their defaults.
 
     Raises:
         InputError: a setting of the IMU or of its mounting is given.
@@ -78,11 +68,9 @@ class LidarOdometry(Snapshots):
         'ok'
     """
 
-    def __init__(self, config: LioConfig | None = None) -> None:
-        self.config = config or LioConfig()
-        given = [name for name in _OF_THE_IMU if getattr(self.config, name) != LioConfig.model_fields[name].default]
-        if given:
-            raise InputError("settings of a LiDAR alone", f"{', '.join(given)}", "leave them out: no IMU takes part")
+    def __init__(self, config: LidarOdometryConfig | None = None) -> None:
+        config = config or LidarOdometryConfig()
+        self.config = config.of_lidar_alone() if isinstance(config, LioConfig) else config
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self.start: LidarStart | None = None
         self.start_problem: str | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from boxplus.systems.slam.config import RegistrationConfig
+from boxplus.systems.slam.config import LocalMapRegistrationConfig
 
 
 class LocalizationConfig(BaseModel):
@@ -20,7 +20,9 @@ class LocalizationConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    registration: RegistrationConfig = Field(RegistrationConfig(), description="see RegistrationConfig of loop closure")
+    registration: LocalMapRegistrationConfig = Field(
+        LocalMapRegistrationConfig(), description="see LocalMapRegistrationConfig of loop closure"
+    )
     query_duration: float = Field(3.0, gt=0, description="scans are collected for this long, then looked for in the map [s]")
     query_length: float = Field(20.0, gt=0, description="or over this way [m]")
     candidates: int = Field(10, ge=2, description="poses that agree best from above and are registered")

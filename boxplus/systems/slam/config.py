@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from boxplus.maps.descriptors.config import DescriptorConfig
 
 
-class RegistrationConfig(BaseModel):
+class LocalMapRegistrationConfig(BaseModel):
     """How two local maps are laid over each other, and what their covariance is made of."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -40,7 +40,7 @@ class SlamConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     descriptor: DescriptorConfig = Field(DescriptorConfig(), description="see DescriptorConfig")
-    registration: RegistrationConfig = Field(RegistrationConfig(), description="see RegistrationConfig")
+    registration: LocalMapRegistrationConfig = Field(LocalMapRegistrationConfig(), description="see LocalMapRegistrationConfig")
     appearance: Literal["density", "scan_context", "none"] = Field(
         "density",
         description="how places are recognised: by features of density images (needs the extra vision), and by scan contexts "

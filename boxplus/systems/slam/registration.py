@@ -23,7 +23,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, IkdView, copy_found, knn
 from boxplus.maps.ikd_tree.tree import IkdTree
 from boxplus.maps.plane_fit import fit_plane_into
-from boxplus.systems.slam.config import RegistrationConfig
+from boxplus.systems.slam.config import LocalMapRegistrationConfig
 
 Floats = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def register(
     source: Surface,
     target: Surface,
     T_start: Floats,
-    config: RegistrationConfig | None = None,
+    config: LocalMapRegistrationConfig | None = None,
     deformation: Floats | None = None,
     is_close: bool = False,
 ) -> Registration | None:
@@ -92,7 +92,7 @@ def register(
 
     Example: docs/slam.md.
     """
-    config = config if config is not None else RegistrationConfig()
+    config = config if config is not None else LocalMapRegistrationConfig()
     T = _staged(source, target, T_start, config, _STAGES[-1:] if is_close else _STAGES)
     if T is None:
         return None
@@ -108,7 +108,7 @@ def register(
     return Registration(T, covariance, information, weak, found.lever, overlap, found.scale, len(found.e))
 
 
-def approach(source: Surface, target: Surface, T_start: Floats, config: RegistrationConfig) -> Floats | None:
+def approach(source: Surface, target: Surface, T_start: Floats, config: LocalMapRegistrationConfig) -> Floats | None:
     """(7,) T_target_source before the last stage of `register`, from a sixth of its work; None where that gives none.
 
     From guesses on a grid of up to a metre. Floors fit at once, and by their spread a wall that is half a metre off would be an
@@ -121,7 +121,7 @@ def _staged(
     source: Surface,
     target: Surface,
     T_start: Floats,
-    config: RegistrationConfig,
+    config: LocalMapRegistrationConfig,
     stages: tuple[tuple[float, int, int], ...],
     blunt: float = 0.0,
 ) -> Floats | None:
@@ -143,7 +143,7 @@ def refine(
     points: NDArray[np.float32],
     target: Surface,
     T_start: Floats,
-    config: RegistrationConfig,
+    config: LocalMapRegistrationConfig,
     *,
     distance: float,
     steps: int,
@@ -174,7 +174,9 @@ def refine(
     return Registration(T, covariance, information, weak, found.lever, (unasked, unasked), found.scale, len(found.e))
 
 
-def surface_distance(source: Surface, target: Surface, T_target_source: Floats, config: RegistrationConfig) -> float | None:
+def surface_distance(
+    source: Surface, target: Surface, T_target_source: Floats, config: LocalMapRegistrationConfig
+) -> float | None:
     """Robust standard deviation of the distances of a source's points to the target's planes [m], laid over it as given."""
     distance, _, count = _STAGES[-1]
     found = _Matched.of(_spread(source.points, count // 4), target, T_target_source, distance, config)
@@ -182,7 +184,7 @@ def surface_distance(source: Surface, target: Surface, T_target_source: Floats, 
 
 
 def fitting_share(
-    source: Surface, target: Surface, T_target_source: Floats, tolerance: float, config: RegistrationConfig
+    source: Surface, target: Surface, T_target_source: Floats, tolerance: float, config: LocalMapRegistrationConfig
 ) -> float:
     """Share of a source's points that lie within `tolerance` [m] of a plane of the target; one without a plane does not."""
     distance, _, count = _STAGES[-1]
@@ -211,7 +213,7 @@ class _Matched:
         target: Surface,
         T: Floats,
         distance: float,
-        config: RegistrationConfig,
+        config: LocalMapRegistrationConfig,
         least_scale: float = _LEAST_SCALE,
     ) -> _Matched | None:
         count = len(points)
@@ -258,7 +260,7 @@ class _Matched:
         step = -vectors[:, good] @ (g / values[good])
         return self.to_origin @ step, float(np.linalg.norm(step))
 
-    def covariance(self, config: RegistrationConfig, deformation: Floats) -> tuple[Floats, Floats, Floats]:
+    def covariance(self, config: LocalMapRegistrationConfig, deformation: Floats) -> tuple[Floats, Floats, Floats]:
         values, vectors, good = self._modes(config.weak_information)
         _, cell = np.unique(np.floor(self.where / config.cluster).astype(np.int64), axis=0, return_inverse=True)
         gradients = np.zeros((int(cell.max()) + 1, 6))

@@ -13,7 +13,7 @@ from boxplus.manifolds import so3
 from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, simulate
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 
@@ -97,13 +97,15 @@ def test_goes_on_from_a_snapshot_with_the_same_bits(tmp_path: Path) -> None:
 
 def test_the_result_does_not_depend_on_the_threads() -> None:
     scans = _scans(simulate("walk", duration_s=2.0, lidar=SPARSE))
-    one, two = (_run(LidarOdometry(LioConfig(threads=threads)), scans) for threads in (1, 2))
+    one, two = (_run(LidarOdometry(LidarOdometryConfig(threads=threads)), scans) for threads in (1, 2))
     assert all(np.array_equal(a.state.pack(), b.state.pack()) for a, b in zip(one, two, strict=True))
 
 
 def test_settings_of_an_imu_are_refused() -> None:
     with pytest.raises(InputError, match="settings of a LiDAR alone – got gyro_noise, max_imu_gap – leave them out"):
         LidarOdometry(LioConfig(gyro_noise=0.001, max_imu_gap=0.3))
+    alone = LidarOdometry(LioConfig(max_points=1000, threads=2)).config
+    assert alone == LidarOdometryConfig(max_points=1000, threads=2) and type(alone) is LidarOdometryConfig
 
 
 def test_scans_that_cannot_be_used_are_counted() -> None:

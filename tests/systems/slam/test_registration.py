@@ -10,7 +10,7 @@ from boxplus.manifolds import se3
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.simulation.worlds.world import World
 from boxplus.simulation.worlds.worlds import city, corridor, hall
-from boxplus.systems.slam.config import RegistrationConfig
+from boxplus.systems.slam.config import LocalMapRegistrationConfig
 from boxplus.systems.slam.registration import Surface, approach, register
 from boxplus.systems.slam.rivals import rival_shifts
 
@@ -53,7 +53,7 @@ def test_visits_are_laid_over_each_other_within_the_covariance() -> None:
 
 def test_walls_half_a_metre_off_are_no_outliers_beside_a_floor_that_fits() -> None:
     """From the middle of a cell of 1 m, along either axis of a hall, whose floor is most of what is seen."""
-    config, errors = RegistrationConfig(), []
+    config, errors = LocalMapRegistrationConfig(), []
     for seed in range(3):
         random = np.random.default_rng(seed)
         world = hall(seed=seed)
