@@ -158,7 +158,7 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         np.sqrt(power),
         len(pairs.first),
         pairs.covered,
-        pairs.overlap > 1,
+        pairs.overlap > 1.0,
     )
 
 
@@ -167,14 +167,14 @@ class _Pairs:
     """Poses `first` and `last` (K,) of a path between which rotations are compared.
 
     Attributes:
-        overlap: how many of the intervals lie over each other.
+        overlap: how many of the intervals lie over each other, on average.
         covered: share of the path that they span.
         jitter: what of the rates between them changes from scan to scan without a trend [rad/s].
     """
 
     first: NDArray[np.intp]
     last: NDArray[np.intp]
-    overlap: int
+    overlap: float
     covered: float
     jitter: float
 
@@ -186,25 +186,32 @@ def _pairs(path: LidarPath, imu: ImuSamples, attitude: GyroAttitude) -> _Pairs:
     begins = np.append(True, path.segment[1:] != path.segment[:-1])
     seen = (known > 1.0 / _SEEN_RAD**2) | begins
     first = np.arange(max(len(path) - 1, 0))
-    near = _covered(path, imu, attitude, first[seen[1:]], 1)
+    near = _covered(path, imu, attitude, first[seen[1:]], 1, 1)
     if near.covered > _MOST or len(path) < 3:
         return near
     count = max(round(_LONG_S / (float(np.median(np.diff(path.time_ns))) * 1e-9)), 2)
     seen = (known > 1.0 / _SEEN_LONG_RAD**2) | begins
-    first = np.arange(0, max(len(path) - count, 0), count // 2)
-    far = _covered(path, imu, attitude, first[seen[first] & seen[first + count]], count)
+    stride = count // 2
+    first = np.arange(0, max(len(path) - count, 0), stride)
+    far = _covered(path, imu, attitude, first[seen[first] & seen[first + count]], count, stride)
     return far if far.covered > _MOST else near
 
 
-def _covered(path: LidarPath, imu: ImuSamples, attitude: GyroAttitude, first: NDArray[np.intp], count: int) -> _Pairs:
-    """Poses `count` scans apart, beginning with `first` (K,), within a segment and where the gyroscope covers what is between."""
+def _covered(
+    path: LidarPath, imu: ImuSamples, attitude: GyroAttitude, first: NDArray[np.intp], count: int, stride: int
+) -> _Pairs:
+    """Poses `count` scans apart, within a segment and where the gyroscope covers what is between.
+
+    They begin with `first` (K,), some of every `stride`-th pose.
+    """
     first = first[path.segment[first] == path.segment[first + count]]
     begin_ns, end_ns = path.time_ns[first], path.time_ns[first + count]
     inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0) & ~_across_gap(imu.time_ns, begin_ns, end_ns)
-    first, overlap = first[inside], min(count, 2)
+    first = first[inside]
     neighbours = first if count == 1 else np.flatnonzero(path.segment[1:] == path.segment[:-1])
-    covered = count * len(first) / overlap / max(len(path) - 1, 1)
-    return _Pairs(first, first + count, overlap, covered, _jitter(path, neighbours) / count)
+    spanned = np.zeros(max(len(path) - 1, 1), dtype=bool)
+    spanned[first[:, None] + np.arange(count)] = True
+    return _Pairs(first, first + count, count / stride, float(spanned.mean()), _jitter(path, neighbours) / count)
 
 
 def _jitter(path: LidarPath, first: NDArray[np.intp]) -> float:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import SE3
-from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.local_map import LocalMap, drift_covariance
 from boxplus.systems.slam.loop import Floats
 from boxplus.systems.slam.odometry_chain import OdometryChain
 
@@ -78,12 +79,17 @@ class Session:
     def start_covariance(self) -> Floats:
         """(6, 6) of the first map in the session's frame, on its right: what the odometry drifts by on the way there.
 
-        The frame is where the session began; what is known of it goes through the first map. Zero where that stands in it.
+        The frame is where the session began; what is known of it goes through the first map. Zero where that stands in it. With
+        one map nothing tells how the odometry drifts: what the settings add to every way by themselves is counted.
         """
-        way = [local_map.path_m for local_map in self.maps[:2]]
-        if len(way) < 2 or way[0] <= 0.0 or way[1] <= way[0]:
+        first_m = self.maps[0].path_m
+        if first_m <= 0.0:
             return np.zeros((6, 6))
-        return np.asarray(self.maps[0].covariance * (way[0] / (way[1] - way[0])))
+        if len(self.maps) == 1:
+            settings = LocalMapConfig()
+            return drift_covariance(first_m, settings.drift_rotation, settings.drift_position)
+        way_m = self.maps[1].path_m - first_m
+        return np.asarray(self.maps[0].covariance * (first_m / way_m)) if way_m > 0.0 else np.zeros((6, 6))
 
     def chain(self) -> OdometryChain:
         """What is known between any two maps: poses after loops, covariances of the odometry, which loops only make smaller."""

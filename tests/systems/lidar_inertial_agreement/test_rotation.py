@@ -79,6 +79,30 @@ def test_attitudes_known_coarsely_are_compared_over_longer_intervals(seed: int, 
         assert error @ np.linalg.solve(off, error) < 16.3  # three components, one in a thousand
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 7.5, 10.0, 12.5, 20.0])
+@pytest.mark.parametrize(("known", "compared"), [(1.0, True), (0.7, True), (0.4, False)])
+def test_of_attitudes_known_coarsely_over_half_of_the_path_is_asked_for(rate_hz: float, known: float, compared: bool) -> None:
+    """Whatever the rate of the scans, of which a whole number fits into an interval and a whole number into its half."""
+    random = np.random.default_rng(7)
+    K, step_s = round(16.0 * rate_hz), 1.0 / rate_hz
+    std = np.where(np.arange(K + 1) < known * K, 0.02, 1.0)
+    zeros = np.zeros(K + 1)
+    time_ns = (np.arange(K + 1) * step_s * 1e9).astype(np.int64)
+    rate = np.deg2rad([25.0, 18.0, 12.0]) * np.sin(np.arange(K)[:, None] * step_s * [1.5, 2.0, 2.5] + random.uniform(0.0, 6.0, 3))
+    R = [np.eye(3)]
+    for turn in so3.exp(rate * step_s):
+        R.append(R[-1] @ turn)
+    information = np.eye(6) / std[:, None, None] ** 2
+    path = LidarPath(time_ns, np.array(R), np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
+    imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
+    gyro = rate[np.clip(np.searchsorted(time_ns, imu_ns) - 1, 0, K - 1)]
+    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
+    assert (fit is not None) == compared
+    if fit is not None:
+        assert fit.coarse
+        assert known - 0.1 < fit.covered <= min(known + 0.02, 1.0)
+
+
 @pytest.mark.parametrize("count", [40, 120])
 @pytest.mark.parametrize("second", [0.0, 0.005, 0.02, 0.2])
 def test_the_mounting_is_as_far_off_as_it_says(count: int, second: float) -> None:

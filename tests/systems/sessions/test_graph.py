@@ -12,6 +12,7 @@ from boxplus import residuals
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
+from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.optimization.problem import Problem
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
@@ -97,7 +98,18 @@ def test_the_way_to_the_first_map_is_part_of_what_a_frame_is_off_by() -> None:
     to_b, to_a = se3.adjoint(B[0]), se3.adjoint(se3.compose(se3.inverse(ANCHOR), A[0]))
     expected = without + 20.0 * to_b @ own @ to_b.T + 10.0 * to_a @ own @ to_a.T
     np.testing.assert_allclose(with_it, expected, rtol=1e-5, atol=1e-10)
-    assert not Session.of("one", [replace(a.maps[0], path_m=5.0)]).start_covariance.any()
+
+
+@pytest.mark.parametrize("way", [2.0, 10.0])
+def test_a_session_of_one_map_is_as_uncertain_as_the_settings_say_of_its_way(way: float) -> None:
+    a, b = drawn("a", A), drawn("b", B[:1])
+    encounters = met(0, 1, [(1, 0)], A, se3.compose(ANCHOR[None], B[:1]))
+    start = np.stack([turned(0.0, 0.0, 0.0), ANCHOR])
+    later = Session.of("b", [replace(b.maps[0], path_m=way)])
+    without, with_it = (join([a, session], encounters, start, 1e4).covariance[1] for session in (b, later))
+    to_b, settings = se3.adjoint(B[0]), LocalMapConfig()
+    own = np.diag(np.repeat([settings.drift_rotation**2, settings.drift_position**2], 3)) * way
+    np.testing.assert_allclose(with_it, without + to_b @ own @ to_b.T, rtol=1e-5, atol=1e-10)
 
 
 def test_own_loops_hold_a_session_together() -> None:
