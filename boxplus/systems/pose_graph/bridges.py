@@ -31,9 +31,9 @@ class Bridge:
 
     Attributes:
         edge: its number in the graph.
-        votes: loop closures between the two pieces that agree with it, itself included.
-        others: those that agree with each other most of those that do not.
-        count: loop closures between the two pieces.
+        votes: pairs of poses with a loop closure between the two pieces that agrees with it, its own included.
+        others: the most pairs that agree with each other of those that do not.
+        count: pairs with loop closures between the two pieces. A pair that is there twice has no second witness.
     """
 
     edge: int
@@ -43,12 +43,17 @@ class Bridge:
 
     @property
     def is_contested(self) -> bool:
-        """Whether another placement has nearly as much to say for itself."""
-        return self.others >= _CONTESTED * self.votes and self.count > 1
+        """Whether another placement has nearly as much to say for itself, or none but the bridge says anything for this one."""
+        return self.others >= _CONTESTED * self.votes or self.votes < 2
 
     def sentence(self, graph: PoseGraph) -> str:
         """What is contested."""
         i, j = graph.ids[graph.edges[self.edge]]
+        if self.count < 2:
+            return (
+                f"odometry falls into pieces, and that of pose {i} and that of pose {j} are joined by the loop closure {i} → {j} "
+                "alone: whether it is right, and with it how they lie to each other, nothing can tell"
+            )
         return (
             f"odometry falls into pieces, and of {self.count} loop closures between that of pose {i} and that of pose {j} "
             f"{self.votes} agree on how they lie to each other, and {self.others} on another way: which are right is not clear"
@@ -87,11 +92,17 @@ def bridge_pieces(
 def _most_agreed(crossings: Crossings, edges: NDArray[np.int64]) -> Bridge:
     tried = crossings.tried
     agree = np.stack([crossings.agreeing(int(one))[0] for one in tried])
-    votes = agree.sum(axis=1)
+    pair = np.unique(np.stack([crossings.a, crossings.b]), axis=1, return_inverse=True)[1].ravel()
+    votes = _pairs(agree, pair)
     best = int(np.argmax(votes))
     # Of the others, only those that the chosen ones do not agree with speak for another placement.
-    others = (agree & ~agree[best]).sum(axis=1)[~agree[best][tried]]
-    return Bridge(int(edges[tried[best]]), int(votes[best]), int(others.max(initial=0)), len(edges))
+    others = _pairs(agree & ~agree[best], pair)[~agree[best][tried]]
+    return Bridge(int(edges[tried[best]]), int(votes[best]), int(others.max(initial=0)), int(pair.max()) + 1)
+
+
+def _pairs(agree: NDArray[np.bool_], pair: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(t,) of how many different pairs of poses, `pair` (k,), the loop closures marked in every row of `agree` (t, k) are."""
+    return np.array([np.count_nonzero(np.bincount(pair[row])) for row in agree], dtype=np.int64)
 
 
 def _spanning(pieces: int, found: list[tuple[int, int, Bridge]]) -> list[Bridge]:

@@ -90,6 +90,53 @@ def test_robots_without_odometry_between_them_are_joined_by_the_loops_that_agree
     assert result.doubt is None
 
 
+def two_robots(dimension, seed, true, false, *, twice=False):
+    """A walk cut in two, with `true` loop closures between the halves and `false` ones, the last of which is there `twice`.
+
+    Returns the graph, and how far from the truth the second robot is in the frame of the first for given poses.
+    """
+    rng = np.random.default_rng(seed)
+    group = se3 if dimension == 3 else se2
+    simulated = simulate_pose_graph(dimension=dimension, poses=120, seed=seed, loops=60, reach_m=4.0)
+    graph = simulated.graph
+    halves = graph.edges < 60
+    between = halves[:, 0] != halves[:, 1]
+    crossing = rng.permutation(np.flatnonzero(between & simulated.is_loop))
+    chosen = np.append(crossing[:true], crossing[true : true + false])
+    wrong = group.compose(simulated.truth[graph.edges[chosen[true:], 0]], graph.measurements[chosen[true:]])
+    wrong[:, -dimension:] += rng.choice([-1.0, 1.0], (false, dimension)) * rng.uniform(4.0, 12.0, (false, dimension))
+    graph.measurements[chosen[true:]] = group.compose(group.inverse(simulated.truth[graph.edges[chosen[true:], 0]]), wrong)
+    rows = np.concatenate([np.flatnonzero(~between), chosen, chosen[-1:] if twice else chosen[:0]])
+    graph = replace(
+        graph, edges=graph.edges[rows], measurements=graph.measurements[rows], information=graph.information[rows],
+        ids=np.where(np.arange(120) < 60, (97 << 56) + np.arange(120), (98 << 56) + np.arange(120) - 60),
+    )  # fmt: skip
+
+    def off(poses):
+        there = [group.compose(group.inverse(T[:1]), T[60:61])[0, -dimension:] for T in (poses, simulated.truth)]
+        return np.linalg.norm(there[0] - there[1])
+
+    return graph, off
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("true", "false"), [(1, 0), (0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (3, 1), (4, 0), (5, 2)])
+def test_robots_that_few_loops_join_wrongly_are_doubted(dimension, true, false):
+    for seed in range(4):
+        graph, off = two_robots(dimension, seed, true, false)
+        result = optimize_pose_graph(graph, GNC)
+        if off(result.graph.poses) > 1.5 or max(true, false) < 2:
+            assert result.doubt is not None and "odometry falls into pieces" in result.doubt
+        elif true > 2 * false:
+            assert result.doubt is None
+
+
+def test_a_loop_that_is_there_twice_is_one_witness():
+    graph, off = two_robots(2, 0, 0, 1, twice=True)
+    result = optimize_pose_graph(graph, GNC)
+    assert off(result.graph.poses) > 3.0 and "alone" in result.doubt
+
+
 @pytest.mark.parametrize(("dimension", "slip"), [(2, 1.0), (2, 3.0), (3, 3.0)])
 def test_odometry_that_slipped_is_a_doubt_that_names_it(dimension, slip):
     for seed in (1, 3):
