@@ -11,6 +11,7 @@ from boxplus.errors import InputError
 _LIBRARIES = {
     "cv2": ("OpenCV", "vision"),
     "dpkt": ("dpkt", "sensors"),
+    "fsspec": ("fsspec", "fleet"),
     "laspy": ("laspy", "las"),
     "lazrs": ("lazrs", "las"),
     "matplotlib": ("matplotlib", "report"),

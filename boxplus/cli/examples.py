@@ -52,7 +52,13 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "map export": (("boxplus map export out/map -o out.las --voxel 0.2", "LAS, thinned"),),
     "map grid": (("boxplus map grid out", ""),),
     "map height": (("boxplus map height out", ""),),
-    "fleet run": (("boxplus fleet run recordings -o fleet", "every recording of a folder"),),
+    "fleet run": (
+        ("boxplus fleet run recordings -o fleet", "every recording of a folder"),
+        (
+            "boxplus fleet run overnight.txt -o s3://bucket/fleet --address 10.0.0.5:6379",
+            "a list, on a cluster, into an object store",
+        ),
+    ),
     "report": (("boxplus report flight_boxplus", ""),),
     "simulate": (
         ("boxplus simulate walk -o recordings", "with a LiDAR"),

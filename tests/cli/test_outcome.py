@@ -27,6 +27,7 @@ NOWHERE = {
     "ba": ["nowhere.txt"],
     "pgo": ["nowhere.g2o"],
     "map merge": ["nowhere", "nowhere_else"],
+    "fleet run": ["nowhere"],
     "map update": ["nowhere", "nowhere_else"],
     "calibrate lidar-imu": ["nowhere.bag"],
     "calibrate cameras": ["nowhere.csv", "--target", "nowhere.yaml", "--resolution", "752x480"],

@@ -67,6 +67,9 @@ class PlaceIndex:
         self._count = 0
         self._bits = np.zeros((_FIRST, WORDS), dtype=np.uint64)
         self._place_of = np.zeros(_FIRST, dtype=np.int32)
+        # Scratch of a query, which leaves it as it was: a query looks at few places, however many there are.
+        self._voted, self._votes = np.full(_FIRST, _END, dtype=np.int32), np.zeros(_FIRST, dtype=np.int32)
+        self._touched = np.zeros(_FIRST, dtype=np.int32)
         # Bits that key a table, fixed once: as many as a key may ever have.
         random = np.random.Generator(np.random.PCG64(20240514))
         self._sampled = np.stack([random.permutation(64 * WORDS)[:_MOST_BITS] for _ in range(_TABLES)]).astype(np.uint64)
@@ -90,18 +93,24 @@ class PlaceIndex:
         _file(self._bits, self._count, self._count + more, self._sampled, self._key_bits, self._head, self._next)
         self._count += more
         self._places.append(place)
+        if len(self._places) > len(self._voted):
+            size = 2 * len(self._voted)
+            self._voted, self._votes = np.full(size, _END, dtype=np.int32), np.zeros(size, dtype=np.int32)
+            self._touched = np.zeros(size, dtype=np.int32)
 
-    def votes(self, query: Features, before: int | None = None) -> NDArray[np.int32]:
-        """(places,) how many of the query's features have a match in each place; zero from place `before` on."""
+    def votes(self, query: Features, before: int | None = None) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Places (n,) in which features of the query have a match, ascending, and of how many (n,); none from `before` on."""
         last = len(self._places) if before is None else min(before, len(self._places))
-        votes = np.zeros(max(last, 0), dtype=np.int32)
-        if last > 0 and len(query.bits):
-            voted = np.full(last, _END, dtype=np.int32)
-            limit = np.uint64(self.config.max_distance)
-            _vote(
-                query.bits, self._bits, self._place_of, self._sampled, self._key_bits, self._head, self._next, limit, voted, votes
-            )
-        return votes
+        if last <= 0 or not len(query.bits):
+            return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+        count = _vote(
+            query.bits, self._bits, self._place_of, self._sampled, self._key_bits, self._head, self._next,
+            np.uint64(self.config.max_distance), np.int32(last), self._voted, self._votes, self._touched,
+        )  # fmt: skip
+        places = np.sort(self._touched[:count])
+        votes = self._votes[places]
+        self._voted[places], self._votes[places] = _END, 0
+        return places, votes
 
     def candidates(self, query: Features, *, before: int | None = None, seed: int = 0) -> list[Candidate]:
         """Places that look like the query, the most inliers first.
@@ -111,10 +120,10 @@ class PlaceIndex:
             before: only places of smaller numbers.
             seed: of the sampling of matches.
         """
-        votes = self.votes(query, before)
+        places, votes = self.votes(query, before)
         best = np.argsort(-votes, kind="stable")[: self.config.candidates]
         found = []
-        for place in best[votes[best] >= _LEAST_VOTES].tolist():
+        for place in places[best[votes[best] >= _LEAST_VOTES]].tolist():
             candidate = self.align(query, place, seed)
             if candidate is not None:
                 found.append(candidate)
@@ -181,11 +190,16 @@ def _vote(
     head: NDArray[np.int32],
     following: NDArray[np.int32],
     max_distance: np.uint64,
+    last: np.int32,
     voted: NDArray[np.int32],
     votes: NDArray[np.int32],
-) -> None:
-    """One vote of every query feature for every place with a feature near it; `voted` (places,) is scratch, filled with −1."""
-    last = np.int32(len(votes))
+    touched: NDArray[np.int32],
+) -> np.int64:
+    """One vote of every query feature for every place below `last` with a feature near it; returns how many places have one.
+
+    These are written to `touched`; `voted`, filled with −1, and `votes`, with zeros, are left as they are for no other place.
+    """
+    count = np.uint64(0)
     for i in range(np.uint64(len(query))):
         for table in range(np.uint64(len(head))):
             found = head[table, _key(query, i, sampled, table, key_bits)]
@@ -194,6 +208,10 @@ def _vote(
                     break
                 place = place_of[found]
                 if place < last and voted[place] != np.int32(i) and hamming(query, i, bits, np.uint64(found)) <= max_distance:
+                    if voted[place] < 0:
+                        touched[count] = place
+                        count += np.uint64(1)
                     voted[place] = np.int32(i)
                     votes[place] += np.int32(1)
                 found = following[table, found]
+    return np.int64(count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -11,6 +12,7 @@ from boxplus._extras import require
 from boxplus.errors import InputError
 
 _RETRIES = 3  # of a task whose worker or machine was lost
+_IN_FLIGHT = 2000  # tasks that the cluster knows of at a time, however many there are
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +74,18 @@ class RayExecutor:
     def run(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[TaskEnd]:
         """See `Executor`."""
         remote = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(function)
-        numbers = {remote.remote(*given): number for number, given in enumerate(arguments)}
-        waiting = list(numbers)
-        while waiting:
-            (done,), waiting = self._ray.wait(waiting, num_returns=1)
+        rest, numbers = iter(enumerate(arguments)), dict[Any, int]()
+        while True:
+            for number, given in itertools.islice(rest, _IN_FLIGHT - len(numbers)):
+                numbers[remote.remote(*given)] = number
+            if not numbers:
+                return
+            (done,), _ = self._ray.wait(list(numbers), num_returns=1)
+            number = numbers.pop(done)
             try:
-                yield TaskEnd(numbers[done], self._ray.get(done))
+                yield TaskEnd(number, self._ray.get(done))
             except self._ray.exceptions.RayTaskError as error:
-                yield TaskEnd(numbers[done], error=f"{type(error.cause).__name__}: {error.cause}")
+                yield TaskEnd(number, error=f"{type(error.cause).__name__}: {error.cause}")
             except self._ray.exceptions.RayError as error:
                 lost = str(error).splitlines()[0] if str(error) else type(error).__name__
-                yield TaskEnd(numbers[done], error=f"lost {_RETRIES + 1} times: {lost}")
+                yield TaskEnd(number, error=f"lost {_RETRIES + 1} times: {lost}")

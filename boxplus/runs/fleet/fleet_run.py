@@ -1,53 +1,38 @@
 """`boxplus fleet run`: recordings, then which of them may have met, then whether they did, then one map.
 
-The results of every recording lie in a folder that all workers share. Whatever was finished is not done again, so that a fleet
-that was stopped goes on by the same command.
+The results lie in a folder that all workers share, or in an object store. Whatever was finished is not done again, so that a
+fleet that was stopped goes on by the same command.
 """
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from boxplus.errors import InputError
-from boxplus.formats.output import make_folder
-from boxplus.maps.descriptors.features import Features
+from boxplus.errors import InputError, OutputError
+from boxplus.maps.tiles.layout import MANIFEST, Manifest, write_manifest
+from boxplus.maps.tiles.store import merge
 from boxplus.runs.fleet.executor import Executor
+from boxplus.runs.fleet.joint_map import PARTS, Region, cut_run, join_region
 from boxplus.runs.fleet.status import FleetStatus, RecordingStatus
-from boxplus.runs.fleet.tasks import describe_run, meet_runs, run_recording
-from boxplus.runs.sessions.config import MergeConfig
-from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
+from boxplus.runs.fleet.store import MERGED, SharedFolder, Store, open_store
+from boxplus.runs.fleet.tasks import RunOutline, meet_runs, outline_run, run_of, run_recording
+from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
+from boxplus.runs.sessions.joined import merge_facts
+from boxplus.runs.sessions.merge_run import merge_runs
+from boxplus.runs.sessions.tables import write_encounters
 from boxplus.runs.slam.config import SlamRunConfig
-from boxplus.runs.storage.folder_lock import locked_folder
+from boxplus.runs.storage.output_folder import SUMMARY
 from boxplus.systems.sessions.candidates import candidate_pairs
 from boxplus.systems.sessions.encounter import Meeting
-from boxplus.systems.sessions.session import Session
 from boxplus.systems.sessions.sessions import SessionAlignment, place_sessions
 
-Report = Callable[[FleetStatus], None]
+Report = Callable[[FleetStatus, RecordingStatus | None], None]
 
-
-@dataclass(frozen=True, slots=True)
-class FleetFolder:
-    """The paths of the results."""
-
-    path: Path
-
-    @property
-    def status(self) -> Path:
-        """Where the fleet stands."""
-        return self.path / "fleet.json"
-
-    @property
-    def merged(self) -> Path:
-        """The joint map, as `boxplus map merge` leaves it."""
-        return self.path / "merged"
-
-    def run(self, name: str) -> Path:
-        """The run of one recording."""
-        return self.path / "runs" / name
+_WRITTEN_EVERY_S = 1.0  # of a large fleet `fleet.json` is large, too
 
 
 def run_fleet(
@@ -65,22 +50,27 @@ def run_fleet(
 
     Args:
         recordings: paths by name, as `find_recordings` finds them; every worker can read them under these paths.
-        output: folder that every worker can write to; what is finished in it is kept.
+        output: folder or URL that every worker can write to; what is finished in it is kept.
         executor: where tasks run.
         slam, merging: settings; each has a default.
-        remove_dynamic: as for `merge_runs`.
+        remove_dynamic: as for `merge_runs`; for a folder only, and by this process alone.
         neighbours: other recordings that each one is laid over at least, the most alike first.
-        report: called with the status after every task.
+        report: called with the status after every task, and with the recording whose run has ended.
 
     Raises:
-        InputError: no recording; another process runs a fleet there.
-        OutputError: the folder cannot be written or the disk is full.
+        InputError: no recording; another process runs a fleet there; `remove_dynamic` with a URL; a URL without a driver; workers
+            that write to a place of their own.
+        OutputError: the place cannot be written or the disk is full; a task of the joint map was lost for good.
     """
     if not recordings:
         raise InputError("a recording at least", "none", "see find_recordings")
-    folder = FleetFolder(make_folder(output))
-    with locked_folder(folder.path, "boxplus fleet run"):
-        fleet = _Fleet(recordings, folder, executor, slam or SlamRunConfig(), merging or MergeConfig(), neighbours, report)
+    store = open_store(output)
+    if remove_dynamic and not isinstance(store, SharedFolder):
+        raise InputError(
+            "a folder, to remove what was seen through", f"{store.text}", "give a folder, or leave --remove-dynamic out"
+        )
+    with store.locked():
+        fleet = _Fleet(recordings, store, executor, slam or SlamRunConfig(), merging or MergeConfig(), neighbours, report)
         return fleet.execute(remove_dynamic)
 
 
@@ -88,71 +78,95 @@ class _Fleet:
     def __init__(
         self,
         recordings: Mapping[str, Path],
-        folder: FleetFolder,
+        store: Store,
         executor: Executor,
         slam: SlamRunConfig,
         merging: MergeConfig,
         neighbours: int,
         report: Report | None,
     ) -> None:
-        self._recordings, self._folder, self._executor = recordings, folder, executor
+        self._recordings, self._store, self._executor = recordings, store, executor
         self._slam, self._merging, self._neighbours, self._report = slam, merging, neighbours, report
         self._began = time.perf_counter()
-        waiting = [RecordingStatus(name=name, recording=str(path)) for name, path in recordings.items()]
-        self.status = FleetStatus(recordings=waiting)
+        self._written = -_WRITTEN_EVERY_S
+        self.status = FleetStatus(
+            recordings=[RecordingStatus(name=name, recording=str(path)) for name, path in recordings.items()]
+        )
+        self._rows = self.status.recordings  # changed in place: a large fleet has many, and every task ends in a change
 
     def execute(self, remove_dynamic: bool) -> FleetStatus:
-        self._note()
+        self._note(stage="recordings")
         self._run_recordings()
-        names = [own.name for own in self.status.recordings if own.state == "finished"]
-        if len(names) > 1:
+        if len(self._sound()) > 1:
             self._note(stage="pairs")
-            pairs = self._pairs(names)
+            outlines = self._outlines(self._sound())
+            names = list(outlines)
+            pairs = self._pairs(list(outlines.values()))
             meetings = self._meet(names, pairs)
             self._note(stage="map", pairs_looked_at=len(pairs))
-            merged = self._merge(names, meetings, remove_dynamic)
-            self._note(
-                joined=[session.name for session in merged.summary.joined],
-                pairs_joined=sum(meeting.refusal is None for meeting in merged.alignment.meetings),
-            )
+            sessions = [outline.session for outline in outlines.values()]
+            if len(sessions) > 1:
+                alignment = place_sessions(sessions, meetings, self._merging.sessions)
+                self._write_map(alignment, remove_dynamic)
+                self._note_alignment(meetings, alignment)
+        elif self._store.read(f"{MERGED}/{SUMMARY}") is not None:
+            self._note(warnings=[f"{self._store / MERGED} is of an earlier fleet: nothing was joined this time"])
         self._note(stage="finished")
         return self.status
 
-    def _note(self, **facts: object) -> None:
-        self.status = self.status.model_copy(update={**facts, "seconds": time.perf_counter() - self._began})
-        self.status.write(self._folder.status)
+    def _sound(self) -> list[str]:
+        """Names of the recordings that came to their end and are to be trusted: one that is not would bend the others."""
+        return [own.name for own in self._rows if own.state == "finished" and own.doubt is None]
+
+    def _note(self, own: RecordingStatus | None = None, **facts: object) -> None:
+        now = time.perf_counter()
+        self.status = self.status.model_copy(update={**facts, "seconds": now - self._began})
+        if "stage" in facts or now - self._written >= _WRITTEN_EVERY_S:
+            self.status.write(self._store)
+            self._written = time.perf_counter()
         if self._report is not None:
-            self._report(self.status)
+            self._report(self.status, own)
+
+    def _note_recording(self, number: int, **facts: object) -> None:
+        self._rows[number] = self._rows[number].model_copy(update=facts)
+        self._note(self._rows[number])
 
     def _run_recordings(self) -> None:
-        names = list(self._recordings)
-        arguments = [(name, str(path), str(self._folder.run(name)), self._slam) for name, path in self._recordings.items()]
+        arguments = [(self._store.text, name, str(path), self._slam) for name, path in self._recordings.items()]
         for end in self._executor.run(run_recording, arguments):
-            rows = list(self.status.recordings)
-            rows[end.number] = (
-                end.value
-                if end.error is None
-                else RecordingStatus(
-                    name=names[end.number], recording=rows[end.number].recording, state="failed", error=end.error
+            if end.error is not None:
+                self._note_recording(end.number, state="failed", error=end.error)
+                continue
+            own: RecordingStatus = end.value
+            if own.state == "finished" and self._store.read(f"{run_of(own.name)}/{SUMMARY}") is None:
+                raise InputError(
+                    "a place for the results that all workers share",
+                    f"{self._store.text}, where this process does not find what a worker wrote",
+                    "give a shared folder or the URL of an object store with --output",
                 )
-            )
-            self._note(recordings=rows)
+            self._note_recording(end.number, **own.model_dump())
 
-    def _pairs(self, names: Sequence[str]) -> list[tuple[int, int]]:
-        """Sessions that look alike; all pairs where there are few, or where nothing is described."""
-        count = len(names)
-        if count <= self._neighbours + 1 or self._merging.sessions.slam.appearance != "density":
-            return [(a, b) for a in range(count) for b in range(a + 1, count)]
-        described: list[list[Features]] = [[] for _ in names]
-        arguments = [(str(self._folder.run(name)), self._merging.sessions.slam) for name in names]
-        for end in self._executor.run(describe_run, arguments):
+    def _outlines(self, names: Sequence[str]) -> dict[str, RunOutline]:
+        """Where the local maps of every run are; one that cannot be read is named, and the others go on."""
+        config = self._merging.sessions.slam
+        numbers = {own.name: number for number, own in enumerate(self._rows)}
+        found: dict[str, RunOutline] = {}
+        for end in self._executor.run(outline_run, [(self._store.text, name, config) for name in names]):
             if end.error is None:
-                described[end.number] = end.value
-        return candidate_pairs(described, self._merging.sessions.slam.descriptor, per_session=self._neighbours)
+                found[names[end.number]] = end.value
+            else:
+                self._note_recording(numbers[names[end.number]], state="failed", error=f"its local maps: {end.error}")
+        return {name: found[name] for name in names if name in found}
+
+    def _pairs(self, outlines: Sequence[RunOutline]) -> list[tuple[int, int]]:
+        """Sessions that look alike; all pairs where there are few, or where nothing is described."""
+        count, config = len(outlines), self._merging.sessions.slam
+        if count <= self._neighbours + 1 or config.appearance != "density":
+            return [(a, b) for a in range(count) for b in range(a + 1, count)]
+        return candidate_pairs([own.features for own in outlines], config.descriptor, per_session=self._neighbours)
 
     def _meet(self, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> list[Meeting]:
-        folders = [str(self._folder.run(name)) for name in names]
-        arguments = [((folders[a], folders[b]), (names[a], names[b]), (a, b), self._merging.sessions) for a, b in pairs]
+        arguments = [(self._store.text, (names[a], names[b]), (a, b), self._merging.sessions) for a, b in pairs]
         found: dict[int, Meeting] = {}
         for end in self._executor.run(meet_runs, arguments):
             a, b = pairs[end.number]
@@ -163,9 +177,83 @@ class _Fleet:
                 self._note(pairs_failed=[*self.status.pairs_failed, f"{names[a]} and {names[b]}: {end.error}"])
         return [found[number] for number in sorted(found)]
 
-    def _merge(self, names: Sequence[str], meetings: Sequence[Meeting], remove_dynamic: bool) -> MergeResult:
-        def align(sessions: Sequence[Session]) -> SessionAlignment:
-            return place_sessions(sessions, meetings, self._merging.sessions)
+    def _write_map(self, alignment: SessionAlignment, remove_dynamic: bool) -> None:
+        """The folder of `boxplus map merge`; an earlier one stays whole until this one is, where the store can do that."""
+        names = [session.name for session in alignment.sessions]
+        if remove_dynamic and isinstance(self._store, SharedFolder):
+            folders = [self._store.path / run_of(name) for name in names]
+            merged = merge_runs(
+                folders, self._store.path / MERGED, self._merging,
+                remove_dynamic=True, overwrite=True, align=lambda _: alignment,
+            )  # fmt: skip
+            self._note(map_points=merged.summary.map_points, warnings=merged.summary.warnings)
+            return
+        began, world = time.perf_counter(), alignment.worlds[0]
+        summary = merge_facts(alignment, [self._store / run_of(name) for name in names], [None] * len(names))
+        with self._store.joint_map() as into:
+            self._store.write(f"{into}/config.yaml", dump_merge_config(self._merging).encode())
+            with tempfile.TemporaryDirectory(prefix="boxplus-fleet-") as scratch:
+                table = Path(scratch) / "encounters.csv"
+                write_encounters(table, alignment.meetings, names)
+                self._store.write(f"{into}/{table.name}", table.read_bytes())
+            points = 0
+            if len(world.members) > 1:
+                self._store.remove(PARTS)
+                points = self._write_tiles(into, alignment)
+                self._store.remove(PARTS)
+            seconds = time.perf_counter() - began
+            summary = summary.model_copy(update={"map_points": points, "seconds": seconds})
+            self._store.write(f"{into}/{SUMMARY}", summary.model_dump_json(indent=2).encode())
+        self._note(map_points=points, warnings=summary.warnings)
 
-        folders = [self._folder.run(name) for name in names]
-        return merge_runs(folders, self._folder.merged, self._merging, remove_dynamic=remove_dynamic, overwrite=True, align=align)
+    def _write_tiles(self, into: str, alignment: SessionAlignment) -> int:
+        """Returns how many points there are."""
+        text, config, world = self._store.text, self._merging.map, alignment.worlds[0]
+        cuts = self._all(
+            cut_run,
+            [
+                (text, alignment.sessions[number].name, number, T, into, config)
+                for number, T in zip(world.members, world.T_world_map, strict=True)
+            ],
+        )
+        intensity = all(cut.intensity for cut in cuts)
+        regions: dict[Region, list[int]] = {}
+        for number, cut in zip(world.members, cuts, strict=True):
+            for region in cut.points:
+                regions.setdefault(region, []).append(number)
+        counts = self._all(
+            join_region, [(text, region, numbers, into, config, intensity) for region, numbers in sorted(regions.items())]
+        )
+        with tempfile.TemporaryDirectory(prefix="boxplus-fleet-") as scratch:
+            write_manifest(Path(scratch), Manifest(config.tile_size, config.voxel, intensity, closed=True))
+            self._store.write(f"{into}/map/{MANIFEST}", (Path(scratch) / MANIFEST).read_bytes())
+        if config.ply and isinstance(self._store, SharedFolder):
+            merge(self._store.path / into / "map", [self._store.path / into / "map.ply"])
+        return sum(counts)
+
+    def _all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """The values of tasks none of which may be missing."""
+        found: dict[int, Any] = {}
+        for end in self._executor.run(function, arguments):
+            if end.error is not None:
+                raise OutputError(
+                    f"expected every part of the joint map – got {end.error} ({arguments[end.number][1]}) – "
+                    "the runs are kept: give the same command again"
+                )
+            found[end.number] = end.value
+        return [found[number] for number in range(len(arguments))]
+
+    def _note_alignment(self, meetings: Sequence[Meeting], alignment: SessionAlignment) -> None:
+        """Who is where, and which pairs met by themselves but not in the light of the others."""
+        names = [session.name for session in alignment.sessions]
+        facts = {own.name: own for own in merge_facts(alignment, names, [None] * len(names)).sessions}
+        against = [
+            f"{names[after.query_session]} and {names[after.place_session]}: {after.refusal}"
+            for before, after in zip(meetings, alignment.meetings, strict=True)
+            if before.refusal is None and after.refusal is not None
+        ]
+        for number, own in enumerate(self._rows):
+            if (found := facts.get(own.name)) is not None:
+                known = {"joined": found.joined, "apart_because": found.apart_because}
+                self._rows[number] = own.model_copy(update=known)
+        self._note(contradictions=against, pairs_joined=sum(meeting.refusal is None for meeting in alignment.meetings))

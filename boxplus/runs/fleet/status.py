@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
-from boxplus.formats.output import atomic_file
+from boxplus.runs.fleet.store import Store
 from boxplus.runs.run_facts import Part
+
+STATUS = "fleet.json"
 
 
 class RecordingStatus(Part):
@@ -18,11 +19,13 @@ class RecordingStatus(Part):
     recording: str
     state: Literal["waiting", "finished", "failed"] = "waiting"
     error: str | None = Field(None, description="why it failed")
-    doubt: str | None = Field(None, description="why its result is not to be trusted")
+    doubt: str | None = Field(None, description="why its result is not to be trusted; such a one is left out of the joint map")
     seconds: float = Field(0.0, description="of its task; 0 where it was there already")
     scans: int = 0
     path_length_m: float = 0.0
     loops: int = 0
+    joined: bool = Field(False, description="whether it is in the joint map")
+    apart_because: list[str] = Field(default=[], description="what spoke against joining it with others, where it is not")
 
 
 class FleetStatus(Part):
@@ -34,7 +37,11 @@ class FleetStatus(Part):
     pairs_looked_at: int = 0
     pairs_joined: int = 0
     pairs_failed: list[str] = Field(default=[], description="sentences on pairs whose task failed")
-    joined: list[str] = Field(default=[], description="names of the recordings in the joint map")
+    contradictions: list[str] = Field(
+        default=[], description="pairs that met by themselves, and that the others contradict: one of them is wrong"
+    )
+    map_points: int = Field(0, description="in the joint map; 0 where there is none")
+    warnings: list[str] = Field(default=[], description="of the joint map")
     seconds: float = 0.0
 
     @property
@@ -42,11 +49,27 @@ class FleetStatus(Part):
         """The recordings that did not come to their end."""
         return [recording for recording in self.recordings if recording.state == "failed"]
 
-    def write(self, path: Path) -> None:
+    @property
+    def joined(self) -> list[str]:
+        """Names of the recordings in the joint map."""
+        return [recording.name for recording in self.recordings if recording.joined]
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why not all of the result is to be trusted, in sentences; none where nothing speaks against it."""
+        found = [f"{own.name} failed: {own.error}" for own in self.failed]
+        found += [f"{own.name} is left out of the joint map: {own.doubt}" for own in self.recordings if own.doubt is not None]
+        found += [f"a pair could not be looked at: {text}" for text in self.pairs_failed]
+        found += [f"the recordings contradict each other: {text}" for text in self.contradictions]
+        sound = [own for own in self.recordings if own.state == "finished" and own.doubt is None]
+        if self.stage == "finished" and len(sound) > 1 and not self.joined:
+            found.append("no two of the recordings met: there is no joint map")
+        return found
+
+    def write(self, store: Store) -> None:
         """Replace the file in one step.
 
         Raises:
             OutputError: it cannot be written; the file before stays.
         """
-        with atomic_file(path) as file:
-            file.write(self.model_dump_json(indent=2).encode())
+        store.write(STATUS, self.model_dump_json(indent=2).encode())

@@ -1,76 +1,145 @@
-"""The tasks of a fleet: functions of paths and settings, which may be run anywhere, again, and in any order."""
+"""The tasks of a fleet: functions of the store, names and settings, which may be run anywhere, again, and in any order."""
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
 
 from boxplus.errors import BoxplusError, InputError
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings import open_recording
 from boxplus.runs.fleet.status import RecordingStatus
+from boxplus.runs.fleet.store import Store, open_store
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
-from boxplus.runs.slam.folder import PROGRAM, SlamFolder
+from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.slam_run import run_slam
-from boxplus.runs.slam.summary import SlamSummary, read_slam_summary
-from boxplus.runs.storage.output_folder import program_of
+from boxplus.runs.slam.summary import SlamSummary
+from boxplus.runs.storage.output_folder import SUMMARY
+from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.meeting import meet
 from boxplus.systems.sessions.places import Places
+from boxplus.systems.sessions.session import Session
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.proposals import described
 
+OF_A_SESSION = (SUMMARY, "config.yaml", "local_maps", f"odometry/{SUMMARY}")
+"""What of a run says where its local maps are."""
 
-def run_recording(name: str, recording: str, folder: str, config: SlamRunConfig) -> RecordingStatus:
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunOutline:
+    """A run without its points: small enough for one process to hold those of a whole fleet.
+
+    Attributes:
+        session: its local maps, of no point each.
+        features: what they look like; empty where density images are not asked for.
+    """
+
+    session: Session
+    features: list[Features]
+
+
+def run_of(name: str) -> str:
+    """Where in a store the run of a recording lies."""
+    return f"runs/{name}"
+
+
+def run_recording(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
     """One run of 'boxplus slam', unless it is there already; one that was killed goes on where it can.
 
     What the recording or its run has against it is in the status, not raised: another attempt would find the same.
     """
-    began, own = time.perf_counter(), SlamFolder(Path(folder))
-    if (done := _finished(own, config)) is not None:
+    began, place = time.perf_counter(), open_store(store)
+    if (done := _finished(place, name, config)) is not None:
         return _status(name, recording, done, 0.0)
-    try:
-        with open_recording(recording, config.recording) as opened:
+    with place.writing(run_of(name)) as folder:
+        try:
+            summary = _run(folder, recording, config)
+        except BoxplusError as error:
+            return RecordingStatus(name=name, recording=recording, state="failed", error=str(error), seconds=_since(began))
+    return _status(name, recording, summary, _since(began))
+
+
+def outline_run(store: str, name: str, config: SlamConfig) -> RunOutline:
+    """Where the local maps of a run are, and what they look like."""
+    with open_store(store).reading(run_of(name), OF_A_SESSION) as folder:
+        session = open_session_run(folder, name, needs_scans=False).session
+        maps, features = LocalMapFolder(SlamFolder(folder).local_maps), list[Features]()
+        if config.appearance == "density":
+            features = [described(maps[number], config) for number in range(len(session.maps))]
+    none = np.zeros((0, 3), dtype=np.float32)
+    return RunOutline(replace(session, maps=[replace(own, points=none) for own in session.maps]), features)
+
+
+def meet_runs(store: str, names: tuple[str, str], numbers: tuple[int, int], config: SessionsConfig) -> Meeting:
+    """Whether two runs met, and where; what was found of the same runs before is taken from the store."""
+    place = open_store(store)
+    file, key = f"pairs/{names[0]}/{names[1]}.npz", _key_of_pair(place, names, config)
+    with tempfile.TemporaryDirectory(prefix="boxplus-fleet-") as scratch:
+        kept = Path(scratch) / "meeting.npz"
+        if (before := place.read(file)) is not None:
+            kept.write_bytes(before)
             try:
-                result = run_slam(opened, own.path, config, resume=_is_begun(own, config))
-            except InputError:  # a checkpoint that cannot be taken up, or another run's results
-                result = run_slam(opened, own.path, config, overwrite=True)
-    except BoxplusError as error:
-        return RecordingStatus(name=name, recording=recording, state="failed", error=str(error), seconds=_since(began))
-    return _status(name, recording, result.summary, _since(began))
+                state = read_state(kept)
+            except InputError:  # cut, or by other code, which may find something else
+                state = {}
+            if state.get("key") == key:
+                found: Meeting = state["meeting"]
+                return replace(found, place_session=numbers[0], query_session=numbers[1])
+        places = []
+        for name in names:
+            with place.reading(run_of(name), OF_A_SESSION) as folder:
+                places.append(Places(open_session_run(folder, name, needs_scans=False).session, config.slam))
+        meeting = meet(places[0], places[1], config, numbers)
+        write_state(kept, {"key": key, "meeting": meeting})
+        place.write(file, kept.read_bytes())
+    return meeting
 
 
-def describe_run(folder: str, config: SlamConfig) -> list[Features]:
-    """What the local maps of a run look like."""
-    maps = LocalMapFolder(SlamFolder(Path(folder)).local_maps)
-    return [described(maps[number], config) for number in range(len(maps))]
+def _run(folder: Path, recording: str, config: SlamRunConfig) -> SlamSummary:
+    own = SlamFolder(folder)
+    with open_recording(recording, config.recording) as opened:
+        try:
+            return run_slam(opened, own.path, config, resume=_is_begun(own, config)).summary
+        except InputError:  # a checkpoint that cannot be taken up, or another run's results
+            return run_slam(opened, own.path, config, overwrite=True).summary
 
 
-def meet_runs(folders: tuple[str, str], names: tuple[str, str], numbers: tuple[int, int], config: SessionsConfig) -> Meeting:
-    """Whether two runs met, and where."""
-    place, query = (
-        Places(open_session_run(folder, name).session, config.slam) for folder, name in zip(folders, names, strict=True)
-    )
-    return meet(place, query, config, numbers)
-
-
-def _finished(folder: SlamFolder, config: SlamRunConfig) -> SlamSummary | None:
+def _finished(place: Store, name: str, config: SlamRunConfig) -> SlamSummary | None:
     """The facts of a run with these settings that came to its end."""
-    if not folder.summary.is_file() or program_of(folder.summary) != PROGRAM or not _has_settings(folder, config):
+    facts, settings = (place.read(f"{run_of(name)}/{file}") for file in (SUMMARY, "config.yaml"))
+    if facts is None or settings is None or settings.decode() != dump_slam_config(config):
         return None
-    summary = read_slam_summary(folder.summary)
+    try:
+        summary = SlamSummary.model_validate_json(facts)
+    except ValidationError:
+        return None
     return summary if summary.state == "finished" else None
 
 
 def _is_begun(folder: SlamFolder, config: SlamRunConfig) -> bool:
-    return _has_settings(folder, config) and (folder.odometry.checkpoint.is_file() or folder.odometry_is_finished())
+    if not folder.config.is_file() or folder.config.read_text(encoding="utf-8") != dump_slam_config(config):
+        return False
+    return folder.odometry.checkpoint.is_file() or folder.odometry_is_finished()
 
 
-def _has_settings(folder: SlamFolder, config: SlamRunConfig) -> bool:
-    return folder.config.is_file() and folder.config.read_text(encoding="utf-8") == dump_slam_config(config)
+def _key_of_pair(place: Store, names: tuple[str, str], config: SessionsConfig) -> str:
+    """Changes with the settings, and with every new run of one of the two."""
+    digest = hashlib.sha256(config.model_dump_json().encode())
+    for name in names:
+        digest.update(b"\0" + (place.read(f"{run_of(name)}/local_maps/graph.npz") or b""))
+        digest.update(b"\0" + (place.read(f"{run_of(name)}/{SUMMARY}") or b""))
+    return digest.hexdigest()
 
 
 def _status(name: str, recording: str, summary: SlamSummary, seconds: float) -> RecordingStatus:

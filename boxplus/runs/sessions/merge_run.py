@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +13,19 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError, printable
 from boxplus.formats.clouds.ply import PlyWriter
 from boxplus.formats.output import atomic_file
-from boxplus.formats.trajectory import read_trajectory
-from boxplus.formats.trajectory_writer import TrajectoryWriter
-from boxplus.manifolds import se3
 from boxplus.maps.seen_through import SeenThrough
 from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
-from boxplus.runs.run_loop import versions
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
+from boxplus.runs.sessions.joined import merge_facts, write_session_trajectory
 from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
-from boxplus.runs.sessions.summary import MergeSummary, SessionFacts
+from boxplus.runs.sessions.summary import MergeSummary
 from boxplus.runs.sessions.tables import write_changes, write_encounters
-from boxplus.runs.slam.corrected import append_moved, turned_covariances
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.session import Session
 from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions
-from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]
 Align = Callable[[Sequence[Session]], SessionAlignment]
@@ -82,7 +76,8 @@ def merge_runs(
         sessions = [run.session for run in runs]
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
         world = alignment.worlds[0]
-        summary = _facts(runs, alignment).model_copy(update={"remove_dynamic": remove_dynamic})
+        places, doubts = [printable(str(run.folder.path.resolve())) for run in runs], [run.doubt for run in runs]
+        summary = merge_facts(alignment, places, doubts).model_copy(update={"remove_dynamic": remove_dynamic})
         names = [run.session.name for run in runs]
         with atomic_file(own.config) as file:
             file.write(dump_merge_config(config).encode())
@@ -90,51 +85,11 @@ def merge_runs(
         if len(world.members) > 1:
             update = _write_map(own, runs, world, config, remove_dynamic)
             for number, T in zip(world.members, world.T_world_map, strict=True):
-                _write_trajectory(own, runs[number], T)
+                write_session_trajectory(own.sessions, runs[number], T)
             summary = summary.model_copy(update=update)
         summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
         summary.write(own.summary)
     return MergeResult(summary, alignment)
-
-
-def _facts(runs: Sequence[SessionRun], alignment: SessionAlignment) -> MergeSummary:
-    world = alignment.worlds[0]
-    is_joined = len(world.members) > 1
-    sessions, warnings = [], []
-    for number, run in enumerate(runs):
-        there = is_joined and number in world.members
-        facts = SessionFacts(
-            name=run.session.name,
-            run=printable(str(run.folder.path.resolve())),
-            local_maps=len(run.session.maps),
-            joined=there,
-            apart_because=[] if there else alignment.why_apart(number),
-            doubt=run.doubt,
-        )
-        if there:
-            row = world.members.index(number)
-            T = world.T_world_session[row]
-            rigid = se3.compose(np.broadcast_to(T, run.session.T_session_map.shape), run.session.T_session_map)
-            bend = np.linalg.norm(world.T_world_map[row][:, 4:] - rigid[:, 4:], axis=1).max()
-            sigma = np.sqrt(np.diag(world.covariance[row]))
-            facts = facts.model_copy(
-                update={"T_world_session": T.tolist(), "sigma": sigma.tolist(), "largest_bend_m": float(bend)}
-            )
-        sessions.append(facts)
-        if run.doubt is not None:
-            warnings.append(f"{run.session.name} is not to be trusted itself: {run.doubt}")
-    for other in alignment.worlds[1:]:
-        if is_joined and len(other.members) > 1:
-            them = " and ".join(runs[k].session.name for k in other.members)
-            warnings.append(f"{them} met each other but none of the others: merge them by themselves")
-    return MergeSummary(
-        versions=versions("opencv-python-headless"),
-        created=datetime.now(UTC),
-        sessions=sessions,
-        encounters_looked_at=sum(len(meeting.encounters) for meeting in alignment.meetings),
-        encounters_accepted=sum(len(meeting.accepted) for meeting in alignment.meetings),
-        warnings=warnings,
-    )
 
 
 def _write_map(
@@ -192,13 +147,3 @@ def _thinned(parts: Sequence[NDArray[np.float32]], edge: float) -> NDArray[np.fl
 
 def _has_intensity(run: SessionRun, T: Floats) -> bool:
     return next((scan.intensity is not None for scan in run.scans(T)), True)
-
-
-def _write_trajectory(own: MergeFolder, run: SessionRun, T_world_map: Floats) -> None:
-    """A session's trajectory in the joint world; its covariance is that of the session, against its own first pose."""
-    before = read_trajectory(run.folder.trajectory)
-    poses = Correction(run.correction.time_ns, run.correction.T_map, T_world_map).apply(
-        before.times, np.hstack([before.q_wxyz, before.p])
-    )
-    with TrajectoryWriter(own.sessions, run.session.name) as writer:
-        append_moved(writer, before, poses, turned_covariances(before, poses))

@@ -90,8 +90,11 @@ class SessionRun:
             yield np.concatenate(origins), np.concatenate(ends)
 
 
-def open_session_run(folder: str | Path, name: str) -> SessionRun:
+def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True) -> SessionRun:
     """Open the output folder of a run as a session of a name.
+
+    Args:
+        needs_scans: for the joint map; without them its local maps alone are looked at.
 
     Raises:
         InputError: not a run of 'boxplus slam', one that did not come to its end, or one that kept no scans.
@@ -103,7 +106,7 @@ def open_session_run(folder: str | Path, name: str) -> SessionRun:
     summary = read_slam_summary(own.summary)
     if summary.state != "finished":
         raise InputError("a run that came to its end", f"{own.path}: {summary.describe_state()}", "go on with it: --resume")
-    if not own.spool.is_file():
+    if needs_scans and not own.spool.is_file():
         raise InputError("a run that kept its scans", f"no {own.spool.name} in {own.path}", _ADVICE)
     stored, outcome = LocalMapFolder(own.local_maps), read_graph(own.graph)
     placed = outcome.placed  # in the frame of its trajectory and map, which is the Earth's where it was laid onto it

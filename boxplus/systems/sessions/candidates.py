@@ -37,19 +37,26 @@ def candidate_pairs(
     """
     index = PlaceIndex(config)
     owner = np.repeat(np.arange(len(descriptions)), [len(own) for own in descriptions])
+    score = np.zeros(len(descriptions), dtype=np.int64)  # of the session at hand; few entries are touched
     for own in descriptions:
         for features in own:
             index.add(features)
     found: set[tuple[int, int]] = set()
     for number, own in enumerate(descriptions):
-        score = np.zeros(len(descriptions), dtype=np.int64)
+        alike = []
         for features in own:
-            votes = index.votes(features)
-            best = np.zeros(len(descriptions), dtype=np.int64)
-            np.maximum.at(best, owner, votes)
-            score += np.where(best >= _LEAST_VOTES, best, 0)
+            places, votes = index.votes(features)
+            many = votes >= _LEAST_VOTES
+            others, first = np.unique(owner[places[many]], return_index=True)  # places of a session follow each other
+            if len(others):
+                score[others] += np.maximum.reduceat(votes[many], first)
+                alike.append(others)
+        if not alike:
+            continue
         score[number] = 0
-        for other in np.argsort(-score, kind="stable")[:per_session].tolist():
+        others = np.unique(np.concatenate(alike))
+        for other in others[np.argsort(-score[others], kind="stable")[:per_session]].tolist():
             if score[other] > 0:
                 found.add((min(number, other), max(number, other)))
+        score[others] = 0
     return sorted(found)

@@ -129,14 +129,12 @@ class _Anchors:
 
     def __init__(self, count: int) -> None:
         self.root = list(range(count))
+        self._members = {number: [number] for number in range(count)}
         self.T = [_START] * count
         self.covariance = [np.zeros((6, 6))] * count
 
     def groups(self) -> list[tuple[int, ...]]:
-        found: dict[int, list[int]] = {}
-        for number, root in enumerate(self.root):
-            found.setdefault(root, []).append(number)
-        return [tuple(members) for members in found.values()]
+        return [tuple(sorted(members)) for members in self._members.values()]
 
     def between(self, a: int, b: int) -> tuple[Floats, Floats]:
         """T_a_b of two sessions of one root, and its covariance, as if both had been placed independently."""
@@ -147,7 +145,8 @@ class _Anchors:
     def unite(self, a: int, b: int, T_a_b: Floats, covariance: Floats) -> None:
         """Move all that b is joined with to a's root."""
         root, old = self.root[a], self.root[b]
-        members = [k for k, own in enumerate(self.root) if own == old]
+        members = self._members.pop(old)
+        self._members[root] += members
         moved = {}
         for k in members:
             T_b_k, S_b_k = self.between(b, k) if k != b else (_START, np.zeros((6, 6)))

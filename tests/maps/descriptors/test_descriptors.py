@@ -124,13 +124,16 @@ def test_votes_are_brute_force_where_bits_agree(random_seed: int = 5) -> None:
         index.add(place)
     assert len(index) == 120
     query = Features(np.concatenate([places[3].xy, places[70].xy[:40]]), np.concatenate([places[3].bits, places[70].bits[:40]]))
-    votes = index.votes(query)
+    found = index.votes(query)
     near = np.zeros(120, dtype=int)
     for k, place in enumerate(places):
         differing = np.array([[np.bitwise_count(p ^ q).sum() for q in place.bits] for p in query.bits[::10]])
         near[k] = np.count_nonzero((differing <= config.max_distance).any(axis=1))
-    assert votes[3] == 90 and votes[70] == 40
-    assert (near[np.setdiff1d(np.arange(120), [3, 70])] == 0).all() and votes.sum() == 130
+    assert [values.tolist() for values in found] == [[3, 70], [90, 40]]
+    assert (near[np.setdiff1d(np.arange(120), [3, 70])] == 0).all() and near[3] and near[70]
+    assert [values.tolist() for values in index.votes(query)] == [[3, 70], [90, 40]]  # a query leaves no trace
+    assert [values.tolist() for values in index.votes(places[70])] == [[70], [90]]
+    assert [values.tolist() for values in index.votes(query, before=70)] == [[3], [90]]
     assert [c.place for c in index.candidates(query)] == [3, 70]
     assert [c.place for c in index.candidates(query, before=70)] == [3]
     assert index.candidates(query, before=0) == []

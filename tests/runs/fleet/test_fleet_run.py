@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,12 +15,16 @@ import pytest
 
 from boxplus.errors import InputError
 from boxplus.maps.descriptors.features import Features
+from boxplus.maps.tiles.store import TileStore
 from boxplus.runs.fleet import fleet_run, tasks
 from boxplus.runs.fleet.executor import InProcess, RayExecutor, TaskEnd
-from boxplus.runs.fleet.fleet_run import FleetFolder, run_fleet
+from boxplus.runs.fleet.fleet_run import run_fleet
 from boxplus.runs.fleet.recordings import find_recordings, holds_recordings
 from boxplus.runs.fleet.status import RecordingStatus
+from boxplus.runs.fleet.store import open_store
 from boxplus.runs.sessions.config import MergeConfig
+from boxplus.runs.sessions.merge_run import merge_runs
+from boxplus.runs.sessions.summary import read_merge_summary
 from boxplus.runs.settings_file import load_settings
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import SlamFolder
@@ -26,22 +32,28 @@ from boxplus.runs.slam.summary import SlamSummary
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.sessions.candidates import candidate_pairs
+from boxplus.systems.sessions.config import SessionsConfig
+from boxplus.systems.sessions.encounter import Meeting
+from boxplus.systems.sessions.meeting import meet
+from boxplus.systems.sessions.sessions import place_sessions
 from tests.runs.sessions.runs import written_run
 
 DRIFT = DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
 QUICK = ["sessions.slam={least_overlap: 0.6, rival_fit: 0.85, descriptor: {candidates: 2}}", "map.voxel=0.2"]
+OBJECTS = "memory://fleet"
 ROUTES = {
     "monday": [[0.0, 0.0], [60.0, 0.0], [60.0, 40.0]],
     "friday": [[60.0, 50.0], [60.0, 0.0], [10.0, 0.0]],
 }
 
 
-def drive(name: str, recording: str, folder: str, config: SlamRunConfig) -> RecordingStatus:
+def drive(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
     """In place of the odometry: a folder as it leaves one, or what a recording that cannot be read gets."""
     del config
     if name not in ROUTES:
         return RecordingStatus(name=name, recording=recording, state="failed", error="expected a bag – got none – look for it")
-    written_run(Path(folder), city(2, 2, seed=5), ROUTES[name], DRIFT, seed=len(name) + len(recording) % 2)
+    with open_store(store).writing(f"runs/{name}") as folder:
+        written_run(folder, city(2, 2, seed=5), ROUTES[name], DRIFT, seed=len(name) + len(recording) % 2)
     return RecordingStatus(name=name, recording=recording, state="finished", scans=50)
 
 
@@ -67,42 +79,144 @@ def merging() -> MergeConfig:
 def test_recordings_that_met_are_joined_and_failed_ones_named(
     tmp_path: Path, merging: MergeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    met: dict[tuple[str, str], Any] = {}
+    looked_at = []
 
-    def meet_once(folders: Any, names: tuple[str, str], numbers: Any, config: Any) -> Any:
-        """The same two drives meet in every fleet here."""
-        if names not in met:
-            met[names] = tasks.meet_runs(folders, names, numbers, config)
-        return met[names]
+    def meet_once(place: Any, query: Any, config: Any, numbers: Any) -> Meeting:
+        looked_at.append(numbers)
+        return meet(place, query, config, numbers)
 
     monkeypatch.setattr(fleet_run, "run_recording", drive)
-    monkeypatch.setattr(fleet_run, "meet_runs", meet_once)
+    monkeypatch.setattr(tasks, "meet", meet_once)
     recordings = {name: Path(name) for name in ("friday", "broken", "monday")}
     stages = []
-    status = run_fleet(recordings, tmp_path / "a", InProcess(), None, merging, report=lambda s: stages.append(s.stage))
+    status = run_fleet(recordings, tmp_path / "a", InProcess(), None, merging, report=lambda s, _: stages.append(s.stage))
     assert status.joined == ["friday", "monday"] and status.pairs_joined == status.pairs_looked_at == 1
     assert [own.name for own in status.failed] == ["broken"] and "look for it" in str(status.failed[0].error)
+    assert status.doubts == [f"broken failed: {status.failed[0].error}"]
     assert stages == sorted(stages, key=["recordings", "pairs", "map", "finished"].index)
-    assert json.loads((tmp_path / "a" / "fleet.json").read_text())["stage"] == "finished"
-    # The order in which tasks end changes nothing.
+    written = json.loads((tmp_path / "a" / "fleet.json").read_text())
+    assert written["stage"] == "finished" and [own["joined"] for own in written["recordings"]] == [True, False, True]
+    merged = tmp_path / "a" / "merged"
+    assert read_merge_summary(merged / "run.json").map_points == status.map_points == TileStore.open(merged / "map").point_count
+    assert not (tmp_path / "a" / "map_parts").exists()
+    # The map is that of 'boxplus map merge', which one process writes.
+    shutil.copytree(tmp_path / "a" / "runs", tmp_path / "b" / "runs")
+    shutil.copytree(tmp_path / "a" / "pairs", tmp_path / "b" / "pairs")
+    meeting = tasks.meet_runs(str(tmp_path / "a"), ("friday", "monday"), (0, 1), merging.sessions)
+    runs = [tmp_path / "a" / "runs" / name for name in ("friday", "monday")]
+    merge_runs(runs, tmp_path / "whole", merging, align=lambda own: place_sessions(own, [meeting], merging.sessions))
+    names = ["map.ply", "encounters.csv", *(f"sessions/{name}.csv" for name in ("friday", "monday"))]
+    assert [(merged / name).read_bytes() for name in names] == [(tmp_path / "whole" / name).read_bytes() for name in names]
+    # The order in which tasks end changes nothing, and pairs that were looked at are not looked at again.
+    assert looked_at == [(0, 1)]
+    monkeypatch.setattr(fleet_run, "run_recording", lambda _, name, recording, config: found[name])
+    found = {own.name: own for own in status.recordings}
     run_fleet(recordings, tmp_path / "b", Backwards(), None, merging)
-    first, second = (FleetFolder(tmp_path / name).merged for name in "ab")
-    assert (first / "map.ply").read_bytes() == (second / "map.ply").read_bytes()
-    assert (first / "encounters.csv").read_bytes() == (second / "encounters.csv").read_bytes()
+    files = sorted(path.relative_to(merged) for path in merged.rglob("*") if path.is_file() and path.name != "run.json")
+    assert len(files) > 8
+    assert all((merged / file).read_bytes() == (tmp_path / "b" / "merged" / file).read_bytes() for file in files)
+    # Nor does an object store, which has no merged file.
+    for file in (tmp_path / "a").rglob("*"):
+        if file.is_file() and file.relative_to(tmp_path / "a").parts[0] in ("runs", "pairs"):
+            open_store(OBJECTS).write(file.relative_to(tmp_path / "a").as_posix(), file.read_bytes())
+    again = run_fleet(recordings, OBJECTS, InProcess(), None, merging)
+    assert again.joined == status.joined and looked_at == [(0, 1)]
+    stored = open_store(OBJECTS)
+    assert all(
+        stored.read(f"merged/{file.as_posix()}") == (merged / file).read_bytes() for file in files if file.name != "map.ply"
+    )
+    with pytest.raises(InputError, match="a folder, to remove what was seen through – got memory"):
+        run_fleet(recordings, OBJECTS, InProcess(), remove_dynamic=True)
     # A pair whose task is lost is said to be, and is not joined.
     lost = run_fleet(recordings, tmp_path / "b", Backwards(lost=0), None, merging)
     assert lost.joined == [] and lost.pairs_failed == ["friday and monday: lost 4 times: the worker died"]
+    assert "no two of the recordings met: there is no joint map" in lost.doubts
+
+    # Nor one that the others contradict.
+    def contradicted(*given: Any) -> Any:
+        refused = place_sessions(given[0], [Meeting(0, 1, [], refusal="lies 9 standard deviations away")], given[2])
+        return refused
+
+    monkeypatch.setattr(fleet_run, "place_sessions", contradicted)
+    doubted = run_fleet(recordings, tmp_path / "b", InProcess(), None, merging)
+    assert doubted.contradictions == ["monday and friday: lies 9 standard deviations away"]
+    assert "the recordings contradict each other: monday and friday: lies 9 standard deviations away" in doubted.doubts
+
+
+def test_what_is_not_to_be_trusted_is_left_out_of_the_joint_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
+        open_store(store).write(f"runs/{name}/run.json", b"{}")
+        return RecordingStatus(
+            name=name, recording=recording, state="finished", doubt="the sensors differ" if name == "b" else None
+        )
+
+    monkeypatch.setattr(fleet_run, "run_recording", run)
+    open_store(tmp_path).write("merged/run.json", b"{}")
+    status = run_fleet({"a": Path("a"), "b": Path("b")}, tmp_path, InProcess())
+    assert status.joined == [] and status.doubts == ["b is left out of the joint map: the sensors differ"]
+    assert "is of an earlier fleet" in status.warnings[0]
+
+
+def test_workers_that_write_to_a_place_of_their_own_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def elsewhere(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
+        return RecordingStatus(name=name, recording=recording, state="finished")
+
+    monkeypatch.setattr(fleet_run, "run_recording", elsewhere)
+    with pytest.raises(InputError, match="a place for the results that all workers share – got memory://elsewhere, where"):
+        run_fleet({"a": Path("a"), "b": Path("b")}, "memory://elsewhere", InProcess())
+
+
+def test_a_run_whose_local_maps_are_damaged_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
+        open_store(store).write(f"runs/{name}/run.json", b"{}")
+        return RecordingStatus(name=name, recording=recording, state="finished")
+
+    monkeypatch.setattr(fleet_run, "run_recording", damaged)
+    status = run_fleet({"a": Path("a"), "b": Path("b")}, tmp_path, InProcess())
+    assert [own.name for own in status.failed] == ["a", "b"]
+    assert all(
+        text.startswith(f"{name} failed: its local maps: InputError") for name, text in zip("ab", status.doubts, strict=True)
+    )
+
+
+def test_a_pair_is_looked_at_again_after_a_new_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def found(place: Any, query: Any, config: Any, numbers: tuple[int, int]) -> Meeting:
+        calls.append(numbers)
+        return Meeting(*numbers, [], np.arange(7.0), np.eye(6), 3, 2)
+
+    monkeypatch.setattr(tasks, "Places", lambda *_: None)
+    monkeypatch.setattr(tasks, "open_session_run", lambda *_, **__: SimpleNamespace(session=None))
+    monkeypatch.setattr(tasks, "meet", found)
+    store, config = open_store(tmp_path), MergeConfig().sessions
+
+    def meeting(numbers: tuple[int, int], own: SessionsConfig = config) -> Meeting:
+        return tasks.meet_runs(store.text, ("a", "b"), numbers, own)
+
+    first, second = meeting((0, 1)), meeting((3, 7))
+    assert calls == [(0, 1)] and (second.place_session, second.query_session) == (3, 7)
+    assert np.array_equal(first.T_place_query, second.T_place_query) and second.confirmed == 2
+    store.write("runs/a/local_maps/graph.npz", b"another")
+    meeting((0, 1))
+    meeting((0, 1), config.model_copy(update={"reach": 10.0}))
+    assert len(calls) == 3
+    store.write("pairs/a/b.npz", b"cut")
+    meeting((0, 1))
+    assert len(calls) == 4
 
 
 def test_a_recording_that_is_finished_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config, folder = SlamRunConfig(), SlamFolder(tmp_path)
+    store = tmp_path / "fleet"
+    config, folder = SlamRunConfig(), SlamFolder(store / "runs" / "r")
+    folder.path.mkdir(parents=True)
     now = datetime(2026, 1, 1, tzinfo=UTC)
     SlamSummary(versions={}, state="finished", started=now, updated=now, recording="r", scans=7).write(folder.summary)
     folder.config.write_text(dump_slam_config(config), encoding="utf-8")
-    status = tasks.run_recording("r", str(tmp_path / "none.bag"), str(tmp_path), config)
+    status = tasks.run_recording(str(store), "r", str(tmp_path / "none.bag"), config)
     assert (status.state, status.scans, status.seconds) == ("finished", 7, 0.0)
     folder.config.write_text("other settings", encoding="utf-8")
-    again = tasks.run_recording("r", str(tmp_path / "none.bag"), str(tmp_path), config)
+    again = tasks.run_recording(str(store), "r", str(tmp_path / "none.bag"), config)
     assert again.state == "failed" and "check the path" in str(again.error)
 
 
