@@ -18,6 +18,7 @@ from boxplus.manifolds import quaternion, so3
 _W_LAST = [1, 2, 3, 0]  # takes for (w, x, y, z) what was read as (x, y, z, w)
 _FAR_DEG = 10.0  # scatter of the orientations' differences that no estimate of these positions has
 _CLEARLY = 0.2  # times the error as read, that of another reading has to reach
+_AS_GOOD = 1.5  # times the error of the better one of two readings, up to which either may be meant
 _SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from 1, from which on a scale is told
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
@@ -106,6 +107,7 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
 def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
     if alignment.kind not in ("se3", "sim3", "yaw"):
         return
+    errors = {}
     for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
         p = -np.einsum("nba,nb->na", one.R, one.p)
         try:
@@ -113,16 +115,25 @@ def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignm
         except InputError:
             continue
         moved = found.apply(replace(one, p=p, covariance=None, lines=None)).p
-        error = rms(np.linalg.norm(moved - other.p, axis=1))
-        if error < _CLEARLY * rmse:
-            yield (
-                f"the poses of the {name} seem to be those of the world in the body: inverted, the ATE is {error:.4g} m instead "
-                f"of {rmse:.4g} m"
-            )
+        errors[name] = rms(np.linalg.norm(moved - other.p, axis=1))
+    clear = sorted((error, name) for name, error in errors.items() if error < _CLEARLY * rmse)
+    if not clear:
+        return
+    if len(clear) == 2 and clear[1][0] < _AS_GOOD * clear[0][0]:  # undoing either undoes what the other one does
+        yield (
+            f"the poses of one of the files seem to be those of the world in the body: the ATE is "
+            f"{errors['estimate']:.4g} m with the estimate inverted, {errors['ground truth']:.4g} m with the ground truth inverted, instead of {rmse:.4g} m"
+        )
+        return
+    error, name = clear[0]
+    yield (
+        f"the poses of the {name} seem to be those of the world in the body: inverted, the ATE is {error:.4g} m instead of "
+        f"{rmse:.4g} m"
+    )
 
 
 def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Iterator[str]:
-    if alignment.kind != "se3":
+    if alignment.kind == "sim3":
         return
     try:
         rigid, found = align(estimate.p, truth.p), align(estimate.p, truth.p, "sim3")
@@ -131,8 +142,8 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     rmse, error = (rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
     if error < min(_SCALED * rmse, _FITS * rigid.spread_m[0]) and abs(found.scale - 1.0) > _SCALE:
         yield (
-            f"{found.scale:.4g} times as large the estimate has an ATE of {error:.4g} m instead of {rmse:.4g} m: a wrong scale "
-            "is most of its error (--align sim3, for an estimate that has none)"
+            f"{found.scale:.4g} times as large the estimate has, rigidly aligned, an ATE of {error:.4g} m instead of {rmse:.4g} m: "
+            "a wrong scale is most of its error (--align sim3, for an estimate that has none)"
         )
 
 
