@@ -121,8 +121,8 @@ def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignm
         return
     if len(clear) == 2 and clear[1][0] < _AS_GOOD * clear[0][0]:  # undoing either undoes what the other one does
         yield (
-            f"the poses of one of the files seem to be those of the world in the body: the ATE is "
-            f"{errors['estimate']:.4g} m with the estimate inverted, {errors['ground truth']:.4g} m with the ground truth inverted, instead of {rmse:.4g} m"
+            f"the poses of one of the files seem to be those of the world in the body: the ATE is {errors['estimate']:.4g} m "
+            f"with the estimate inverted, {errors['ground truth']:.4g} m with the ground truth, instead of {rmse:.4g} m"
         )
         return
     error, name = clear[0]
@@ -142,8 +142,8 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     rmse, error = (rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
     if error < min(_SCALED * rmse, _FITS * rigid.spread_m[0]) and abs(found.scale - 1.0) > _SCALE:
         yield (
-            f"{found.scale:.4g} times as large the estimate has, rigidly aligned, an ATE of {error:.4g} m instead of {rmse:.4g} m: "
-            "a wrong scale is most of its error (--align sim3, for an estimate that has none)"
+            f"{found.scale:.4g} times as large the estimate has, rigidly aligned, an ATE of {error:.4g} m instead of {rmse:.4g} "
+            "m: a wrong scale is most of its error (--align sim3, for an estimate that has none)"
         )
 
 

@@ -130,7 +130,7 @@ def adjust_bundle(
     notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
     seen = np.unique(point_of)
     notes += mirror_notes(reconstruction.points[seen], adjusted.points[seen])
-    notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution.cost, left)
+    notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
     contradicted = sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     return BundleAdjustmentResult(
         reconstruction=adjusted,

@@ -14,10 +14,11 @@ from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
+from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 
-_STEPS = 5
+_STEPS, _LEAST_S = 5, 1.0
 _CHANCE = 15.0  # of the cost of a number that explains noise, by which chance does not lower it
 _CHANGED = 0.01  # of the focal length; less is what calibrations differ by
 
@@ -28,24 +29,29 @@ def lens_notes(
     dropped: NDArray[np.int64],
     config: BundleAdjustmentConfig,
     loss: Loss | None,
-    cost: float,
+    solved: Solution,
     left: int,
 ) -> list[str]:
     """A sentence where other focal lengths than those that were held explain the images clearly better.
 
     Args:
-        adjusted: where bundle adjustment ended, at `cost`.
+        adjusted: where bundle adjustment ended, as `solved` tells; only a minimum is examined.
         used: (k,) observations that were adjusted. dropped: points that were not.
         left: measurements less unknowns.
     """
+    cost, time_s = solved.cost, solved.history[-1].time_s
     if not isinstance(adjusted, ColmapModel) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
+        return []
+    # Who stopped the adjustment does not wait for more of it, and an examination takes no longer than what is examined.
+    limit_s = max(time_s, _LEAST_S) if config.solver.time_limit_s is None else config.solver.time_limit_s - time_s
+    if solved.status != "converged" or not limit_s > 0.0:
         return []
     free = config.model_copy(update={"intrinsics": "refined"})
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
     problem.fix(points[dropped])
     try:
-        solution = problem.solve(config.solver.model_copy(update={"max_iterations": _STEPS}))
+        solution = problem.solve(config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": limit_s}))
     except BoxplusError:
         return []
     # As in an F-test; the noise as the errors have it, not as sigma says.

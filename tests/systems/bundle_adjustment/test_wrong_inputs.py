@@ -219,6 +219,15 @@ def test_a_wrong_focal_length_that_is_held_is_told(wrong):
         assert not [note for note in adjust_bundle(reconstruction(seed, "colmap")).notes if "intrinsics" in note]
 
 
+def test_an_adjustment_that_was_stopped_is_not_examined_further():
+    """No second solve after Ctrl-C or a time limit; what it would tell of a focal length waits for the minimum."""
+    start = reconstruction(68, "colmap")
+    start = replace(start, camera_params=(start.camera_params[0] * [0.8, 0.8, 1.0, 1.0],))
+    stopped = adjust_bundle(start, callback=lambda iteration: iteration.number >= 4)
+    assert stopped.solution.status == "stopped"
+    assert not [note for note in stopped.notes if "other intrinsics" in note]
+
+
 def test_few_wrong_matches_without_a_robust_loss_are_told():
     start = reconstruction(69, "gbp")
     pixels = start.pixels.copy()
