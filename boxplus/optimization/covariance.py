@@ -34,8 +34,11 @@ class Covariances:
         self._space: NullSpace | None = None
         self._is_factorized = False
 
-    def blocks(self, first: VariableRows, second: VariableRows) -> NDArray[np.float64]:
+    def blocks(self, first: VariableRows, second: VariableRows, is_determined: bool = False) -> NDArray[np.float64]:
         """Blocks (k, dof of first, dof of second) of H⁻¹ for pairs of variables; zero where one of them is fixed.
+
+        Args:
+            is_determined: no direction is free, and none is looked for.
 
         Raises:
             InputError: `first` and `second` differ in length.
@@ -45,7 +48,7 @@ class Covariances:
             raise InputError("as many second variables as first ones", f"{len(first)} and {len(second)}", "pair them")
         i, j = self._problem.layout.numbers(first), self._problem.layout.numbers(second)
         free = np.flatnonzero((i >= 0) & (j >= 0))
-        self._prepare(np.concatenate([i[free], j[free]]))
+        self._prepare(np.concatenate([i[free], j[free]]), is_determined)
         blocks = np.zeros((len(first), first.block.manifold.dof, second.block.manifold.dof))
         for k, block in zip(free, self._problem.system.inverse_blocks(i[free], j[free]), strict=True):
             blocks[k] = block
@@ -65,6 +68,34 @@ class Covariances:
     def _to_own(self, rows: VariableRows) -> NDArray[np.float64] | None:
         number = rows.block.number
         return to_own_tangent(self._problem.layout, number, self._values[number][self._problem.layout.rows(rows)])
+
+    def response(self, slopes: Sequence[NDArray[np.float64]], is_determined: bool = False) -> list[NDArray[np.float64]]:
+        """H⁻¹ g for a gradient g with (n, dof) of every block; zero where fixed or held.
+
+        Args:
+            is_determined: no direction is free, and none is looked for.
+
+        Raises:
+            SingularProblemError: an unobservable direction moves a variable.
+        """
+        layout = self._problem.layout
+        self._prepare(np.arange(len(layout.sizes)), is_determined)
+        g, changes = np.zeros(layout.dof), []
+        for block, own, number in zip(layout.blocks, slopes, layout.number, strict=True):
+            rows = block[block.ids[number >= 0]]
+            change, moving = self._to_own(rows), self._moving(rows)
+            part = own[number >= 0] * moving
+            at = layout.start[number[number >= 0], None] + np.arange(block.manifold.dof)
+            g[at] = part if change is None else np.einsum("nij,ni->nj", change, part)
+            changes.append((change, moving, at))
+        delta = self._problem.system.solve(g)
+        moved = []
+        for own, number, (change, moving, at) in zip(slopes, layout.number, changes, strict=True):
+            step = np.zeros(np.shape(own))
+            part = delta[at] if change is None else np.einsum("nij,nj->ni", change, delta[at])
+            step[number >= 0] = part * moving
+            moved.append(step)
+        return moved
 
     def joint(self, selected: Sequence[VariableRows], is_determined: bool = False) -> NDArray[np.float64]:
         """The covariance (D, D) of all selected variables together, tangent after tangent in the order given.

@@ -125,7 +125,13 @@ class Solution:
         """Steps tried."""
         return self.history[-1].number
 
-    def covariance(self, first: VariableRows | Variables, second: VariableRows | Variables | None = None) -> NDArray[np.float64]:
+    def covariance(
+        self,
+        first: VariableRows | Variables,
+        second: VariableRows | Variables | None = None,
+        *,
+        is_determined: bool = False,
+    ) -> NDArray[np.float64]:
         """Covariance of variables in their tangents at the solution, in the units of the tangents.
 
         The first call costs about two factorisations, many variables together about three more; what was computed is kept.
@@ -133,6 +139,7 @@ class Solution:
         Args:
             first: k variables.
             second: k variables, for the cross-covariances of first[n] and second[n]; None for `first` itself.
+            is_determined: the problem determines all of its variables, which is then not looked into, and saves half of the time.
 
         Returns:
             (k, dof, dof) blocks of H⁻¹, the losses' weights included. A fixed variable has covariance zero: it is known.
@@ -141,7 +148,7 @@ class Solution:
             SingularProblemError: an unobservable direction of the problem moves one of these variables.
         """
         rows = self._own(first)
-        return self._covariances.blocks(rows, rows if second is None else self._own(second))
+        return self._covariances.blocks(rows, rows if second is None else self._own(second), is_determined)
 
     def joint_covariance(self, *selected: VariableRows | Variables, is_determined: bool = False) -> NDArray[np.float64]:
         """Covariance (D, D) of all selected variables together, their tangents one after the other in the order given.
@@ -154,6 +161,25 @@ class Solution:
             InputError, SingularProblemError: as for `covariance`; with `is_determined` where H is singular to rounding.
         """
         return self._covariances.joint([self._own(rows) for rows in selected], is_determined)
+
+    def response(self, slopes: Sequence[NDArray[np.float64]], *, is_determined: bool = False) -> list[NDArray[np.float64]]:
+        """How far a change of the residuals moves the variables, to first order: H⁻¹ g, in the units of the tangents.
+
+        Args:
+            slopes: g for every block (n, dof): Jᵀ Δr of whitened residuals that change by −Δr.
+            is_determined: as for `covariance`.
+
+        Raises:
+            SingularProblemError: an unobservable direction of the problem moves a variable.
+
+        Example:
+            >>> problem = bp.Problem()
+            >>> x = problem.add_variables(bp.Euclidean(1), [0.0])
+            >>> group = problem.add_residuals(bp.residuals.Prior(bp.Euclidean(1), [2.0], sigma=0.5), x)
+            >>> problem.solve().response([np.array([[4.0]])])[0]
+            array([[1.]])
+        """
+        return self._covariances.response(slopes, is_determined)
 
     def standard_deviations(self, selected: VariableRows | Variables) -> NDArray[np.float64]:
         """Square roots (k, dof) of the diagonals of `covariance`, in the units of the tangents; zero where fixed.

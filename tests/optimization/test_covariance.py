@@ -48,6 +48,20 @@ def test_where_all_is_determined_the_search_for_free_directions_may_be_left_out(
     np.testing.assert_allclose(quick, solution.joint_covariance(*selected), rtol=1e-9, atol=1e-14)
 
 
+@pytest.mark.parametrize("linear_solver", SOLVERS)
+@pytest.mark.parametrize("is_determined", [False, True])
+def test_the_response_to_slopes_is_the_inverse_times_them(linear_solver, is_determined):
+    scene = make_scene(points=12)
+    solution = scene.problem.solve(linear_solver=linear_solver, examine=False)
+    rng = np.random.default_rng(0)
+    slopes = [rng.normal(size=(len(block), block.manifold.dof)) for block in scene.problem.blocks]
+    moved = solution.response(slopes, is_determined=is_determined)
+    free = np.concatenate([~block.is_fixed.repeat(block.manifold.dof) for block in scene.problem.blocks])
+    expected = np.zeros(len(free))
+    expected[free] = inverse_of(scene.problem, solution) @ np.concatenate([g.ravel() for g in slopes])[free]
+    np.testing.assert_allclose(np.concatenate([m.ravel() for m in moved]), expected, rtol=1e-6, atol=1e-9)
+
+
 def test_what_is_not_determined_is_said_whatever_was_promised():
     problem = Problem()
     free = problem.add_variables(Euclidean(2), np.zeros((1, 2)))

@@ -220,6 +220,10 @@ def _convention(graph: PoseGraph, config: PoseGraphConfig, loss: Loss | None, re
     return f"{text}; rotation information of the file taken for {taken}, its cross block read as {reading['cross_block']}"
 
 
+def _fit(result: PoseGraphResult) -> str:
+    return result.fit.sentence if result.checks is None or result.fit.dof == 0 else f"{result.fit.sentence}; {result.checks}"
+
+
 def _summary(
     file: Path,
     output: str,
@@ -249,7 +253,7 @@ def _summary(
         start=result.start_reason,
         chi2_initial=float((result.errors_before**2).sum()),
         chi2=result.chi2,
-        fit=result.fit.sentence if config.objective == "logarithm" else None,
+        fit=_fit(result) if config.objective == "logarithm" else None,
         errors_initial=ErrorFacts.of(result.errors_before),
         errors=ErrorFacts.of(result.errors),
         loops=None if result.loops is None else result.loops.report.sentence("loop closures"),

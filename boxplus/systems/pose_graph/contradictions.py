@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_quantile, chi_square_sf
 from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.systems.pose_graph.arms import find_arms
 from boxplus.systems.pose_graph.bridges import Bridge
 from boxplus.systems.pose_graph.consensus import Crossings
 from boxplus.systems.pose_graph.doubts import pose_names
@@ -18,13 +19,13 @@ from boxplus.systems.pose_graph.start import components
 
 _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as that
 _WIDTHS = (1, 3, 10, 30)  # steps that a slip is spread over
-_ALONE = 0.1  # share of the odometry that no kept loop closure checks, from which on that is told
+_ALONE = 0.1  # share of the poses that no kept loop closure checks, from which on that is told; of loop closures that are few
 _WITNESSES = 3  # loop closures that agree with each other by more than chance
 _OBJECTING = 2  # loop closures that may have been kept by chance, or bent; more of them confirm the odometry
 
 
-def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]) -> list[str]:
-    """A sentence on each; none where nothing speaks against the verdict.
+def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]) -> tuple[list[str], list[str]]:
+    """Sentences to note, and sentences for which the result is not to be trusted.
 
     Args:
         bridges: loop closures that were believed beforehand.
@@ -42,28 +43,41 @@ def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]
             f"the edges that were kept leave {len(alone)} pieces tied to nothing, with poses {pose_names(graph, alone)}: where "
             "these lie is not known"
         )
-    return [*said, *(text for text in (_bent(graph, verdict), _slip(graph, verdict)) if text)]
-
-
-def unconfirmed_notes(graph: PoseGraph, verdict: LoopVerdict) -> list[str]:
-    """A sentence where a good part of the odometry is spanned by refused loop closures and by none that was kept."""
     rank = odometry_order(graph)
-    low, high = np.sort(rank[graph.edges], axis=1).T
-    kept, refused = (verdict.is_loop & which for which in (verdict.is_kept, ~verdict.is_kept))
-    n = len(graph.ids)
-    alone = (_spanned(low[refused], high[refused], n) > 0) & (_spanned(low[kept], high[kept], n) == 0)
-    if not alone.sum() > _ALONE * n:
-        return []
-    of = np.cumsum(alone)[high - 1] > np.where(low > 0, np.cumsum(alone)[low - 1], 0)
+    notes, contested = _unconfirmed(graph, verdict, rank)
+    return notes, [*said, *(text for text in (_bent(graph, verdict, rank), _slip(graph, verdict, rank)) if text), *contested]
+
+
+def _unconfirmed(graph: PoseGraph, verdict: LoopVerdict, rank: NDArray[np.int64]) -> tuple[list[str], list[str]]:
+    """Notes and doubts on parts of the graph that hang on odometry alone, and of which refused loop closures speak."""
+    arms = find_arms(graph, verdict.solution.values[0], verdict.is_kept, verdict.is_loop, rank)
+    if not arms:
+        return [], []
+    refusals, loops = np.count_nonzero(~verdict.is_kept), np.count_nonzero(verdict.is_loop)
+    if arms[0].is_contested:
+        told = [
+            f"{arms[0].agreeing} of {len(arms[0].refused)} refused loop closures agree with each other that the "
+            f"{len(arms[0].poses)} poses that hang on {arms[0].name(graph, rank)} lie elsewhere, and none that was kept speaks "
+            "of these: it slipped there, or these loop closures are false together"
+        ]
+        # Where there are others that no slip explains, false ones that agree are as likely.
+        return ([], told) if refusals <= max(_ALONE * loops, 2 * arms[0].agreeing) else (told, [])
+    alone = np.unique(np.concatenate([arm.poses for arm in arms]))
+    refused = np.unique(np.concatenate([arm.refused for arm in arms]))
+    share = len(alone) / len(graph.ids)
+    # Where many are false, some are of any part.
+    if not (share > _ALONE or refusals <= max(_ALONE * loops, _WITNESSES)):
+        return [], []
     return [
-        f"{alone.mean():.0%} of the odometry is confirmed by no loop closure that was kept, refused ones "
-        f"that span it: {np.count_nonzero(of & refused)}; whether it slipped there or these are false cannot be told"
-    ]
+        f"{share:.0%} of the odometry is confirmed by no loop closure that was kept ({len(alone)} poses, behind "
+        f"{arms[0].name(graph, rank)}), refused ones that speak of it: {len(refused)}; whether it slipped there or these are "
+        "false cannot be told"
+    ], []
 
 
-def _bent(graph: PoseGraph, verdict: LoopVerdict) -> str | None:
+def _bent(graph: PoseGraph, verdict: LoopVerdict, rank: NDArray[np.int64]) -> str | None:
     """Where the loop closures that were kept bend the odometry, over one step or several, by more than its noise."""
-    rank, dim = odometry_order(graph), graph.information.shape[1]
+    dim = graph.information.shape[1]
     steps = np.flatnonzero(~verdict.is_loop & (np.abs(np.diff(rank[graph.edges], axis=1))[:, 0] == 1))
     steps = steps[np.argsort(rank[graph.edges[steps]].min(axis=1), kind="stable")]
     squared = verdict.innovations[steps] ** 2
@@ -87,13 +101,12 @@ def _bent(graph: PoseGraph, verdict: LoopVerdict) -> str | None:
     return told
 
 
-def _slip(graph: PoseGraph, verdict: LoopVerdict) -> str | None:
+def _slip(graph: PoseGraph, verdict: LoopVerdict, rank: NDArray[np.int64]) -> str | None:
     """Where refused loop closures agree that all after some step of odometry lies elsewhere, and hardly any kept one objects."""
     refused = np.flatnonzero(verdict.is_loop & ~verdict.is_kept)
     if len(refused) < _WITNESSES:
         return None
     n = len(graph.ids)
-    rank = odometry_order(graph)
     i, j = rank[graph.edges].T
     crossings = Crossings.of(graph, verdict.solution.values[0], refused, i[refused] > j[refused], rank, ~verdict.is_loop)
     low, high = np.minimum(i, j), np.maximum(i, j)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_cdf, chi_square_exceeded, chi_square_quantile
 from boxplus._jit import kernel
 from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds import se2, se3
 from boxplus.optimization.solution import Solution
 from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start
@@ -22,6 +23,7 @@ _STRANGE = 1e-6  # chance that an edge of a sound graph, the worst of all, stand
 _LEAST = 1.1  # times its mean: noise is never so well known that less contradicts it
 _SAME = 1e-3  # relative difference up to which two minima are one
 _WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an information matrix says nothing along some direction
+_ROUNDED, _DIGITS = 1e-9, 6  # by which numbers of edges that are there twice differ, and digits that they are sorted by
 _LISTED = 5
 
 
@@ -31,11 +33,12 @@ class Fit:
 
     Attributes:
         chi2: of the counted edges.
-        dof: their rows less the degrees of freedom that the poses take up; the mean of χ² where the information is right.
+        dof: their rows less the degrees of freedom that the poses take up; the mean of χ² where the information is right, and no
+            whole number of a part of the edges.
     """
 
     chi2: float
-    dof: int
+    dof: float
 
     @property
     def excess(self) -> float:
@@ -187,17 +190,27 @@ def structure_notes(graph: PoseGraph, held: NDArray[np.int64]) -> list[str]:
 
 
 def repetition_notes(graph: PoseGraph) -> list[str]:
-    """A sentence on edges that are there twice, measurement and all."""
-    i, j = graph.edges.T
-    order = np.lexsort((graph.measurements[:, -1], i * len(graph.ids) + j))
-    same = (graph.edges[order][1:] == graph.edges[order][:-1]).all(axis=1)
-    same &= (graph.measurements[order][1:] == graph.measurements[order][:-1]).all(axis=1)
+    """A sentence on edges that are there twice, measurement and all, the other way round too."""
+    group = se3 if graph.dimension == 3 else se2
+    is_back = graph.edges[:, 0] > graph.edges[:, 1]
+    Z = graph.measurements.copy()
+    Z[is_back] = group.inverse(Z[is_back])
+    if graph.dimension == 3:
+        Z[:, :4] *= np.where(Z[:, :1] < 0.0, -1.0, 1.0)  # q and -q turn alike
+    low, high = np.sort(graph.edges, axis=1).T
+    key = low * len(graph.ids) + high
+    # Inverting and printing round, and rounding must not part what is next to each other.
+    order = np.lexsort((np.arange(len(key)), np.round(Z[:, -1], _DIGITS), key))
+    same = key[order][1:] == key[order][:-1]
+    same &= (np.abs(Z[order][1:] - Z[order][:-1]) <= _ROUNDED * (1.0 + np.abs(Z[order][1:]))).all(axis=1)
     repeated = np.sort(order[1:][same])
     if not len(repeated):
         return []
+    turned = np.count_nonzero(is_back[order][1:][same] != is_back[order][:-1][same])
     return [
-        f"{len(repeated)} of {len(order)} edges are there before with the same measurement and count again, as if measured "
-        f"independently; standard deviations come out too small: {edge_names(graph, repeated)}"
+        f"{len(repeated)} of {len(order)} edges are there before with the same measurement"
+        + (f" ({turned} of them the other way round)" if turned else "")
+        + f" and count again, as if measured independently; standard deviations come out too small: {edge_names(graph, repeated)}"
     ]
 
 

@@ -46,6 +46,7 @@ class LoopVerdict:
         innovations: (m,) ‖W e‖ at the result, in standard deviations of the measurement.
         report: how clear the decision was.
         solution: the least-squares minimum over the kept edges.
+        poses: the variables of it.
         widths: of the loss that were gone through.
     """
 
@@ -54,6 +55,7 @@ class LoopVerdict:
     innovations: NDArray[np.float64]
     report: InlierReport
     solution: Solution
+    poses: Variables
     widths: int
 
 
@@ -104,7 +106,7 @@ def judge_loops(
         innovations[rows] = np.sqrt(own.squares(solution.values))
     is_kept[is_loop] = kept
     report = inlier_report(innovations[is_loop] ** 2, group.residual.dim, keep, kept)
-    return LoopVerdict(is_loop, is_kept, innovations, report, solution, len(found.levels))
+    return LoopVerdict(is_loop, is_kept, innovations, report, solution, poses, len(found.levels))
 
 
 def _solve_kept(

@@ -22,8 +22,9 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.outliers.convex_start import convex_cost
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.pose_graph.certificate import Certificate, certify
-from boxplus.systems.pose_graph.contradictions import contradictions, unconfirmed_notes
+from boxplus.systems.pose_graph.contradictions import contradictions
 from boxplus.systems.pose_graph.doubts import (
     Fit,
     disagree,
@@ -39,8 +40,16 @@ from boxplus.systems.pose_graph.doubts import (
     without_information,
 )
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
-from boxplus.systems.pose_graph.problem import Objective, pose_graph_problem, squared_errors, turns, with_edges
+from boxplus.systems.pose_graph.problem import (
+    Objective,
+    consecutive_edges,
+    pose_graph_problem,
+    squared_errors,
+    turns,
+    with_edges,
+)
 from boxplus.systems.pose_graph.readings import misreading
+from boxplus.systems.pose_graph.reliability import Reliability, suspicions
 from boxplus.systems.pose_graph.start import held_poses
 from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
 
@@ -71,6 +80,11 @@ class PoseGraphConfig(BaseModel):
     robust: Literal["none", "gnc"] = Field(
         "none", description="gnc: false loop closures are told from true ones by graduated non-convexity and refused"
     )
+    examine: bool = Field(
+        True,
+        description="look for single edges that all others contradict, for odometry that is off as a whole and for information "
+        "that is wrong in parts; takes about as long as the optimisation",
+    )
     certify: bool = Field(False, description="whether the optimum is the global one, by SE-Sync's dual; chordal objective only")
     solver: SolverOptions = Field(
         SolverOptions(initial_damping=_DAMPING), description="see SolverOptions; Levenberg-Marquardt, hardly damped"
@@ -91,6 +105,7 @@ class PoseGraphResult:
         errors_before: the same at the poses of the input; at the start, where it has none.
         weights: (m,) weight of every edge at the end, 0 to 1: refused, or silenced by a robust loss.
         fit: χ² of the edges that count against what their information promises.
+        checks: how large an error of a single edge has to be to show; None where that was not examined.
         minima: the objective at the end of every start that was followed; more than one where the residuals did not fit.
         loops: the verdict on the loop closures, with `robust="gnc"`; None otherwise.
         certificate: with `certify`; None otherwise.
@@ -100,7 +115,8 @@ class PoseGraphResult:
             than it was read as, edges that contradict each other or a minimum that is likely local, not certified though that was
             asked for, or what speaks against the verdict on the loops; None otherwise.
         solution: with history, covariance, and why it stopped.
-        timing_s: seconds of checking and building the problem, of the initialisation, and of the optimisation.
+        poses: the variables of `solution`.
+        timing_s: seconds of checking and building the problem, of the initialisation, of the optimisation, of the examination.
 
     Example:
         >>> result = bp.optimize_pose_graph(bp.read_pose_graph("loops.g2o"))
@@ -120,6 +136,7 @@ class PoseGraphResult:
     errors_before: NDArray[np.float64]
     weights: NDArray[np.float64]
     fit: Fit
+    checks: str | None
     minima: dict[Start, float]
     loops: LoopVerdict | None
     certificate: Certificate | None
@@ -127,6 +144,7 @@ class PoseGraphResult:
     notes: tuple[str, ...]
     doubt: str | None
     solution: Solution
+    poses: Variables
     timing_s: dict[str, float]
 
 
@@ -157,7 +175,7 @@ def optimize_pose_graph(
     silent = without_information(graph)
     whole, graph = graph, with_edges(graph, ~silent)
     held = held_poses(graph)
-    problem, _ = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
+    problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
     starts = Starts(graph, config.start, options, callback)
     built = time.perf_counter()
     known = starts.candidates(loss, is_robust=config.robust == "gnc")
@@ -168,6 +186,7 @@ def optimize_pose_graph(
     verdict = None
     if config.robust == "gnc" and starts.is_loop.any():
         verdict = judge_loops(graph, starts.is_loop, known[chosen], options, callback)
+        poses = verdict.poses
         solution, minima = verdict.solution, {chosen: 2.0 * verdict.solution.cost}
         weights = verdict.is_kept.astype(np.float64)
         squared = squared_errors(residual, graph, solution.values[0])
@@ -195,12 +214,24 @@ def optimize_pose_graph(
     notes += local_notes(fit, minima)
     reasons = [text for text in (misreading(graph),) if text]
     if verdict is not None:
-        notes += unconfirmed_notes(graph, verdict)
-        reasons += _verdict_doubts(fit, verdict) + contradictions(graph, verdict, starts.bridges)
+        if fit.is_poor and not fit.is_contradiction:
+            notes.append(f"{misfit(fit)}: information that is too optimistic, or false loop closures among those that were kept")
+        unsure, against = contradictions(graph, verdict, starts.bridges)
+        notes += unsure
+        reasons += _verdict_doubts(fit, verdict) + against
     elif fit.is_poor:
         told = poor_fit_sentence(fit, minima, len(graph.fixed))
         bent = fit.is_contradiction and (disagree(minima) or standing_out(squared, graph.information.shape[1]).any())
         (reasons if bent else notes).append(told)
+    examined = time.perf_counter()
+    reliability = None
+    if config.examine and loss is None and config.objective == "logarithm" and solution.status != "stopped":
+        kept = np.ones(len(graph.edges), dtype=np.bool_) if verdict is None else verdict.is_kept
+        reliability = Reliability.of(with_edges(graph, kept), solution, poses)
+    if reliability is not None:
+        for one in suspicions(reliability, solution, poses, consecutive_edges(graph)[kept]):
+            (reasons if one.is_grave else notes).append(one.sentence)
+    examination = time.perf_counter() - examined
     if certificate is not None and not certificate.is_certified:
         reasons.append(certificate.sentence)
     return PoseGraphResult(
@@ -216,6 +247,7 @@ def optimize_pose_graph(
         errors_before=_spread(np.sqrt(squared_before), ~silent),
         weights=_spread(weights, ~silent),
         fit=fit,
+        checks=None if reliability is None else reliability.sentence,
         minima=minima,
         loops=verdict,
         certificate=certificate,
@@ -223,7 +255,13 @@ def optimize_pose_graph(
         notes=tuple(notes),
         doubt="; ".join(reasons) or None,
         solution=solution,
-        timing_s={"set-up": built - begin, "start": prepared - built, "optimisation": solved - prepared},
+        poses=poses,
+        timing_s={
+            "set-up": built - begin,
+            "start": prepared - built,
+            "optimisation": solved - prepared,
+            "examination": examination,
+        },
     )
 
 

@@ -1,0 +1,305 @@
+"""What all other edges say of each one: edges that slipped, odometry that is off as a whole, information that is wrong in parts.
+
+Least squares spreads what one edge is off by over all around it, so that errors look like noise. What an edge leaves of its
+own error is known beforehand: whitened, e has the covariance S = I − J P Jᵀ, with J its Jacobian and P the covariance of the
+poses. So eᵀ S⁻¹ e is how far the others contradict it, as if it had been left out, and the trace of S, its redundancy, how well
+they could (Baarda, A testing procedure for use in geodetic networks, 1968). The same holds of any error with a known shape b
+over all edges: its size is bᵀe / bᵀSb.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._chi_square import chi_square_cdf, chi_square_exceeded, chi_square_quantile
+from boxplus.errors import SingularProblemError
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds import se2, se3
+from boxplus.manifolds.se2 import SE2
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.solution import Solution
+from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.doubts import Fit, edge_names
+from boxplus.systems.pose_graph.problem import odometry_order, residual_of
+
+Floats = NDArray[np.float64]
+
+_STRANGE = 1e-4  # chance that an edge of a sound graph, the worst of all, is told
+_SURE = 1e-6  # chance that anything else is
+_UNCHECKED = 1e-5  # share of an error that shows, below which nothing checks that direction
+_ROUNDING = 1e-15  # of the covariances that such a share is a small difference of
+_ALIKE = 9.2  # difference of squares by which one suspect is a hundred times likelier than another
+_BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
+_LEAST_STEPS = 10  # of odometry, for a scale or a drift of its own
+_LEAST_SPARE = 10.0  # redundancy from which on a group of edges is judged on its own
+_CLEARLY, _WRONG = 1.5, 4.0  # times what the information promises of a group's χ², to be told, and not to be trusted
+_SLACK = 0.25
+_STEP = 1e-6  # of differences by a scale and by an angle [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Reliability:
+    """Errors of edges, and what is known of these beforehand.
+
+    Attributes:
+        graph: with these edges only.
+        poses: the result.
+        errors: (m, d) whitened.
+        factors: (m, d, d) by which errors are whitened.
+        jacobians: (m, d, d) whitened, by the first and by the second pose.
+        predicted: (m, d, d) J P Jᵀ, the covariance of what the result says of an edge, in its standard deviations.
+        rounding: (m,) what is left of the share of an error that shows when nothing checks it.
+        deviations: (n, d) standard deviations of the poses.
+    """
+
+    graph: PoseGraph
+    poses: Floats
+    errors: Floats
+    factors: Floats
+    jacobians: tuple[Floats, Floats]
+    predicted: Floats
+    rounding: Floats
+    deviations: Floats
+
+    @classmethod
+    def of(cls, graph: PoseGraph, solution: Solution, variables: Variables) -> Reliability | None:
+        """Of the edges that a solution rests on; None where these do not determine all poses.
+
+        Args:
+            graph: with these edges only.
+            variables: the poses.
+        """
+        (i, j), m = graph.edges.T, len(graph.edges)
+        residual, x = residual_of(graph), solution[variables]
+        d = residual.dim
+        r, J, valid = np.zeros((m, d)), (np.zeros((m, d, d)), np.zeros((m, d, d))), np.ones(m, dtype=np.bool_)
+        residual.linearize_into(0, m, (x, x), (i.astype(np.uint32), j.astype(np.uint32)), r, J, valid)
+        W = np.broadcast_to(residual.whitening.factors, (m, d, d))
+        everyone = np.arange(len(x))
+        try:
+            first, second = (np.concatenate(rows) for rows in ((i, j, i, everyone), (i, j, j, everyone)))
+            P = solution.covariance(variables[first], variables[second], is_determined=True)
+        except SingularProblemError:
+            return None
+        e, Ji, Jj = (W @ r[:, :, None])[:, :, 0], W @ J[0], W @ J[1]
+        across = Ji @ P[2 * m : 3 * m] @ np.swapaxes(Jj, 1, 2)
+        own = [Ji @ P[:m] @ np.swapaxes(Ji, 1, 2), Jj @ P[m : 2 * m] @ np.swapaxes(Jj, 1, 2)]
+        M = own[0] + own[1] + across + np.swapaxes(across, 1, 2)
+        rounding = _ROUNDING * np.einsum("nii->n", own[0] + own[1])
+        deviations = np.sqrt(np.maximum(np.einsum("nii->ni", P[3 * m :]), 0.0))
+        return cls(graph, x, e, W, (Ji, Jj), 0.5 * (M + np.swapaxes(M, 1, 2)), rounding, deviations)
+
+    @property
+    def redundancy(self) -> Floats:
+        """(m,) sum of the shares of an edge's error that show, over its directions: the mean of its squared error."""
+        d = self.errors.shape[1]
+        return np.asarray(np.clip(d - np.einsum("nii->n", self.predicted), 0.0, d))
+
+    @property
+    def sentence(self) -> str:
+        """How large an error of an edge has to be for all others to contradict it."""
+        d, m = self.errors.shape[1], len(self.errors)
+        directions = self.against()[1]
+        alone = int(np.count_nonzero(directions == 0))
+        if alone == m:
+            return "no edge is checked by others"
+        share = self.redundancy[directions > 0] / d
+        shows = math.sqrt(chi_square_exceeded(_STRANGE / m, d) / float(np.median(share)))
+        rest = f", and not at all in {alone}, which no other checks" if alone else ""
+        return f"a wrong edge shows from {shows:.2g} of its standard deviations on in half of {m - alone} edges{rest}"
+
+    def against(self) -> tuple[Floats, NDArray[np.int64], Floats]:
+        """(m,) how far all others contradict each edge, squared; in how many directions they can; how far it bends the result.
+
+        The last one in the standard deviations that the result claims of the pose of one of its poses in the other.
+        """
+        share, U = np.linalg.eigh(np.eye(self.errors.shape[1]) - self.predicted)
+        is_checked = share > np.maximum(_UNCHECKED, self.rounding)[:, None]
+        own = np.einsum("nji,nj->ni", U, self.errors)
+        squared = np.where(is_checked, own * own / np.where(is_checked, share, 1.0), 0.0)
+        bent = np.where(is_checked, squared / np.where(is_checked, share, 1.0) * np.clip(1.0 - share, 0.0, 1.0), 0.0)
+        return squared.sum(axis=1), is_checked.sum(axis=1), np.sqrt(bent.sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Suspicion:
+    """Something that the redundancy of a graph contradicts.
+
+    Attributes:
+        sentence: what.
+        is_grave: whether the result is off by more than it claims.
+    """
+
+    sentence: str
+    is_grave: bool
+
+
+def suspicions(known: Reliability, solution: Solution, variables: Variables, odometry: NDArray[np.bool_]) -> list[Suspicion]:
+    """Edges that all others contradict, odometry that is off as a whole, and groups that their information does not fit.
+
+    Args:
+        odometry: (m,) edges that join successive poses.
+    """
+    squared, directions, bent = known.against()
+    checked = directions > 0
+    if not checked.any():
+        return []
+    d, total = known.errors.shape[1], float((known.errors**2).sum())
+    half = np.array([math.nan, *(chi_square_quantile(0.5, k) for k in range(1, d + 1))])
+    usual = max(float(np.median(squared[checked] / half[directions[checked]])), 1.0)
+
+    def noise(explained: float, by: int) -> float:
+        """χ² over its mean without what was explained: one cause contradicts many edges where there are few."""
+        spare = float(known.redundancy.sum()) - by
+        return min(usual, max((total - explained) / spare, 1.0)) if spare > 0.0 else usual
+
+    worst = int(np.argmax(squared))
+    common = _systematic(known, solution, variables, odometry) if np.count_nonzero(odometry) >= _LEAST_STEPS else []
+    whole = max(common, key=lambda one: one.squared, default=None)
+    said = []
+    if whole is not None and whole.squared >= squared[worst]:
+        scale = noise(whole.squared, 1)
+        if whole.squared > scale * chi_square_exceeded(_STRANGE / len(common), 1):
+            said.append(whole.suspicion(scale))
+    else:
+        scale = noise(float(squared[worst]), int(directions[worst]))
+        limits = np.array([math.inf, *(chi_square_exceeded(_STRANGE / len(squared), k) for k in range(1, d + 1))])
+        found = squared > scale * limits[directions]
+        if found.any():
+            said.append(_slipped(known, squared, bent, found))
+    return [*said, *_groups(known, odometry)]
+
+
+def _slipped(known: Reliability, squared: Floats, bent: Floats, found: NDArray[np.bool_]) -> Suspicion:
+    graph, worst = known.graph, int(np.argmax(np.where(found, squared, -1.0)))
+    alike = np.flatnonzero(squared > squared[worst] - _ALIKE)
+    alike = alike[alike != worst]
+    others = np.count_nonzero(found) - 1 - np.count_nonzero(found[alike])
+    name, size = edge_names(graph, np.array([worst])), math.sqrt(squared[worst])
+    told = f"all other edges contradict {name} by {size:.3g} standard deviations"
+    if len(alike):
+        rank = odometry_order(graph)
+        ends = np.unique(graph.edges[[worst, *alike]])
+        first, last = (graph.ids[ends[k(rank[ends])]] for k in (np.argmin, np.argmax))
+        told += f", or one of {len(alike)} that they cannot tell from it, from pose {first} to pose {last}"
+    told += f"; kept as it is, it bends the result there by {bent[worst]:.2g} of its own standard deviations"
+    if others > 0:
+        told += f", and {others} more are contradicted"
+    return Suspicion(f"{told}: it slipped, joins the wrong poses, or claims too much", bool(bent[worst] > _BENT))
+
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """An error that all steps of the odometry may share.
+
+    Attributes:
+        sentence: what it is.
+        unit: factor to what it is told in.
+        size, spare: by how much, and the inverse of its variance.
+        bent: by how many of its own standard deviations the result is off at most, if this is so.
+    """
+
+    sentence: str
+    unit: float
+    size: float
+    spare: float
+    bent: float
+
+    @property
+    def squared(self) -> float:
+        """By how much χ² would fall."""
+        return self.size**2 * self.spare
+
+    def suspicion(self, scale: float) -> Suspicion:
+        """With errors that are √scale times what their information promises."""
+        return Suspicion(
+            f"{self.sentence} by {self.unit * self.size:.3g} ± {self.unit * math.sqrt(scale / self.spare):.2g}, as all edges "
+            f"together have it and their information does not know; the result is bent by up to {self.bent:.2g} of its own "
+            "standard deviations",
+            self.bent > _BENT,
+        )
+
+
+def _systematic(known: Reliability, solution: Solution, variables: Variables, odometry: NDArray[np.bool_]) -> list[Common]:
+    """All steps of the odometry are too long or too short, or turn too far, by the same."""
+    found = []
+    for sentence, unit, b in _shapes(known, odometry):
+        slopes = _scattered(known, b)
+        (response,) = solution.response([slopes], is_determined=True)
+        length = float((b * b).sum())
+        spare = length - float((slopes * response).sum())
+        if not spare > _UNCHECKED * length:
+            continue
+        size = float((b * known.errors).sum()) / spare
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bent = np.abs(response * size) / known.deviations
+        found.append(Common(sentence, unit, size, spare, float(np.nanmax(bent, initial=0.0))))
+    return found
+
+
+def _shapes(known: Reliability, odometry: NDArray[np.bool_]) -> list[tuple[str, float, Floats]]:
+    """What the odometry may be off by, with the factor to the unit it is told in and its shape (m, d) in the whitened errors.
+
+    By the steps of the result, as those that were measured hold the very noise that they would be compared with; what the result
+    has of it is at right angles to the errors.
+    """
+    graph = known.graph
+    manifold, group = (SE3, se3) if graph.dimension == 3 else (SE2, se2)
+    i, j = graph.edges[odometry].T
+    steps: Floats = group.compose(group.inverse(known.poses[i]), known.poses[j])
+    turns, W = 3 if graph.dimension == 3 else 1, known.factors[odometry]
+
+    def shape(moved: Callable[[float], Floats]) -> Floats:
+        b = np.zeros_like(known.errors)
+        change = manifold.boxminus(steps, moved(_STEP)) - manifold.boxminus(steps, moved(-_STEP))
+        b[odometry] = np.einsum("nab,nb->na", W, change / (2.0 * _STEP))
+        return b
+
+    def stretched(by: float) -> Floats:
+        moved: Floats = steps.copy()
+        moved[:, -graph.dimension :] *= 1.0 + by
+        return moved
+
+    found = [("steps of the odometry are too long, in %,", 100.0, shape(stretched))]
+    for axis in range(turns):
+        about = f" about {'xyz'[axis]}" if turns == 3 else ""
+        one = np.eye(manifold.dof)[axis]
+        by_turn = functools.partial(lambda one, by: manifold.boxplus(steps, by * one[None]), one)
+        found.append((f"steps of the odometry turn too far{about}, in degrees,", math.degrees(1.0), shape(by_turn)))
+    return found
+
+
+def _scattered(known: Reliability, b: Floats) -> Floats:
+    """Jᵀ b (n, d)."""
+    slopes = np.zeros((len(known.poses), b.shape[1]))
+    for rows, J in zip(known.graph.edges.T, known.jacobians, strict=True):
+        np.add.at(slopes, rows, np.einsum("nab,na->nb", J, b))
+    return slopes
+
+
+def _groups(known: Reliability, odometry: NDArray[np.bool_]) -> list[Suspicion]:
+    """Odometry and loop closures, each against what its information promises of it."""
+    squared, spare = (known.errors**2).sum(axis=1), known.redundancy
+    fits = {}
+    for name, rows in (("odometry", odometry), ("loop closures", ~odometry)):
+        if spare[rows].sum() >= _LEAST_SPARE:
+            fits[name] = float(squared[rows].sum()), float(spare[rows].sum())
+    if len(fits) < 2:
+        return []
+    said = []
+    for name, (chi2, mean) in fits.items():
+        ratio = chi2 / mean
+        (other,) = (c / m for key, (c, m) in fits.items() if key != name)
+        told = f"{name} have {ratio:.3g} times the squared errors that their information promises, the others {other:.3g} times: "
+        if ratio > _CLEARLY * max(other, 1.0) and Fit(chi2, mean).is_contradiction:
+            told += "the weight between the two is wrong, and with it the result and its standard deviations"
+            said.append(Suspicion(told, ratio > _WRONG))
+        elif ratio < _SLACK and ratio < _SLACK * other and chi_square_cdf(chi2, mean) < _SURE:
+            said.append(Suspicion(told + "they count for less than they could", False))
+    return said
