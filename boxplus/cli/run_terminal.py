@@ -58,18 +58,20 @@ class RunTerminal(Terminal):
         with ProgressBar(*columns, console=self.console, disable=not self.console.is_terminal) as bar:
             task = bar.add_task("odometry", total=1.0, text="")
             rate = _Rate()
-            compiling = False
+            compiling, stage = False, ""
 
             def show(progress: Progress) -> None:
-                nonlocal compiling
+                nonlocal compiling, stage
                 if progress.compiling is not None:
                     if not compiling:
                         compiling = True
                         self.console.print("compiling kernels (first use only) …")
                     bar.update(task, text=f"compiling {progress.compiling}")
-                elif rate.due():
-                    text = f"{progress.count} {progress.unit}, {rate(progress.count):.0f}/s, {progress.status}"
-                    bar.update(task, completed=progress.share, description=progress.stage, text=text)
+                elif progress.stage != stage or rate.due():  # a stage may be told once, and last for minutes
+                    stage = progress.stage
+                    counted = f"{progress.count} {progress.unit}, {rate(progress.count):.0f}/s, "
+                    text = (counted if progress.count else "") + progress.status
+                    bar.update(task, completed=progress.share, description=stage, text=text)
 
             yield show
             bar.update(task, completed=bar.tasks[0].total if bar.tasks[0].completed > 0.999 else bar.tasks[0].completed)

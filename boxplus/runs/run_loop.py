@@ -36,11 +36,11 @@ class Progress:
 
     Attributes:
         share: of the recording, 0 to 1.
-        count: estimates so far.
+        count: estimates so far; 0 in stages that make none.
         unit: what one is for (`scans`, `frames`).
         status: of the last one, or "starting".
         compiling: name of the kernel that is being compiled, or None.
-        stage: "odometry" or "merging the map".
+        stage: what goes on: "odometry", "merging the map", "finding planes" …
     """
 
     share: float

@@ -91,7 +91,7 @@ def refine_command(
                     claimed,
                     run_config,
                     recording=recording,
-                    progress=lambda stage, share: progress(Progress(share, odometry.summary.scans, "scans", stage, stage=stage)),
+                    progress=lambda stage, share: progress(Progress(share, 0, "scans", "", stage=stage)),
                     should_stop=should_stop,
                 )
             summary, comparison = result.summary, None

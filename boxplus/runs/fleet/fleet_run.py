@@ -29,6 +29,7 @@ from boxplus.runs.storage.output_folder import SUMMARY
 from boxplus.systems.sessions.candidates import candidate_pairs
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.sessions import SessionAlignment, place_sessions
+from boxplus.systems.slam.slam import Slam
 
 Report = Callable[[FleetStatus, RecordingStatus | None], None]
 
@@ -59,18 +60,20 @@ def run_fleet(
 
     Raises:
         InputError: no recording; another process runs a fleet there; `remove_dynamic` with a URL; a URL without a driver; workers
-            that write to a place of their own.
+            that write to a place of their own; OpenCV, the extra `vision`, is not installed and density images are wanted.
         OutputError: the place cannot be written or the disk is full; a task of the joint map was lost for good.
     """
     if not recordings:
         raise InputError("a recording at least", "none", "see find_recordings")
+    slam, merging = slam or SlamRunConfig(), merging or MergeConfig()
+    Slam(slam.slam)  # what it refuses, a library that is missing, every recording would fail with
     store = open_store(output)
     if remove_dynamic and not isinstance(store, SharedFolder):
         raise InputError(
             "a folder, to remove what was seen through", f"{store.text}", "give a folder, or leave --remove-dynamic out"
         )
     with store.locked():
-        fleet = _Fleet(recordings, store, executor, slam or SlamRunConfig(), merging or MergeConfig(), neighbours, report)
+        fleet = _Fleet(recordings, store, executor, slam, merging, neighbours, report)
         return fleet.execute(remove_dynamic)
 
 

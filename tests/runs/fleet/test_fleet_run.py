@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -279,9 +280,14 @@ def test_a_task_that_fails_ends_alone() -> None:
     assert ends[1].error is not None and ends[1].error.startswith("ZeroDivisionError")
 
 
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
+def test_without_opencv_no_recording_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(InputError, match=r"boxplus\[vision\]"):
+        run_fleet({"a": Path("a")}, tmp_path / "out", InProcess())
+    assert not (tmp_path / "out").exists()
 
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"boxplus\[fleet\]"):
         RayExecutor()
