@@ -24,6 +24,8 @@ def as_batch(name: str, values: ArrayLike, tail: tuple[int, ...]) -> tuple[NDArr
         shape = ", ".join(["...", *map(str, tail)])
         raise InputError(f"{name} of shape ({shape})", f"shape {array.shape}", f"put the {'×'.join(map(str, tail))} values last")
     lead = array.shape[: array.ndim - len(tail)]
+    if len(lead) == 1 and array.flags.c_contiguous:
+        return array, lead
     return np.ascontiguousarray(array).reshape(-1, *tail), lead
 
 

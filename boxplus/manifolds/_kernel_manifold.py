@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import kernel
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds._batch import pair_rows
@@ -76,9 +78,8 @@ def checked_rows(name: str, x: ArrayLike, size: int, manifold: str) -> NDArray[n
     array = np.array(as_floats(x, f"{name} (n, {size}) on {manifold}"), ndmin=2, order="C")
     if array.ndim != 2 or array.shape[1] != size:
         raise InputError(f"{name} of shape (n, {size}) on {manifold}", f"shape {np.shape(x)}", "give one row for each variable")
-    finite = np.isfinite(array).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
+    if not np.isfinite(array).all():
+        row = int(np.argmin(np.isfinite(array).all(axis=1)))
         numbers = np.array2string(array[row], precision=4, max_line_width=10_000)
         raise InputError(f"{name} finite", f"{numbers} in row {row}", "remove the variable or give it a start value")
     return array
@@ -90,14 +91,26 @@ def normalize_quaternions(name: str, rows: NDArray[np.float64]) -> None:
     Raises:
         InputError: a quaternion whose length is not 1.
     """
-    length = np.sqrt((rows[:, :4] ** 2).sum(axis=1))
-    off = ~(np.abs(length - 1.0) <= _UNIT_TOLERANCE)
-    if off.any():
-        row = int(np.argmax(off))
+    row, length = _normalize(rows)
+    if row >= 0:
         raise InputError(
             f"{name} with unit quaternions wxyz first",
-            f"length {length[row]:.6g} in row {row}",
+            f"length {length:.6g} in row {row}",
             "check the order of the columns, or normalise the quaternions",
         )
-    rounded = np.abs(length - 1.0) > _ROUNDED  # what is of unit length already keeps its digits
-    rows[rounded, :4] /= length[rounded, None]
+
+
+@kernel
+def _normalize(rows: NDArray[np.float64]) -> tuple[int, float]:
+    """`normalize_quaternions`, if all are of unit length; the first that is not, and its length, or −1."""
+    lengths = np.empty(rows.shape[0])
+    for n in range(rows.shape[0]):
+        w, x, y, z = rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3]
+        lengths[n] = math.sqrt(((w * w + x * x) + y * y) + z * z)
+        if not abs(lengths[n] - 1.0) <= _UNIT_TOLERANCE:
+            return n, lengths[n]
+    for n in range(rows.shape[0]):
+        if abs(lengths[n] - 1.0) > _ROUNDED:  # what is of unit length already keeps its digits
+            for k in range(4):
+                rows[n, k] /= lengths[n]
+    return -1, 1.0

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import kernel
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 
@@ -104,19 +106,14 @@ def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse:
             f"shape {array.shape}",
             "one matrix for all residuals, or one for each",
         )
-    array = array.reshape(-1, dim, dim)
-    finite = np.isfinite(array).all(axis=(1, 2))
-    if not finite.all():
-        raise InputError(
-            f"{name} finite", f"NaN or infinity in residual {int(np.argmin(finite))}", "remove the residual or repair its weight"
-        )
-    scale = np.abs(array).max(axis=(1, 2), initial=0.0)
-    asymmetry = np.abs(array - np.swapaxes(array, 1, 2)).max(axis=(1, 2), initial=0.0)
-    if (asymmetry > _SYMMETRY * scale).any():
-        n = int(np.argmax(asymmetry > _SYMMETRY * scale))
+    array = np.ascontiguousarray(array.reshape(-1, dim, dim))
+    n, asymmetry = _first_not_symmetric(array)
+    if n >= 0 and not np.isfinite(asymmetry):
+        raise InputError(f"{name} finite", f"NaN or infinity in residual {n}", "remove the residual or repair its weight")
+    if n >= 0:
         raise InputError(
             f"{name} symmetric",
-            f"an asymmetry of {asymmetry[n]:.3g} in residual {n}",
+            f"an asymmetry of {asymmetry:.3g} in residual {n}",
             "check the order in which its entries were read",
         )
     try:
@@ -129,6 +126,23 @@ def _from_matrix(name: str, matrix: ArrayLike, dim: int, count: int, *, inverse:
         return _of_semidefinite(name, array, allowed=not inverse)
     # Ω = L Lᵀ is whitened by Lᵀ; Σ = C Cᵀ by C⁻¹, which spares the inverse of Σ.
     return np.ascontiguousarray(np.linalg.inv(factor) if inverse else np.swapaxes(factor, 1, 2))
+
+
+@kernel
+def _first_not_symmetric(matrices: NDArray[np.float64]) -> tuple[int, float]:
+    """The first matrix that is not finite, else the first that is not symmetric, −1 for none; and its asymmetry."""
+    first, worst = -1, 0.0
+    for n in range(matrices.shape[0]):
+        scale, asymmetry = 0.0, 0.0
+        for i in range(matrices.shape[1]):
+            for j in range(matrices.shape[1]):
+                value = matrices[n, i, j]
+                if not math.isfinite(value):
+                    return n, math.nan
+                scale, asymmetry = max(scale, abs(value)), max(asymmetry, abs(value - matrices[n, j, i]))
+        if first < 0 and asymmetry > _SYMMETRY * scale:
+            first, worst = n, asymmetry
+    return first, worst
 
 
 def _of_semidefinite(name: str, matrices: NDArray[np.float64], *, allowed: bool) -> NDArray[np.float64]:

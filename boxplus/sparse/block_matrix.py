@@ -55,30 +55,23 @@ class BlockPattern:
     def __post_init__(self) -> None:
         sizes, col_start, row = (np.ascontiguousarray(a, np.int64) for a in (self.sizes, self.col_start, self.row))
         n = len(sizes)
-        if sizes.ndim != 1 or (n and sizes.min() < 1):
+        start, value_start = np.zeros(n + 1, np.int64), np.zeros(len(row) + 1, np.int64)
+        if sizes.ndim != 1 or not _lay_out_rows(sizes, start):
             raise InputError(
                 "a size of at least 1 for every variable", f"sizes {self.sizes}", "leave out variables without freedom"
             )
-        if col_start.shape != (n + 1,) or col_start[0] != 0 or col_start[-1] != len(row) or (n and np.diff(col_start).min() < 1):
+        if col_start.shape != (n + 1,) or row.ndim != 1 or not _is_partition(col_start, len(row)):
             raise InputError(
                 f"{n + 1} ascending column starts from 0 to {len(row)}, every column with its diagonal",
                 f"{col_start}",
                 "build the pattern with BlockPattern.from_pairs",
             )
-        column = np.repeat(np.arange(n), np.diff(col_start))
-        first = np.zeros(len(row), np.bool_)
-        first[col_start[:-1]] = True
-        ascending = np.ones(len(row), np.bool_)
-        ascending[1:] = first[1:] | (row[1:] > row[:-1])
-        if not ((row[first] == column[first]).all() and ascending.all() and (n == 0 or row.max() < n)):
+        if not _lay_out_values(sizes, col_start, row, value_start):
             raise InputError(
                 "in each column the diagonal and then ascending block rows below it",
                 "another order",
                 "build the pattern with BlockPattern.from_pairs",
             )
-        start, value_start = np.zeros(n + 1, np.int64), np.zeros(len(row) + 1, np.int64)
-        np.cumsum(sizes, out=start[1:])
-        np.cumsum(sizes[row] * sizes[column], out=value_start[1:])
         for name, array in zip(self.__slots__, (sizes, col_start, row, start, value_start), strict=True):
             object.__setattr__(self, name, array)
 
@@ -98,15 +91,15 @@ class BlockPattern:
         n = len(sizes)
         if i.shape != j.shape or i.ndim != 1:
             raise InputError("as many first as second variables", f"{i.shape} and {j.shape}", "give the pairs as two flat arrays")
-        if len(i) and (min(i.min(), j.min()) < 0 or max(i.max(), j.max()) >= n):
+        keys = np.empty(n + len(i), np.int64)
+        if not _keys_of_pairs(n, np.ascontiguousarray(i), np.ascontiguousarray(j), keys):
             raise InputError(
                 f"variables from 0 to {n - 1}", f"{min(i.min(), j.min())} to {max(i.max(), j.max())}", "check the indices"
             )
-        diagonal = np.arange(n) * (n + 1)
-        keys, block = unique_keys(np.concatenate([diagonal, np.minimum(i, j) * n + np.maximum(i, j)]), n * n)
-        col_start = np.zeros(n + 1, np.int64)
-        np.cumsum(np.bincount(keys // max(n, 1), minlength=n), out=col_start[1:])
-        return cls(sizes, col_start, keys % max(n, 1)), PairIndex(block[n:].astype(np.int64), i < j)
+        different, block = unique_keys(keys, n * n)
+        col_start, row = np.zeros(n + 1, np.int64), np.empty(len(different), np.int64)
+        _columns_of_keys(n, different, col_start, row)
+        return cls(sizes, col_start, row), PairIndex(block[n:], i < j)
 
     @classmethod
     def from_scipy(cls, matrix: csc_matrix, sizes: ArrayLike | None = None) -> tuple[BlockPattern, NDArray[np.float64]]:
@@ -175,9 +168,85 @@ def unique_keys(keys: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], 
         bits = (int(size - 1).bit_length() + 1) // 2
         return different[: _number(keys, bits, different, position)], position
     # Few variables and many pairs: a table is quicker than a sort.
-    found = np.zeros(size, dtype=np.bool_)
-    found[keys] = True
-    return np.flatnonzero(found), (np.cumsum(found) - 1)[keys]
+    different, position = np.empty(min(size, len(keys)), np.int64), np.empty(len(keys), np.int64)
+    return different[: _number_by_table(keys, np.zeros(size, np.int64), different, position)], position
+
+
+@kernel
+def _number_by_table(
+    keys: NDArray[np.int64], table: NDArray[np.int64], different: NDArray[np.int64], position: NDArray[np.int64]
+) -> int:
+    """Count the different keys, which are below the length of the table of zeros, and say which one each is."""
+    for k in range(np.uint64(len(keys))):
+        table[np.uint64(keys[k])] = 1
+    found = 0
+    for key in range(np.uint64(len(table))):
+        if table[key]:
+            different[found] = np.int64(key)
+            table[key] = found
+            found += 1
+    for k in range(np.uint64(len(keys))):
+        position[k] = table[np.uint64(keys[k])]
+    return found
+
+
+@kernel
+def _keys_of_pairs(n: int, i: NDArray[np.int64], j: NDArray[np.int64], keys: NDArray[np.int64]) -> bool:
+    """Column · n + row of the n diagonal blocks and of every pair; False where a variable is none of the n."""
+    for k in range(n):
+        keys[k] = k * (n + 1)
+    for k in range(len(i)):
+        low, high = min(i[k], j[k]), max(i[k], j[k])
+        if low < 0 or high >= n:
+            return False
+        keys[n + k] = low * n + high
+    return True
+
+
+@kernel
+def _columns_of_keys(n: int, keys: NDArray[np.int64], col_start: NDArray[np.int64], row: NDArray[np.int64]) -> None:
+    """Where the columns of ascending keys begin, and their rows; `col_start` is zero before."""
+    for k in range(len(keys)):
+        column = keys[k] // n
+        row[k] = keys[k] - column * n
+        col_start[column + 1] += 1
+    for column in range(n):
+        col_start[column + 1] += col_start[column]
+
+
+@kernel
+def _lay_out_rows(sizes: NDArray[np.int64], start: NDArray[np.int64]) -> bool:
+    """First scalar row of each block row; False where one has none."""
+    for k in range(len(sizes)):
+        if sizes[k] < 1:
+            return False
+        start[k + 1] = start[k] + sizes[k]
+    return True
+
+
+@kernel
+def _is_partition(col_start: NDArray[np.int64], blocks: int) -> bool:
+    """Whether columns share the blocks out, one at least for each."""
+    ascends = col_start[0] == 0 and col_start[len(col_start) - 1] == blocks
+    for column in range(len(col_start) - 1):
+        ascends &= col_start[column + 1] > col_start[column]
+    return ascends
+
+
+@kernel
+def _lay_out_values(
+    sizes: NDArray[np.int64], col_start: NDArray[np.int64], row: NDArray[np.int64], value_start: NDArray[np.int64]
+) -> bool:
+    """First value of each block; False where a column does not begin with its diagonal, or does not ascend."""
+    n = len(sizes)
+    for column in range(n):
+        before = column - 1
+        for k in range(col_start[column], col_start[column + 1]):
+            if row[k] <= before or row[k] >= n or (before < column and row[k] != column):
+                return False
+            before = row[k]
+            value_start[k + 1] = value_start[k] + sizes[row[k]] * sizes[column]
+    return True
 
 
 @kernel

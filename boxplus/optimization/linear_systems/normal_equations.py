@@ -165,18 +165,27 @@ class NormalEquations:
         gradient: g (dof,).
     """
 
-    def __init__(self, layout: Layout, groups: Sequence[Group]) -> None:
+    def __init__(
+        self, layout: Layout, groups: Sequence[Group], connected: Sequence[list[NDArray[np.int64]]] | None = None
+    ) -> None:
+        """`connected`: for every group what `connected_numbers` gives, where that is known."""
         rows: list[NDArray[np.int64]] = []
         columns: list[NDArray[np.int64]] = []
+        joint_rows: list[NDArray[np.int64]] = []
+        joint_columns: list[NDArray[np.int64]] = []
         parts: list[tuple[Group, int, int, NDArray[np.int64]]] = []
         self._gradients: list[Gather] = []
-        joint: list[tuple[Group, NDArray[np.int64], NDArray[np.bool_]]] = []
-        for group in groups:
-            numbers = connected_numbers(layout, group)
+        joint: list[tuple[Group, NDArray[np.int64], int]] = []
+        for k, group in enumerate(groups):
+            numbers = connected_numbers(layout, group) if connected is None else connected[k]
             count = group.residual.count
             if len(numbers) >= _MANY and (count == 1 or 0 < count * len(numbers) <= _AT_ONCE):
                 number = np.stack(numbers, axis=1)
-                joint.append((group, number, (number[:, :, None] >= number[:, None]) & (number[:, None] >= 0)))
+                row, column = (np.empty(number.size * len(numbers), dtype=np.int64) for _ in range(2))
+                lower = _joint_pairs(number, row, column)
+                joint.append((group, number, lower))
+                joint_rows.append(row[:lower])
+                joint_columns.append(column[:lower])
                 continue
             moving = [(a, number) for a, number in enumerate(numbers) if (number >= 0).any()]
             for a, number_a in moving:
@@ -189,18 +198,15 @@ class NormalEquations:
                         columns.append(column)
                         parts.append((group, a, b, selected))
         ends = np.cumsum([len(selected) for *_, selected in parts], dtype=np.int64)
-        for _, number, lower in joint:
-            residual, first, second = np.nonzero(lower)
-            rows.append(number[residual, first])
-            columns.append(number[residual, second])
+        rows, columns = rows + joint_rows, columns + joint_columns
         none = [np.zeros(0, dtype=np.int64)]
         self.pattern, pairs = BlockPattern.from_pairs(layout.sizes, np.concatenate(rows or none), np.concatenate(columns or none))
         self._joint = []
         end = int(ends[-1]) if len(ends) else 0
         for group, number, lower in joint:
-            place = np.full(lower.shape, -1)
-            place[lower] = self.pattern.value_start[:-1][pairs.block[end : end + int(lower.sum())]]
-            end += int(lower.sum())
+            place = np.empty((*number.shape, number.shape[1]), dtype=np.int64)
+            _joint_places(number, self.pattern.value_start, pairs.block[end : end + lower], place)
+            end += lower
             column = np.cumsum([0, *(J.shape[2] for J in group.jacobians)])
             self._joint.append(Joint(group, column, np.where(number >= 0, layout.start[number], -1), place))
         self._products = [
@@ -244,6 +250,34 @@ def _lower_pairs(
             residual[count], row[count], column[count] = k, number_a[k], number_b[k]
             count += 1
     return residual[:count], row[:count], column[:count]
+
+
+@kernel
+def _joint_pairs(number: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]) -> int:
+    """The pairs (a, b) of free variables of each residual that lie in the lower triangle, one residual after the other."""
+    count = 0
+    for n in range(number.shape[0]):
+        for a in range(number.shape[1]):
+            for b in range(number.shape[1]):
+                if number[n, a] >= number[n, b] >= 0:
+                    row[count], column[count] = number[n, a], number[n, b]
+                    count += 1
+    return count
+
+
+@kernel
+def _joint_places(
+    number: NDArray[np.int64], value_start: NDArray[np.int64], block: NDArray[np.int64], place: NDArray[np.int64]
+) -> None:
+    """Where the values of the block of each pair begin, in the order of `_joint_pairs`; −1 for all others."""
+    count = 0
+    for n in range(number.shape[0]):
+        for a in range(number.shape[1]):
+            for b in range(number.shape[1]):
+                place[n, a, b] = -1
+                if number[n, a] >= number[n, b] >= 0:
+                    place[n, a, b] = value_start[block[count]]
+                    count += 1
 
 
 def _diagonal_places(pattern: BlockPattern) -> NDArray[np.int64]:

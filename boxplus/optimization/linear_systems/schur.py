@@ -32,7 +32,7 @@ from boxplus.optimization.linear_systems.schur_structure import (
     eliminated_numbers,
 )
 from boxplus.optimization.terms.group import Group
-from boxplus.optimization.terms.layout import Layout
+from boxplus.optimization.terms.layout import Layout, connected_numbers
 from boxplus.optimization.terms.variables import Variables
 from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite, SparseCholesky
 from boxplus.sparse.product_tiles import add_sums, tile_of
@@ -53,12 +53,13 @@ class SchurSystem(LinearSystem):
         # The eliminated variables are one block, so their tangents are one piece of the tangent vector.
         begin = int(layout.start[self._first])
         self._own = slice(begin, begin + count * e)
-        self._others = np.delete(np.arange(layout.dof), self._own)
+        self._others = np.concatenate([np.arange(begin), np.arange(begin + count * e, layout.dof)])
         self._C, self._L = np.zeros((count, e, e)), np.zeros((count, e, e))
         self._b, self._y = np.zeros((count, e)), np.zeros((count, e))
         self._squares, self._slopes = _gathers_of(layout, groups, eliminated, count, e)
-        self._equations = NormalEquations(self._rest, groups)
-        self._entries = build_entries(layout, self._rest, groups, eliminated, count)
+        connected = [connected_numbers(self._rest, group) for group in groups]
+        self._equations = NormalEquations(self._rest, groups, connected)
+        self._entries = build_entries(layout, self._rest, groups, connected, eliminated, count)
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
         self._values = np.zeros(int(self._pattern.value_start[-1]))
         self._cholesky = SparseCholesky(self._pattern, threads=threads, analysis=analysis)
@@ -168,9 +169,18 @@ class SchurSystem(LinearSystem):
 
     def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """See `LinearSystem.inverse_blocks`."""
+        end = self._first + len(self._C)
+        if ((first < self._first) | (first >= end)).all() and ((second < self._first) | (second >= end)).all():
+            return self._inverse_of_kept(first, second)
         return inverse_blocks(
             first, second, self._layout.sizes, self._first, self._L, self._entries, self._cholesky.inverse_blocks, self._threads
         )
+
+    def _inverse_of_kept(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """Blocks of S⁻¹, which is the inverse of H between kept variables; symmetric on the diagonal."""
+        i, j = (np.where(k < self._first, k, k - len(self._C)) for k in (first, second))
+        blocks = self._cholesky.inverse_blocks(i, j)
+        return [0.5 * block + 0.5 * block.T if a == b else block for block, a, b in zip(blocks, i, j, strict=True)]
 
 
 def _gathers_of(

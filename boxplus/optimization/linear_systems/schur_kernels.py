@@ -188,3 +188,58 @@ def list_pairs(begin: NDArray[np.int64], order: NDArray[np.int64], a: NDArray[np
             for j in range(begin[p], i + 1):
                 a[m], b[m] = order[i], order[j]
                 m += 1
+
+
+@kernel
+def number_entries(
+    kept_of: NDArray[np.int64],
+    eliminated_of: NDArray[np.int64],
+    at_eliminated: NDArray[np.int64],
+    at_kept: NDArray[np.int64],
+    entry: NDArray[np.int64],
+    kept: NDArray[np.int64],
+    eliminated: NDArray[np.int64],
+    variables: NDArray[np.int64],
+    begin: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Number the different pairs of an F and an E variable, F variable by F variable, ascending in E within each.
+
+    Args:
+        kept_of, eliminated_of: (n,) the pairs, repeated and in any order.
+        at_eliminated, at_kept: zeros, one more than there are variables of either kind.
+        entry: (n,) receives the number of each pair.
+        kept, eliminated: receive the pair of each number.
+        variables, begin: receive the F variables that are met, where the pairs of each begin, and their number.
+
+    Returns:
+        Numbers of different pairs, and of F variables that are met.
+    """
+    count = len(kept_of)
+    for n in range(count):
+        at_eliminated[eliminated_of[n] + 1] += 1
+        at_kept[kept_of[n] + 1] += 1
+    for k in range(len(at_eliminated) - 1):
+        at_eliminated[k + 1] += at_eliminated[k]
+    for k in range(len(at_kept) - 1):
+        at_kept[k + 1] += at_kept[k]
+    by_eliminated, order = np.empty(count, np.uint32), np.empty(count, np.uint32)
+    for n in range(count):
+        by_eliminated[at_eliminated[eliminated_of[n]]] = n
+        at_eliminated[eliminated_of[n]] += 1
+    for k in range(count):  # stably, so that pairs of an F variable ascend in E
+        n = by_eliminated[k]
+        order[at_kept[kept_of[n]]] = n
+        at_kept[kept_of[n]] += 1
+    pairs, met = 0, 0
+    for k in range(count):
+        n = order[k]
+        f, p = kept_of[n], eliminated_of[n]
+        if pairs == 0 or f != kept[pairs - 1] or p != eliminated[pairs - 1]:
+            if pairs == 0 or f != kept[pairs - 1]:
+                variables[met], begin[met] = f, pairs
+                met += 1
+            kept[pairs], eliminated[pairs] = f, p
+            pairs += 1
+        entry[n] = pairs - 1
+    begin[met] = pairs
+    return pairs, met

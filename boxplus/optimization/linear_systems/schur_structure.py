@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.linear_systems.normal_equations import Gather
-from boxplus.optimization.linear_systems.schur_kernels import count_pairs, list_pairs
+from boxplus.optimization.linear_systems.schur_kernels import count_pairs, list_pairs, number_entries
 from boxplus.optimization.terms.group import Group
-from boxplus.optimization.terms.layout import Layout, connected_numbers
+from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.variables import Variables
 from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.counting_sort import gather_by, order_by
@@ -72,15 +72,26 @@ def eliminated_numbers(layout: Layout, eliminated: Variables, group: Group) -> t
     return slots[0], np.where(number >= 0, number - int(own[own >= 0][0]), -1)
 
 
-def build_entries(layout: Layout, rest: Layout, groups: Sequence[Group], eliminated: Variables, count: int) -> list[Entries]:
-    """The entries of `count` eliminated variables, one `Entries` for each size of kept variables."""
+def build_entries(
+    layout: Layout,
+    rest: Layout,
+    groups: Sequence[Group],
+    connected: Sequence[Sequence[NDArray[np.int64]]],
+    eliminated: Variables,
+    count: int,
+) -> list[Entries]:
+    """The entries of `count` eliminated variables, one `Entries` for each size of kept variables.
+
+    Args:
+        rest: the layout of the kept ones; `connected`: for every group the numbers of its variables in that.
+    """
     parts: list[tuple[Group, int, int, NDArray[np.intp], NDArray[np.int64], NDArray[np.int64]]] = []
-    for group in groups:
+    for group, numbers in zip(groups, connected, strict=True):
         found = eliminated_numbers(layout, eliminated, group)
         if found is None:
             continue
         slot, e_number = found
-        for other, f_number in enumerate(connected_numbers(rest, group)):
+        for other, f_number in enumerate(numbers):
             selected = np.flatnonzero((f_number >= 0) & (e_number >= 0))
             if len(selected):
                 parts.append((group, slot, other, selected, f_number[selected], e_number[selected]))
@@ -100,16 +111,11 @@ def _entries_of(
     e: int,
 ) -> Entries:
     f_all, p_all = np.concatenate([f for *_, f, _ in parts]), np.concatenate([p for *_, p in parts])
-    # Sorted by E, then stably by F: entries come F variable by F variable, and ascend in E within each.
-    by_e = order_by(p_all, count)[0]
-    by_f = by_e[order_by(f_all[by_e], len(rest.sizes))[0]]
-    f_sorted, p_sorted = f_all[by_f], p_all[by_f]
-    is_new = np.ones(len(by_f), dtype=np.bool_)
-    is_new[1:] = (f_sorted[1:] != f_sorted[:-1]) | (p_sorted[1:] != p_sorted[:-1])
-    entry = np.empty(len(by_f), dtype=np.int64)
-    entry[by_f] = np.cumsum(is_new) - 1
-    kept, of = f_sorted[is_new], p_sorted[is_new]
-    variables, begin = np.unique(kept, return_index=True)
+    entry, kept, of = (np.empty(len(f_all), dtype=np.int64) for _ in range(3))
+    variables, begin = np.empty(len(rest.sizes), dtype=np.int64), np.empty(len(rest.sizes) + 1, dtype=np.int64)
+    by_e, by_f = np.zeros(count + 1, dtype=np.int64), np.zeros(len(rest.sizes) + 1, dtype=np.int64)
+    entries, met = number_entries(f_all, p_all, by_e, by_f, entry, kept, of, variables, begin)
+    kept, of, variables, begin = kept[:entries], of[:entries], variables[:met], begin[: met + 1]
     order, of_eliminated = order_by(of, count)
     gathers = []
     place, end = np.arange(len(kept)) * (e * dof), 0
@@ -119,7 +125,7 @@ def _entries_of(
     return Entries(
         dof=dof,
         start=rest.start[variables],
-        begin=np.append(begin, len(kept)),
+        begin=begin,
         kept=kept,
         eliminated=of.astype(np.uint32),
         Z=np.zeros((len(kept), e, dof)),

@@ -39,15 +39,20 @@ class Layout:
         count = 0
         sizes = []
         for block in self.blocks:
-            number = np.full(len(block), -1, dtype=np.int64)
-            free = ~block.is_fixed & (block is not without)
-            own = int(np.count_nonzero(free))
+            free = None if block is without or block.is_all_fixed else ~block.is_fixed
+            own = 0 if free is None else int(np.count_nonzero(free))
+            if own == len(block):
+                number = np.arange(count, count + own)
+            else:
+                number = np.full(len(block), -1, dtype=np.int64)
+                if free is not None:
+                    number[free] = np.arange(count, count + own)
             sizes.append(np.full(own, block.manifold.dof, dtype=np.int64))
-            number[free] = count + np.arange(own)
             count += own
             self.number.append(number)
         self.sizes = np.concatenate(sizes) if sizes else np.zeros(0, dtype=np.int64)
-        self.start = np.concatenate([[0], np.cumsum(self.sizes)])
+        self.start = np.zeros(len(self.sizes) + 1, dtype=np.int64)
+        np.cumsum(self.sizes, out=self.start[1:])
 
     def without(self, block: Variables) -> Layout:
         """The layout of all variables but those of `block`, which count as fixed."""

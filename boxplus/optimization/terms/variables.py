@@ -8,10 +8,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 
 _WIDEST = 8  # times as many places as ids to look up, of a table that is worth filling
+
+
+@kernel
+def find_rows(ids: NDArray[np.int64], wanted: NDArray[np.int64], rows: NDArray[np.uint32]) -> bool:
+    """Where each of the ids `wanted` stands among those that ascend, in `rows`; False where one is not among them."""
+    count, first = len(ids), ids[0] if len(ids) else 0
+    span = ids[count - 1] - first + 1 if count else 0
+    if span <= _WIDEST * len(wanted):
+        # Many are found sooner in a table than by a search for each.
+        table = np.full(span, -1)
+        for k in range(count):
+            table[ids[k] - first] = k
+        for k in range(len(wanted)):
+            place = wanted[k] - first
+            if place < 0 or place >= span or table[place] < 0:
+                return False
+            rows[k] = table[place]
+        return True
+    for k in range(len(wanted)):
+        row = np.searchsorted(ids, wanted[k])
+        if row >= count or ids[row] != wanted[k]:
+            return False
+        rows[k] = row
+    return True
 
 
 class Variables:
@@ -67,27 +92,14 @@ class Variables:
             return np.array([row], dtype=np.uint32)  # as marginal priors ask for theirs, one by one
         if not len(ids):
             return np.zeros(0, dtype=np.uint32)
-        rows = self.rows_near(ids)
-        if not (len(self.ids) and (self.ids.take(rows, mode="clip") == ids).all()):
+        rows = np.empty(len(ids), dtype=np.uint32)
+        if not find_rows(self.ids, np.array(ids, dtype=np.int64), rows):
             gone = ~np.isin(ids, self.ids)
             raise InputError(
                 f"variables of {self.name!r} that are there",
                 f"{self.name}[{ids[np.argmax(gone)]}], which was removed",
                 "drop what was connected to it",
             )
-        return rows.astype(np.uint32)
-
-    def rows_near(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """`rows_of` that does not look whether they are there."""
-        span = int(self.ids[-1] - self.ids[0]) + 1 if len(self.ids) else 0
-        return self._by_table(ids) if 0 < span <= _WIDEST * len(ids) else self.ids.searchsorted(ids)
-
-    def _by_table(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Rows of many ids, which a table finds sooner than a search for each; some row for those that are not there."""
-        first = self.ids[0]
-        table = np.zeros(int(self.ids[-1] - first) + 1, dtype=np.int64)
-        table[self.ids - first] = np.arange(len(self.ids))
-        rows: NDArray[np.int64] = table.take(ids - first, mode="clip")
         return rows
 
     def extend(self, values: NDArray[np.float64]) -> VariableRows:
@@ -193,12 +205,12 @@ class VariableRows:
         if block.next_id == len(block):  # nothing was ever removed
             if given.min() < 0 or given.max() >= block.next_id:
                 return False
-            rows = given.astype(np.uint32)
+            ids, rows = given.copy(), given.astype(np.uint32)
         else:
-            rows = block.rows_near(given).astype(np.uint32)
-            if not (block.ids.take(rows, mode="clip") == given).all():
+            ids, rows = given.copy(), np.empty(len(given), dtype=np.uint32)
+            if not find_rows(block.ids, ids, rows):
                 return False
-        self.ids, self._rows, self._revision = given.copy(), rows, self.block.revision
+        self.ids, self._rows, self._revision = ids, rows, self.block.revision
         return True
 
     def __len__(self) -> int:

@@ -44,7 +44,13 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.camera.image_residual import ImageResidual
-from boxplus.residuals.camera.on_body_kernel import body_jacobians, camera_poses, first_of_relative, relative_poses
+from boxplus.residuals.camera.on_body_kernel import (
+    all_camera_poses,
+    body_jacobians,
+    camera_poses,
+    first_of_relative,
+    relative_poses,
+)
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 
 CUT_ANEW_S = 0.005  # change of the time offset above which the velocity in the image is not constant any more
@@ -210,15 +216,18 @@ class OnBody(Residual):
     def _at(self, begin: int, end: int, x: Arrays, index: Rows) -> tuple[Arrays, Rows]:
         """Variables and rows of the camera residual; moves what it measures to the time of the poses."""
         own_x, own_index = [], []
+        tables: dict[tuple[int, int], Array] = {}
         for place in self._places:
             if len(place.poses) == 1:
                 body, mounting = place.first, place.first + 1
                 bodies, mountings = len(x[body]), len(x[mounting])
                 if 2 * bodies * mountings <= end - begin:
-                    # The poses of all cameras at all times once, not one for every residual.
-                    T, each = np.empty((bodies * mountings, 7)), np.arange(bodies * mountings, dtype=np.uint32)
-                    camera_poses(0, len(T), x[body], each // np.uint32(mountings), x[mounting], each % np.uint32(mountings), T)
-                    own_x.append(T)
+                    # The poses of all cameras at all times once, not one for every residual, nor for every place of the same.
+                    of = id(x[body]), id(x[mounting])
+                    if of not in tables:
+                        tables[of] = np.empty((bodies * mountings, 7))
+                        all_camera_poses(x[body], x[mounting], tables[of])
+                    own_x.append(tables[of])
                     own_index.append(place.table_rows(index[body], index[mounting], mountings))
                     continue
             for pair, T in enumerate(place.poses):

@@ -11,6 +11,28 @@ from boxplus.residuals.matrix3 import apply
 
 
 @kernel
+def _write_camera_pose(
+    n: int, i: int, k: int, bodies: NDArray[np.float64], mountings: NDArray[np.float64], T: NDArray[np.float64]
+) -> None:
+    """T[n] = (T_world_body T_body_camera)⁻¹ of body i and mounting k."""
+    bw, bx, by, bz = bodies[i, 0], bodies[i, 1], bodies[i, 2], bodies[i, 3]
+    lx, ly, lz = rotate(bw, bx, by, bz, mountings[k, 4], mountings[k, 5], mountings[k, 6])
+    w, x, y, z = multiply_scalars(bw, bx, by, bz, mountings[k, 0], mountings[k, 1], mountings[k, 2], mountings[k, 3])
+    px, py, pz = rotate(w, -x, -y, -z, bodies[i, 4] + lx, bodies[i, 5] + ly, bodies[i, 6] + lz)
+    T[n, 0], T[n, 1], T[n, 2], T[n, 3] = w, -x, -y, -z
+    T[n, 4], T[n, 5], T[n, 6] = -px, -py, -pz
+
+
+@kernel
+def all_camera_poses(bodies: NDArray[np.float64], mountings: NDArray[np.float64], T: NDArray[np.float64]) -> None:
+    """T_camera_world of every mounting on every body, body by body, in T (bodies · mountings, 7)."""
+    count = np.uint64(mountings.shape[0])
+    for i in range(np.uint64(bodies.shape[0])):
+        for k in range(count):
+            _write_camera_pose(i * count + k, i, k, bodies, mountings, T)
+
+
+@kernel
 def camera_poses(
     begin: int,
     end: int,
@@ -22,13 +44,7 @@ def camera_poses(
 ) -> None:
     """T[n] = T_camera_world = (T_world_body T_body_camera)⁻¹ for the rows [begin, end) of T (N, 7)."""
     for n in range(np.uint64(begin), np.uint64(end)):
-        i, k = body_of[n], mounting_of[n]
-        bw, bx, by, bz = bodies[i, 0], bodies[i, 1], bodies[i, 2], bodies[i, 3]
-        lx, ly, lz = rotate(bw, bx, by, bz, mountings[k, 4], mountings[k, 5], mountings[k, 6])
-        w, x, y, z = multiply_scalars(bw, bx, by, bz, mountings[k, 0], mountings[k, 1], mountings[k, 2], mountings[k, 3])
-        px, py, pz = rotate(w, -x, -y, -z, bodies[i, 4] + lx, bodies[i, 5] + ly, bodies[i, 6] + lz)
-        T[n, 0], T[n, 1], T[n, 2], T[n, 3] = w, -x, -y, -z
-        T[n, 4], T[n, 5], T[n, 6] = -px, -py, -pz
+        _write_camera_pose(n, body_of[n], mounting_of[n], bodies, mountings, T)
 
 
 @kernel

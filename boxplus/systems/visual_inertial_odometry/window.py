@@ -31,7 +31,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.creep import CornerCreep
-from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, motion_px
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, most_are_below, motion_px
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import mean_parallax, triangulate
 from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
@@ -148,11 +148,8 @@ class Window:
         self._add(tracks, pose, state, is_keyframe, imu)
         number = self.frames[-1].number
         _, landmark, row = np.intersect1d(self._track, tracks.ids, assume_unique=True, return_indices=True)
-        for camera in range(tracks.pixels.shape[1]):
-            there = np.isfinite(tracks.pixels[row, camera, 0])
-            here = np.full(int(there.sum()), number)
-            ids, pixels = self.points.ids[landmark[there]], tracks.pixels[row[there], camera]
-            self._seen.add(here, ids, np.full(len(here), camera), pixels)
+        camera, k = np.nonzero(np.isfinite(tracks.pixels[row][:, :, 0]).T)
+        self._seen.add(np.full(len(k), number), self.points.ids[landmark[k]], camera, tracks.pixels[row[k], camera])
         self.lines.add(number, tracks.lines)
         if is_keyframe:
             self._found_landmarks()
@@ -176,7 +173,7 @@ class Window:
         before = next((f for f in reversed(self.frames[:-1]) if newest.time_ns - f.time_ns > _REST_NS), None)
         moved = np.zeros(0) if before is None else motion_px(before.tracks, newest)
         # All corners of a scene that turns or nears move; noise of a few does not make motion.
-        return len(moved) >= _REST_CORNERS and float(np.quantile(moved, 0.8)) < _REST_PX
+        return len(moved) >= _REST_CORNERS and most_are_below(moved, _REST_PX)
 
     def hold_still(self) -> None:
         """The velocity of the newest frame is zero, as far as corners that stand still say."""
@@ -216,11 +213,9 @@ class Window:
         numbers = np.array([frame.number for frame in keyframes])
         self._track = np.append(self._track, lone[chosen])
         self._anchor = np.append(self._anchor, numbers[anchor[chosen]])
-        for k in range(len(keyframes)):
-            for camera in range(cameras):
-                rows = np.isfinite(pixels[k, chosen, camera, 0]) & (anchor[chosen] <= k)
-                here = np.full(int(rows.sum()), numbers[k])
-                self._seen.add(here, ids[rows], np.full(len(here), camera), pixels[k, chosen[rows], camera])
+        there = np.isfinite(pixels[:, chosen][..., 0]) & (anchor[chosen] <= np.arange(len(keyframes))[:, None])[:, :, None]
+        of, camera, k = np.nonzero(there.transpose(0, 2, 1))
+        self._seen.add(numbers[of], ids[k], camera, pixels[of, chosen[k], camera])
 
     def wants_keyframe(self, tracks: Tracks, pose: Floats) -> bool:
         """Whether a frame at the predicted pose (7,) shows enough that is new, or little of what is known."""
@@ -344,7 +339,8 @@ class Window:
         information = np.zeros(len(self.points))
         if self._views is not None:
             group, _ = self._views
-            np.add.at(information, group.connections[-1].rows, (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1))
+            squares = (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1)
+            information = np.bincount(group.connections[-1].rows, squares, len(self.points))
         return self._creep.weight / np.sqrt(np.maximum(information, 1e-12))
 
     def _remove_landmarks(self, gone: NDArray[np.bool_]) -> None:

@@ -256,6 +256,25 @@ def test_shared_variables_get_the_sum() -> None:
         np.testing.assert_allclose((apart[1] + apart[3])[0, :, k], difference, atol=1e-5)
 
 
+def test_poses_shared_by_many_residuals_are_worked_out_once_and_to_the_same_bits() -> None:
+    rng = np.random.default_rng(3)
+    body, mounting = bp.BodyPose.random(rng, 3), bp.BodyPose.random(rng, 2)
+    body[1:] = nearby(rng, np.repeat(body[:1], 2, axis=0), 0.1, 0.5)
+    mounting[1:] = nearby(rng, mounting[:1], 0.05, 0.2)
+    point = np.column_stack([rng.uniform(-0.3, 0.3, (COUNT, 2)), rng.uniform(0.1, 0.5, COUNT)])
+    residual = residuals.OnBody(residuals.InverseDepthReprojection(CAMERA, pixels(rng)))
+    of = [rng.integers(0, size, COUNT) for size in (3, 2, 3, 2)]
+    problem = bp.Problem()
+    bodies, mountings = problem.add_variables(bp.BodyPose, body), problem.add_variables(bp.BodyPose, mounting)
+    points = problem.add_variables(bp.Euclidean(3), point)
+    group = problem.add_residuals(residual, bodies[of[0]], mountings[of[1]], bodies[of[2]], mountings[of[3]], points)
+    group.linearize([body, mounting, point], 1)
+    alone = residual.linearize(body[of[0]], mounting[of[1]], body[of[2]], mounting[of[3]], point)
+    np.testing.assert_array_equal(group.r, alone.residuals)
+    for J, own in zip(group.jacobians, alone.jacobians, strict=True):
+        np.testing.assert_array_equal(J, own)
+
+
 def test_the_time_offset_moves_what_was_measured() -> None:
     rng = np.random.default_rng(4)
     pair, p = one_view(rng)

@@ -9,6 +9,7 @@ Source: Lucas and Kanade 1981; Bouguet, Pyramidal implementation, 2001; Shi and 
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -18,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._extras import require
+from boxplus._jit import kernel
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.centres import centred
 from boxplus.systems.visual_inertial_odometry.corners.shutter import BodyMotion, at_once
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
-from boxplus.systems.visual_inertial_odometry.corners.triangulation import inverse_depths
+from boxplus.systems.visual_inertial_odometry.corners.triangulation import epipolar_distances, inverse_depths
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 
 _WINDOW = (21, 21)
@@ -193,8 +195,7 @@ class FeatureTracker:
         brightness, contrast = np.full((2, len(self._images)), np.nan)
         for k, image in enumerate(self._images):
             if image is not None:
-                some = image[::8, ::8]
-                brightness[k], contrast[k] = some.mean(), some.std()
+                brightness[k], contrast[k] = _mean_and_deviation(np.ascontiguousarray(image[::8, ::8]))
         counts = {reason: count for reason, count in rejected.items() if count}
         pixels, rays = self._pixels.copy(), self._rays.copy()
         for c, camera in enumerate(self._rig.cameras):
@@ -263,11 +264,8 @@ class FeatureTracker:
             there, kept = self._flow(first, image, self._pixels[tried, 0], guess, Counter())
             rays, found = model.unproject(there)
             kept &= found & self._inside(there, c)
-            # y = (turned + ρ t) / z lies on the line through turned and t: n = t × turned is at right angles to it.
             turned = self._rays[tried, 0] @ T[:3, :3].T
-            n = np.cross(T[:3, 3], turned)
-            off = np.abs((n * rays).sum(axis=1)) / np.linalg.norm(n[:, :2], axis=1) * model.fx
-            on_line = off < self._config.epipolar
+            on_line = model.fx * epipolar_distances(turned, T[:3, 3], rays) < self._config.epipolar
             rho, information = inverse_depths(turned, T[:3, 3], rays)
             before = rho > -2.0 * self._config.pixel_sigma / model.fx / np.sqrt(information)
             rejected["off its epipolar line"] += int((kept & ~on_line).sum())
@@ -277,14 +275,35 @@ class FeatureTracker:
             self._rho[tried[kept]] = np.maximum(rho[kept], 0.0)
 
     def _inside(self, pixels: Floats, camera: int) -> NDArray[np.bool_]:
-        size = np.array([self._rig.cameras[camera].width, self._rig.cameras[camera].height])
-        return np.asarray(((pixels >= _BORDER) & (pixels <= size - 1 - _BORDER)).all(axis=1))
+        of = self._rig.cameras[camera]
+        u, v = pixels[:, 0], pixels[:, 1]
+        inside = (u >= _BORDER) & (u <= of.width - 1 - _BORDER) & (v >= _BORDER) & (v <= of.height - 1 - _BORDER)
+        return np.asarray(inside)
 
     def _empty(self, shape: tuple[int, ...], cell: int) -> Grey:
         """(H, W) 255 in cells without a corner and around them no nearer to one than half a cell, else 0."""
         mask = np.full(shape, 255, np.uint8)
         mask[:_BORDER], mask[-_BORDER:], mask[:, :_BORDER], mask[:, -_BORDER:] = 0, 0, 0, 0
-        half = cell // 2
-        for u, v in np.rint(self._pixels[:, 0]).astype(np.int64):
-            mask[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1] = 0
+        _clear(np.rint(self._pixels[:, 0]).astype(np.int64), cell // 2, mask)
         return mask
+
+
+@kernel
+def _mean_and_deviation(grey: Grey) -> tuple[float, float]:
+    """Mean and standard deviation of grey values (H, W)."""
+    total, squares, count = 0, 0, grey.size
+    for row in range(grey.shape[0]):
+        for column in range(grey.shape[1]):
+            value = np.int64(grey[row, column])
+            total += value
+            squares += value * value
+    return total / count, math.sqrt(float(count * squares - total * total)) / count
+
+
+@kernel
+def _clear(corners: NDArray[np.int64], half: int, mask: Grey) -> None:
+    """Zero about every corner (n, 2), `half` pixels wide to all sides."""
+    for k in range(len(corners)):
+        for v in range(max(corners[k, 1] - half, 0), min(corners[k, 1] + half + 1, mask.shape[0])):
+            for u in range(max(corners[k, 0] - half, 0), min(corners[k, 0] + half + 1, mask.shape[1])):
+                mask[v, u] = 0

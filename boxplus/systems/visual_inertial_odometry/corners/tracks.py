@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from boxplus.systems.visual_inertial_odometry.lines.tracks import LineTracks
 
+_MOST = 0.8
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
@@ -47,3 +49,10 @@ def motion_px(before: Tracks, now: Tracks) -> NDArray[np.float64]:
     """By how much each corner that both saw has moved in the first camera (n,) [px]."""
     _, then, there = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
     return np.asarray(np.linalg.norm(now.pixels[there, 0] - before.pixels[then, 0], axis=1))
+
+
+def most_are_below(values: NDArray[np.float64], limit: float) -> bool:
+    """Whether the quantile of 80 % of the values (n,), n ≥ 1, is below the limit."""
+    if np.count_nonzero(values < limit) < _MOST * (len(values) - 1):
+        return False  # as mostly, and without the quantile: both values between which it lies reach the limit
+    return float(np.quantile(values, _MOST)) < limit

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.manifolds import quaternion
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import RigCamera
@@ -95,7 +98,37 @@ def inverse_depths(turned: Floats, t: Floats, rays: Floats) -> tuple[Floats, Flo
     Returns:
         (n,) ρ, in units of 1/|t|'s; (n,) its information for equations of unit variance, where turned_z is 1.
     """
-    a = t[:2] - rays[:, :2] * t[2]
-    b = rays[:, :2] * turned[:, 2:3] - turned[:, :2]
-    information = np.maximum((a * a).sum(axis=1), _LEAST_INFORMATION)
-    return (a * b).sum(axis=1) / information, information
+    rho, information = np.empty((2, len(rays)))
+    _intersect(*(np.ascontiguousarray(values) for values in (turned, t, rays)), rho, information)
+    return rho, information
+
+
+@kernel
+def _intersect(turned: Floats, t: Floats, rays: Floats, rho: Floats, information: Floats) -> None:
+    for k in range(len(rays)):
+        a0, a1 = t[0] - rays[k, 0] * t[2], t[1] - rays[k, 1] * t[2]
+        b0, b1 = rays[k, 0] * turned[k, 2] - turned[k, 0], rays[k, 1] * turned[k, 2] - turned[k, 1]
+        square = a0 * a0 + a1 * a1
+        information[k] = _LEAST_INFORMATION if square < _LEAST_INFORMATION else square
+        rho[k] = (a0 * b0 + a1 * b1) / information[k]
+
+
+def epipolar_distances(turned: Floats, t: Floats, rays: Floats) -> Floats:
+    """How far (n,) rays of a second camera lie from the epipolar lines of those of the first, in units of the rays.
+
+    (turned + ρ t) / z lies on the line through turned and t, to which n = t × turned is at right angles.
+
+    Args:
+        turned, t, rays: as for `inverse_depths`.
+    """
+    off = np.empty(len(rays))
+    _measure(*(np.ascontiguousarray(values) for values in (turned, t, rays)), off)
+    return off
+
+
+@kernel
+def _measure(turned: Floats, t: Floats, rays: Floats, off: Floats) -> None:
+    for k in range(len(rays)):
+        x, y, z = turned[k, 0], turned[k, 1], turned[k, 2]
+        n0, n1, n2 = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x
+        off[k] = abs((n0 * rays[k, 0] + n1 * rays[k, 1]) + n2 * rays[k, 2]) / math.sqrt(n0 * n0 + n1 * n1)

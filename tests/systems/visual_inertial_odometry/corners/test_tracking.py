@@ -6,12 +6,15 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from boxplus import InputError, Pinhole
 from boxplus.manifolds import so3
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
 from boxplus.systems.visual_inertial_odometry.corners import tracking
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
+from boxplus.systems.visual_inertial_odometry.corners.tracks import most_are_below
 
 SIZE = (320, 240)
 CAMERA = Pinhole(220.0, 220.0, 159.5, 119.5)
@@ -157,3 +160,22 @@ def test_opencv_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(InputError, match=r"boxplus\[vision\]"):
         FeatureTracker(VioConfig(), stereo())
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 60), limit=st.sampled_from([0.2, 0.5, 0.8, 0.81]))
+def test_whether_most_stand_still_is_what_the_quantile_says(seed: int, count: int, limit: float) -> None:
+    rng = np.random.default_rng(seed)
+    values = np.where(rng.random(count) < 0.3, limit, rng.random(count))  # some of them at the limit
+    assert most_are_below(values, limit) == (np.quantile(values, 0.8) < limit)
+
+
+def test_light_is_measured_as_numpy_does_and_cells_with_corners_are_closed() -> None:
+    rng = np.random.default_rng(0)
+    for grey in (rng.integers(0, 256, (60, 94), np.uint8), np.full((5, 7), 201, np.uint8)):
+        np.testing.assert_allclose(tracking._mean_and_deviation(grey), (grey.mean(), grey.std()), rtol=1e-12, atol=1e-12)
+    corners = rng.integers(-8, 70, (12, 2))
+    mask, expected = np.full((2, 48, 64), 255, np.uint8)
+    tracking._clear(corners, 5, mask)
+    for u, v in corners:
+        expected[max(v - 5, 0) : max(v + 6, 0), max(u - 5, 0) : max(u + 6, 0)] = 0
+    np.testing.assert_array_equal(mask, expected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.systems.visual_inertial_odometry.corners.triangulation import triangulate
+from boxplus.systems.visual_inertial_odometry.corners.triangulation import epipolar_distances, inverse_depths, triangulate
 
 
 def views(p_world: np.ndarray, bodies: np.ndarray, mountings: np.ndarray) -> np.ndarray:
@@ -51,3 +51,21 @@ def test_what_has_no_parallax_or_does_not_agree_is_not_believed() -> None:
     rays = views(p_world, bodies, mountings)
     rays[:, :, 0] = np.nan
     assert not triangulate(rays, bodies, mountings, 1e-3)[2].any()
+
+
+def test_two_views_give_the_depth_and_tell_how_far_a_ray_is_off_its_epipolar_line() -> None:
+    bodies, mountings, p_world = rig(5, 1)
+    rays = views(p_world, bodies, mountings)[0]
+    T = se3.compose(se3.inverse(mountings[1]), mountings[0])
+    turned, t = rays[:, 0] @ quaternion.to_matrix(T[:4]).T, T[4:]
+    rho, information = inverse_depths(turned, t, rays[:, 1])
+    depth = se3.act(se3.inverse(se3.compose(bodies[0], mountings[0])), p_world)[:, 2]
+    np.testing.assert_allclose(rho, 1.0 / depth, rtol=1e-9)
+    np.testing.assert_allclose(information, ((t[:2] - rays[:, 1, :2] * t[2]) ** 2).sum(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(epipolar_distances(turned, t, rays[:, 1]), 0.0, atol=1e-12)
+    moved = rays[:, 1] + np.append(np.random.default_rng(0).normal(size=(len(rays), 2)), np.zeros((len(rays), 1)), axis=1)
+    line = np.cross(t, turned)
+    expected = np.abs((line * moved).sum(axis=1)) / np.linalg.norm(line[:, :2], axis=1)
+    np.testing.assert_allclose(epipolar_distances(turned, t, moved), expected, rtol=1e-12)
+    lost = np.where(np.arange(len(rays))[:, None] == 3, np.nan, rays[:, 1])
+    assert np.isnan(inverse_depths(turned, t, lost)[0][3]) and np.isnan(epipolar_distances(turned, t, lost)[3])
