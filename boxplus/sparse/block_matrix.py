@@ -230,7 +230,7 @@ def _is_partition(col_start: NDArray[np.int64], blocks: int) -> bool:
     ascends = col_start[0] == 0 and col_start[len(col_start) - 1] == blocks
     for column in range(len(col_start) - 1):
         ascends &= col_start[column + 1] > col_start[column]
-    return ascends
+    return bool(ascends)
 
 
 @kernel
