@@ -329,7 +329,8 @@ class Window:
             imu_ratio=self._creep.weight * float(np.sqrt(imu[-_LAST_INTERVALS:].mean())) if len(imu) else 0.0,
             lines=self.lines.reject(values, self.frames[-1].number, threshold),
         )
-        seen.keep(~bad)
+        if bad.any():
+            seen.keep(~bad)
         self._rho_sigma = self._inverse_depth_sigmas()
         self._remove_landmarks(gone)
         return fit

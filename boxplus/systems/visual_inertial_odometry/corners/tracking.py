@@ -181,7 +181,8 @@ class FeatureTracker:
 
     def forget(self, ids: NDArray[np.int64]) -> None:
         """Follow these corners no longer: they move on their own, or were never corners."""
-        self._keep(~np.isin(self._ids, ids))
+        if len(ids):
+            self._keep(~np.isin(self._ids, ids))
 
     def snapshot(self) -> dict[str, object]:
         """All that `track` depends on beside config and rig; only to be read."""
