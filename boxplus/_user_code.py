@@ -40,7 +40,7 @@ _SCALARS = (bool, int, str, bytes, type(None), type(Ellipsis))
 
 @dataclass(frozen=True, eq=False)
 class UserCode:
-    """A function of a user's as it is now. Two are equal where what they compile to cannot differ.
+    """A function of a user's as it is now. Two are equal where what they compile to cannot differ; one without a key only to itself.
 
     Attributes:
         function: as it was given.
@@ -69,7 +69,9 @@ class UserCode:
         return cached_name(__file__, "".join(variant), self)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, UserCode) and (self.function, self.key) == (other.function, other.key)
+        if self.key is None or not isinstance(other, UserCode):
+            return self is other
+        return (self.function, self.key) == (other.function, other.key)
 
     def __hash__(self) -> int:
         return hash((self.function, self.key))
@@ -87,7 +89,7 @@ Translation = Callable[[Any, frozenset[str]], Any]
 
 
 def snapshot(function: Callable[..., Any], *, checked: bool, translated: Translation | None = None) -> FunctionType:
-    """The function, a plain or a compiled one, with copies of all that it refers to by name.
+    """The function, a plain or a compiled one, with copies of all that it refers to by name, arrays included.
 
     Functions that a user compiled are compiled again for it, also those that it reaches through a module: one that was compiled
     before may have read constants that changed since. With `checked` they, too, look at the bounds of arrays. Kernels of
@@ -119,8 +121,9 @@ class _Snapshot:
         for name in ("__builtins__", "__name__"):
             scope[name] = function.__globals__.get(name, "boxplus._user_code")
         cells = tuple(self._cell(cell, attributes) for cell in function.__closure__ or ())
-        copy = FunctionType(function.__code__, scope, function.__name__, function.__defaults__, cells)
-        copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
+        copy = FunctionType(function.__code__, scope, function.__name__, self._copied(function.__defaults__), cells)
+        copy.__kwdefaults__ = {name: self._copied(value) for name, value in (function.__kwdefaults__ or {}).items()} or None
+        copy.__qualname__ = function.__qualname__
         self._outer.pop()
         return copy
 
@@ -153,7 +156,19 @@ class _Snapshot:
             for name in attributes & vars(value).keys():
                 setattr(copy, name, self._replaced(vars(value)[name], attributes))
             return copy
-        return value if self._translated is None else self._translated(value, attributes)
+        return self._copied(value) if self._translated is None else self._translated(value, attributes)
+
+    def _copied(self, value: Any) -> Any:
+        """Arrays, also within tuples and lists, as they are now: whoever has the originals may write to them."""
+        if self._translated is not None:  # of what was copied before
+            return value
+        if isinstance(value, np.ndarray | np.void):
+            return value.copy("K") if isinstance(value, np.ndarray) else value.copy()
+        if type(value) in (tuple, list):
+            return type(value)(map(self._copied, value))
+        if isinstance(value, tuple) and hasattr(value, "_make"):
+            return value._make(map(self._copied, value))
+        return value
 
 
 _copies = itertools.count()

@@ -9,7 +9,7 @@ import textwrap
 import time
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -24,6 +24,7 @@ from boxplus._jit import kernel, on_compilation
 from boxplus._user_code import UserCode, snapshot
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.losses import UserLoss
+from boxplus.optimization.user_loss import compiled_loss
 from boxplus.residuals.user_residual import UserResidual
 
 compiles = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="nothing is compiled")
@@ -132,6 +133,10 @@ _opaque = _Opaque()
 _helpers_in_a_tuple = (np.sin, _opaque)
 
 
+class _Pair(NamedTuple):
+    scale: float
+
+
 def _reads_an_object(x):
     return _opaque if x[0] > 0.0 else x[0]
 
@@ -230,6 +235,56 @@ def test_a_snapshot_keeps_what_was_there() -> None:
     assert kernel(taken, cached=False)(2.0) == 30.0
 
 
+@compiles
+def test_a_snapshot_keeps_arrays_that_are_written_to_later() -> None:
+    scope: dict[str, Any] = {"numba": numba, "np": np}
+    text = """
+    A, PAIR, RECORD = np.array([1.0]), (2, np.array([2.0])), np.array([(4.0,)], dtype=[("w", "f8")])
+    @numba.njit
+    def h(x):
+        return x + A[0]
+    def outer(cell):
+        def f(x, y=np.array([16.0])):
+            return h(x) + PAIR[1][0] + RECORD.w[0] + cell[0] + y[0]
+        return f
+    """
+    exec(textwrap.dedent(text), scope)
+    cell = np.array([8.0])
+    function = scope["outer"](cell)
+    code = UserCode.of(function)
+    for array in (scope["A"], scope["PAIR"][1], scope["RECORD"]["w"], cell, function.__defaults__[0]):
+        array *= 100.0
+    assert code.key is not None and code.key != _key(function)
+    for checked in (False, True):
+        taken = code.snapshot(checked=checked)
+        assert taken.__defaults__ is not None and taken.__defaults__[0][0] == 16.0
+        assert kernel(taken, cached=False)(0.0, np.array([0.0])) == 15.0
+
+
+@compiles
+def test_what_has_no_key_is_never_taken_for_what_it_was_before() -> None:
+    scope: dict[str, Any] = {"C": _Pair(2.0)}
+    exec("def f(x):\n    return C.scale * x[0]\ndef loss(s):\n    return C.scale * s, C.scale, 0.0", scope)
+
+    def value() -> float:
+        residual = UserResidual(scope["f"], dim=1, manifolds=(Euclidean(1),), count=1)
+        assert residual.linearize([1.0]).jacobians[0][0, 0, 0] == residual.evaluate([1.0])[0, 0]
+        return float(residual.evaluate([1.0])[0, 0])
+
+    assert _key(scope["f"]) is None
+    assert value() == 2.0
+    losses = [UserLoss(scope["loss"])]
+    scope["C"] = _Pair(3.0)
+    assert value() == 3.0
+    losses.append(UserLoss(scope["loss"]))
+    assert losses[0] != losses[1] and losses[0] == losses[0].with_scale(1.0)
+    derivatives = np.zeros((2, 1, 3))
+    for loss, found in zip(losses, derivatives, strict=True):
+        assert loss.taken_down is not None
+        compiled_loss(loss.taken_down)[0](0, 1, 1.0, np.ones((1, 1)), np.ones(1, dtype=np.bool_), found)
+    assert np.array_equal(derivatives[:, 0], [[2.0, 2.0, 0.0], [3.0, 3.0, 0.0]])
+
+
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("BOXPLUS_CACHE_DIR", str(tmp_path / "cache"))
@@ -309,6 +364,32 @@ def test_a_new_process_compiles_nothing_of_a_loss_and_a_residual(tmp_path: Path)
     assert run(text) == "0.666666667 True"
     assert run(text) == "0.666666667 False"
     assert run("# one line more\n" + text.replace("x[0] - z", "x[0] - z - 1.0")) == "0.333333333 True"
+
+
+@compiles
+def test_arrays_written_to_between_two_compilations_do_not_reach_other_processes(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        textwrap.dedent("""
+        import sys
+        import numpy as np
+        import boxplus as bp
+
+        K = np.array([2.0])
+        stretched = bp.UserManifold(
+            "Stretched", size=1, dof=1, identity=[0.0],
+            plus=lambda x, delta: (x[0] + K[0] * delta[0],), minus=lambda x, base: ((x[0] - base[0]) / K[0],),
+        )
+        K[0] = float(sys.argv[1])
+        position = bp.residuals.UserResidual(lambda x: x[0], dim=1, manifolds=(stretched,), count=1, jacobian="automatic")
+        print(position.linearize([1.0]).jacobians[0].item(), stretched.boxplus([1.0], [1.0]).item())
+        """)
+    )
+    environment = {**os.environ, "BOXPLUS_CACHE_DIR": str(tmp_path / "cache")}
+    for factor in ("5.0", "2.0"):
+        command = [sys.executable, str(program), factor]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["2.0", "3.0"]
 
 
 def test_losses_of_one_function_are_equal_and_follow_its_constants() -> None:

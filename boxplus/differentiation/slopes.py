@@ -97,7 +97,7 @@ def _fmod(a: float, b: float) -> tuple[float, float, float]:
 
 def power(x: float, y: float) -> tuple[float, float, float]:
     value = x**y
-    return value, y * x ** (y - 1.0), value * math.log(x)
+    return value, y * x ** (y - 1.0) if y != 0.0 else 0.0, value * math.log(x)
 
 
 def power_of_integer(x: float, n: int) -> tuple[float, float, float]:

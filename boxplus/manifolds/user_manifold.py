@@ -21,6 +21,7 @@ from boxplus.manifolds._kernel_manifold import KernelManifold, checked_rows
 
 _STEP = 1e-5  # of differences, where compilation is switched off
 _ROUNDING = 1e-9
+_SLOPE = 1e-6  # of derivatives that are the identity but for rounding
 _LINE = types.Array(types.float64, 1, "C")
 _TABLE = types.Array(types.float64, 2, "C")
 _STACK = types.Array(types.float64, 3, "C")
@@ -38,7 +39,7 @@ class UserManifold(KernelManifold):
         x ⊞ 0 = x,   x ⊞ (y ⊟ x) = y,   (x ⊞ δ) ⊟ x = δ
 
     (Hertzberg et al., Integrating generic sensor fusion algorithms, 2013, section 3), which are looked at near `identity` when
-    the manifold is made. Jacobians come from the compiled functions by automatic differentiation (docs/differentiation.md), or
+    the manifold is made, with the derivative of the last at δ = 0, by which tangents are compared. Jacobians come from the compiled functions by automatic differentiation (docs/differentiation.md), or
     from functions of your own. Two are equal where what they compile to cannot differ.
 
     Args:
@@ -102,6 +103,7 @@ class UserManifold(KernelManifold):
         self._minus = self._mapping("minus", self.minus, dof, checked=False)
         self._plus_jacobian = self._jacobian("plus_jacobian", self._jacobians[0])
         self._minus_jacobian = self._jacobian("minus_jacobian", self._jacobians[1])
+        self._check_derivatives_at_zero()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UserManifold) and self._parts == other._parts
@@ -150,6 +152,27 @@ class UserManifold(KernelManifold):
         scope = {"function": function, "partials_into": partials_into, "np": np, "__name__": __name__}
         exec(compile(source, "<boxplus user_basis>", "exec"), scope)
         return kernel(scope["user_basis"], inline=True, cached=False, internal=True)
+
+    def _basis(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(size, dof) what `tangent_basis` gives at x (size,); None where ⊞ is not differentiated."""
+        if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
+            return None
+        source = f"""
+def basis_at(x, basis):
+    unit, eye = zeros(({self.dof},), {self.dof}), np.eye({self.dof})
+    for k in range(np.uint64({self.dof})):
+        unit[k] = seeded(0.0, eye, k, np.uint64(0), {self.dof})
+    user_basis(x, unit, basis, 0, 0)
+"""
+        try:
+            names = {"np": np, "zeros": zeros, "seeded": seeded, "user_basis": self.tangent_basis()}
+            loop = generated(__file__, "basis_at", source, names, self.plus)
+            loop.compile((_LINE, _TABLE))
+        except Exception:  # with Jacobians of one's own it need not be differentiable
+            return None
+        basis = np.zeros((self.size, self.dof))
+        loop(x, basis)
+        return basis
 
     def _dual(self, code: UserCode) -> Any:
         return kernel(dual_snapshot(code.snapshot(checked=False), self.dof), inline=True, cached=False, internal=True)
@@ -259,4 +282,30 @@ def {role}(x, other, J):
                     f"{what} on {self.name}, at the identity {x} and δ = {delta.round(4)}",
                     f"{got} where {expected} is expected",
                     "let minus undo what plus does",
+                )
+
+    def _check_derivatives_at_zero(self) -> None:
+        """That ∂((x ⊞ δ) ⊟ x)/∂δ is the identity at δ = 0: a function that leaves early there has other derivatives than beside it."""
+        x = self._identity
+        points = np.array([x, self.boxplus(x, 0.1 * np.cos(np.arange(1.0, 1.0 + self.dof)))])
+        advice = "let no branch at δ = 0 or x = base leave without them (if n < eps: return x): choose the factor there, not the result"
+        is_compiled = not numba_config.DISABLE_JIT  # type: ignore[attr-defined]
+        for role, own, J in (
+            ("plus", self._jacobians[0], self.boxplus_jacobian(points, np.zeros((2, self.dof)))),
+            ("minus", self._jacobians[1], self.boxminus_jacobian(points, points)),
+        ):
+            if (is_compiled or own is not None) and not np.abs(J - np.eye(self.dof)).max() <= _SLOPE:
+                raise InputError(
+                    f"∂((x ⊞ δ) ⊟ x)/∂δ = 1 at δ = 0 on {self.name}, the derivative of an axiom",
+                    f"{J[0].round(6).tolist()} at x = {x} from {f'{role}_jacobian' if own else 'the derivatives of plus and minus'}",
+                    "correct it" if own else advice,
+                )
+        if any(self._jacobians) and (basis := self._basis(x)) is not None:  # otherwise it is part of what was looked at
+            e = _STEP * np.eye(self.dof)
+            expected = ((self.boxplus(x, e) - self.boxplus(x, -e)) / (2.0 * _STEP)).T
+            if not np.abs(basis - expected).max() <= 1e-5 * max(1.0, np.abs(expected).max(), np.abs(x).max()):
+                raise InputError(
+                    f"derivatives {expected.round(6).tolist()} of x ⊞ δ at δ = 0 on {self.name}, as differences give them",
+                    f"{basis.round(6).tolist()} from plus",
+                    advice,
                 )

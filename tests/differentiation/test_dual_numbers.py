@@ -172,6 +172,14 @@ def test_corners_have_the_mean_of_their_sides_and_poles_none() -> None:
     assert J[3, 0] == 0.0 and np.isinf(J[3, 1]) and np.isnan(J[4]).all()
 
 
+def test_powers_of_zero() -> None:
+    def f(x):
+        return x[0] ** 0.0, x[0] ** 0, x[0] ** 1.0, x[0] ** 1, x[0] ** 2.5, np.power(x[0], 0.0), math.pow(x[0], x[1])
+
+    J = _automatic(f, 7, 2).linearize([0.0, 0.0]).jacobians[0][0]
+    assert np.array_equal(J[:6, 0], [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) and J[6, 0] == 0.0
+
+
 @numba.njit
 def _rounded(x):
     return int(x)

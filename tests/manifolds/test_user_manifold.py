@@ -127,6 +127,73 @@ def test_what_is_no_manifold_is_refused() -> None:
         _scale(dof=0)
 
 
+def _plane(**changes: Any) -> bp.UserManifold:
+    given: dict[str, Any] = {"plus": _moved, "minus": _way, "identity": [0.0, 0.0]}
+    return bp.UserManifold("Plane", size=2, dof=2, **{**given, **changes})
+
+
+def _moved(x, delta):
+    return x[0] + delta[0], x[1] + delta[1]
+
+
+def _moved_unless_small(x, delta):
+    if math.sqrt(delta[0] ** 2 + delta[1] ** 2) < 1e-12:
+        return x[0], x[1]
+    return x[0] + delta[0], x[1] + delta[1]
+
+
+def _way(x, base):
+    return x[0] - base[0], x[1] - base[1]
+
+
+def _way_unless_near(x, base):
+    dx, dy = x[0] - base[0], x[1] - base[1]
+    return (0.0, 0.0) if math.sqrt(dx * dx + dy * dy) < 1e-12 else (dx, dy)
+
+
+def _unit_jacobian(x, other, J):
+    J[0, 0] = J[1, 1] = 1.0
+
+
+def _half_jacobian(x, other, J):
+    J[0, 0] = J[1, 1] = 0.5
+
+
+@compiles
+def test_a_branch_at_zero_that_loses_the_derivative_is_refused() -> None:
+    own = {"plus_jacobian": _unit_jacobian, "minus_jacobian": _unit_jacobian}
+    for functions in ({"plus": _moved_unless_small}, {"minus": _way_unless_near}):
+        with pytest.raises(bp.InputError, match=r"= 1 at δ = 0 on Plane.*got \[\[0.0, 0.0\], .* from the derivatives.*if n < eps"):
+            _plane(**functions)
+    with pytest.raises(bp.InputError, match=r"derivatives \[\[1.0, 0.0\], .* of x ⊞ δ at δ = 0 on Plane.*got \[\[0.0, 0.0\]"):
+        _plane(plus=_moved_unless_small, **own)  # residuals would be differentiated with it all the same
+    plane = _plane(minus=_way_unless_near, **own)
+    problem = bp.Problem()
+    point = problem.add_variables(plane, [[1.0, 2.0]])
+    problem.add_residuals(bp.residuals.Prior(plane, [[1.0, 2.0]], sigma=0.5), point)
+    assert np.allclose(problem.solve().covariance(point), 0.25 * np.eye(2))
+
+
+def test_a_jacobian_of_ones_own_that_is_wrong_at_zero_is_refused() -> None:
+    for role in ("plus_jacobian", "minus_jacobian"):
+        with pytest.raises(bp.InputError, match=rf"got \[\[0.5, 0.0\], \[0.0, 0.5\]\] at x = .* from {role}"):
+            _plane(**{role: _half_jacobian})
+
+
+@compiles
+def test_a_branch_that_chooses_a_factor_is_taken() -> None:
+    def turned_by_factor(x, delta):
+        n = math.sqrt(delta[0] ** 2 + delta[1] ** 2 + delta[2] ** 2)
+        s = math.sin(0.5 * n) / n if n > 1e-9 else 0.5
+        w, a, b, c = math.cos(0.5 * n), s * delta[0], s * delta[1], s * delta[2]
+        return multiply_scalars(x[0], x[1], x[2], x[3], w, a, b, c)
+
+    ours, theirs = _rotations(plus=turned_by_factor), bp.UnitQuaternion
+    x = theirs.random(np.random.default_rng(3), 20)
+    assert np.allclose(ours.boxplus_jacobian(x, np.zeros((20, 3))), np.eye(3), atol=1e-12)
+    assert np.allclose(ours.boxminus_jacobian(x, x), np.eye(3), atol=1e-12)
+
+
 @compiles
 def test_functions_that_do_not_fit_are_refused() -> None:
     with pytest.raises(bp.InputError, match="expected 1 numbers from"):
