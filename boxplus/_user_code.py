@@ -40,7 +40,7 @@ _SCALARS = (bool, int, str, bytes, type(None), type(Ellipsis))
 
 @dataclass(frozen=True, eq=False)
 class UserCode:
-    """A function of a user's as it is now. Two are equal where what they compile to cannot differ; one without a key only to itself.
+    """A function of a user's as it is now. Two are equal where what they compile to cannot differ, one without a key to itself.
 
     Attributes:
         function: as it was given.

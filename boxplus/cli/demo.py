@@ -26,6 +26,7 @@ def demo(
     import os
 
     from boxplus.cli.lidar.lio import run
+    from boxplus.cli.outcome import reported
     from boxplus.cli.options import without_report
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
@@ -40,7 +41,8 @@ def demo(
     report = not without_report(False)
     threads = {"threads": min(2, os.cpu_count() or 1)}
     settings = load_run_config(overrides={"odometry": threads})
-    summary, _ = run(recording, results.path, settings, overwrite=True, report=report)
+    with reported(recording, results.path, as_json=False) as outcome:
+        summary, _ = run(recording, results.path, settings, outcome, overwrite=True, report=report)
     if summary.state != "finished":
         raise typer.Exit(EXIT_INTERRUPTED)
     truth = output / f"{name}.gt.tum"

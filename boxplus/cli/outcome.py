@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from boxplus.errors import BoxplusError, InputError, printable
 
 if TYPE_CHECKING:
     from boxplus.cli.ground_truth import Comparison
+    from boxplus.cli.terminal import Terminal
 
 Ending = Literal["not begun", "finished", "not to be trusted", "interrupted", "failed"]
 
@@ -27,7 +29,7 @@ class Outcome(BaseModel):
         output: folder or file of the results.
         outcome: how it came out.
         exit_code: of a command that was given this alone; None where it was not begun.
-        error: why there is no result, or why it could not be compared with the ground truth.
+        error: why there is no result or no report, or why it could not be compared with the ground truth.
         evaluation: the comparison with the ground truth, as in `evaluation.json`.
         run: what `run.json` holds.
     """
@@ -48,31 +50,51 @@ class Outcome(BaseModel):
         elif untrusted:
             self.outcome, self.exit_code = "not to be trusted", EXIT_UNTRUSTED
         else:
-            self.outcome, self.exit_code = "finished", 0
+            self.outcome, self.exit_code = "finished", self.exit_code or 0
 
     def fall_short(self, run: BaseModel, error: str) -> None:
         """It came to an end without what was asked for."""
-        self.run, self.outcome, self.exit_code, self.error = run, "failed", EXIT_FAILED, error
+        self.run, self.outcome, self.exit_code = run, "failed", EXIT_FAILED
+        self._also(error)
+
+    @contextmanager
+    def drawing(self, terminal: Terminal) -> Iterator[None]:
+        """The report is drawn in this block; where that fails the run is as good without it, and the exit code says so."""
+        try:
+            with terminal.status("drawing the report"):
+                yield
+        except Exception as error:  # noqa: BLE001 - results that took an hour are not to be lost for their pictures
+            if not isinstance(error, BoxplusError):
+                traceback.print_exc()
+            self.exit_code = self.exit_code or EXIT_FAILED
+            self._also(f"the report could not be drawn: {_named(error)}")
 
     def compare(self, comparison: Comparison | None) -> None:
         """With the ground truth; a run that cannot be compared is as good as without it, and its exit code goes before."""
         if comparison is not None:
-            self.evaluation, self.error = comparison.evaluation, comparison.error
+            self.evaluation = comparison.evaluation
             if comparison.error is not None:
                 self.exit_code = self.exit_code or EXIT_BAD_INPUT
+                self._also(comparison.error)
 
     def stop(self, error: BaseException) -> None:
         """It was ended by an exception."""
         if isinstance(error, KeyboardInterrupt):
             self.outcome, self.exit_code, self.error = "interrupted", EXIT_INTERRUPTED, "stopped at once"
             return
-        named = str(error) if isinstance(error, BoxplusError) else printable(f"{type(error).__name__}: {error}")
         code = EXIT_BAD_INPUT if isinstance(error, InputError) else EXIT_FAILED
-        self.outcome, self.exit_code, self.error = "failed", code, named
+        self.outcome, self.exit_code, self.error = "failed", code, _named(error)
+
+    def _also(self, error: str) -> None:
+        self.error = error if self.error is None else f"{self.error}; {error}"
 
     def print_json(self) -> None:
         """In one line on the standard output."""
         typer.echo(self.model_dump_json())
+
+
+def _named(error: BaseException) -> str:
+    return str(error) if isinstance(error, BoxplusError) else printable(f"{type(error).__name__}: {error}")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numba.core import config as numba_config
 from numba.core import types
+from numba.core.errors import NumbaError
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
@@ -39,8 +40,9 @@ class UserManifold(KernelManifold):
         x ⊞ 0 = x,   x ⊞ (y ⊟ x) = y,   (x ⊞ δ) ⊟ x = δ
 
     (Hertzberg et al., Integrating generic sensor fusion algorithms, 2013, section 3), which are looked at near `identity` when
-    the manifold is made, with the derivative of the last at δ = 0, by which tangents are compared. Jacobians come from the compiled functions by automatic differentiation (docs/differentiation.md), or
-    from functions of your own. Two are equal where what they compile to cannot differ.
+    the manifold is made, with the derivative of the last at δ = 0, by which tangents are compared. Jacobians come from the
+    compiled functions by automatic differentiation (docs/differentiation.md), or from functions of your own. Two are equal where
+    what they compile to cannot differ.
 
     Args:
         name: as a user writes it, for messages.
@@ -168,7 +170,7 @@ def basis_at(x, basis):
             names = {"np": np, "zeros": zeros, "seeded": seeded, "user_basis": self.tangent_basis()}
             loop = generated(__file__, "basis_at", source, names, self.plus)
             loop.compile((_LINE, _TABLE))
-        except Exception:  # with Jacobians of one's own it need not be differentiable
+        except NumbaError:  # with Jacobians of one's own it need not be differentiable
             return None
         basis = np.zeros((self.size, self.dof))
         loop(x, basis)
@@ -285,19 +287,20 @@ def {role}(x, other, J):
                 )
 
     def _check_derivatives_at_zero(self) -> None:
-        """That ∂((x ⊞ δ) ⊟ x)/∂δ is the identity at δ = 0: a function that leaves early there has other derivatives than beside it."""
+        """∂((x ⊞ δ) ⊟ x)/∂δ is the identity at δ = 0: a function that leaves early there has other derivatives than beside it."""
         x = self._identity
         points = np.array([x, self.boxplus(x, 0.1 * np.cos(np.arange(1.0, 1.0 + self.dof)))])
-        advice = "let no branch at δ = 0 or x = base leave without them (if n < eps: return x): choose the factor there, not the result"
+        advice = "let no branch at δ = 0 or x = base leave early (if n < eps: return x): let it choose a factor, not the result"
         is_compiled = not numba_config.DISABLE_JIT  # type: ignore[attr-defined]
         for role, own, J in (
             ("plus", self._jacobians[0], self.boxplus_jacobian(points, np.zeros((2, self.dof)))),
             ("minus", self._jacobians[1], self.boxminus_jacobian(points, points)),
         ):
             if (is_compiled or own is not None) and not np.abs(J - np.eye(self.dof)).max() <= _SLOPE:
+                source = f"{role}_jacobian" if own else "the derivatives of plus and minus"
                 raise InputError(
                     f"∂((x ⊞ δ) ⊟ x)/∂δ = 1 at δ = 0 on {self.name}, the derivative of an axiom",
-                    f"{J[0].round(6).tolist()} at x = {x} from {f'{role}_jacobian' if own else 'the derivatives of plus and minus'}",
+                    f"{J[0].round(6).tolist()} at x = {x} from {source}",
                     "correct it" if own else advice,
                 )
         if any(self._jacobians) and (basis := self._basis(x)) is not None:  # otherwise it is part of what was looked at

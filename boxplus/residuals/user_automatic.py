@@ -102,11 +102,13 @@ def _source(
 ) -> str:
     """Dual numbers are made of the stored numbers of each variable and of how these move with its tangent.
 
-    `basis` has a row for every stored number of all variables, a column for every direction of all tangents.
+    `basis` has a row for every stored number of all variables, a column for every direction of all tangents. The loop returns −1
+    where a row of a Jacobian is all zeros, as behind a branch that leaves early at this very point.
     """
     variables = len(manifolds)
     rows = np.concatenate([[0], np.cumsum([manifold.size for manifold in manifolds])])
     columns = np.concatenate([[0], np.cumsum([manifold.dof for manifold in manifolds])])
+    directions = columns[-1]
     made, seeds, bases, nothing, filled, table = [], [], [], [], [], 0
     for s, manifold in enumerate(manifolds):
         made.append(f"y{s} = zeros(({manifold.size},), {width})")
@@ -127,6 +129,8 @@ def _source(
         nothing.append(f"J{s}[n, :, :] = 0.0")
         filled.append(f"for k in range(np.uint64({manifold.dof})):")
         filled.append(f"    J{s}[n, c, k] = slopes[c, np.uint64({columns[s]}) + k]")
+    filled += ["k = np.uint64(0)", f"while k < np.uint64({directions}) and slopes[c, k] == 0.0:", "    k += np.uint64(1)"]
+    filled += [f"if k == np.uint64({directions}):", "    flat = -1"]
     call = ", ".join([*(f"y{s}" for s in range(variables)), *entries_of(data)])
     guard = store.guard("function(" + call + ")", "valid[n] = False; break")
     slopes = [
@@ -141,6 +145,7 @@ def differentiate(
 ):
     basis = np.zeros(({rows[-1]}, {runs * width}))
     slopes = np.zeros(({store.dim}, {runs * width}))
+    flat = 0
 {indented(new_line.join(made), 4)}
     for n in range(np.uint64(begin), np.uint64(end)):
         if valid[n]:
@@ -154,5 +159,5 @@ def differentiate(
             continue
         for c in range(np.uint64({store.dim})):
 {indented(new_line.join(filled), 12)}
-    return 0
+    return flat
 """

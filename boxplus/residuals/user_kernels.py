@@ -41,7 +41,7 @@ class Loops:
 
     Attributes:
         evaluate: residuals and validity. Like `linearize`, it returns 0, or one more than the wrong number of values that a call
-            returned; an index beyond an array raises IndexError.
+            returned; an index beyond an array raises IndexError. An automatic one returns −1 where a row is all zeros.
         derivative: how Jacobians are had.
         linearize: the same with Jacobians; or only Jacobians, of what was evaluated at the same point before, where these are
             automatic or numeric: it does not look at bounds again, which would take almost twice the time. None where

@@ -17,6 +17,7 @@ from boxplus.residuals.user_kernels import Derivative, Loops, compiled_loops
 from boxplus.residuals.whitening import Whitening
 
 _STEP = 1e-5  # of central differences: truncation and rounding both stay below about 1e-10
+_STRAIGHT = 1e-3  # what a straight line may bend by over two steps, as a share of its rise
 
 
 class UserResidual(Residual):
@@ -42,8 +43,9 @@ class UserResidual(Residual):
         count: N, where no data tell.
         jacobian: takes the arguments of the function and then, for every variable, an array (dim, dof) of zeros to fill with
             ∂r(x ⊞ δ)/∂δ. In a batch, it returns one array (n, dim, dof) for each variable. "automatic" differentiates the
-            compiled function itself, exactly, and refuses one of which it cannot; "differences" takes central differences on the
-            manifold. Without it, the first where that can be, else the second: `jacobian_kind` says which, `jacobian_note` why.
+            compiled function itself, exactly (but for rows of zeros behind a branch that leaves early: docs/differentiation.md),
+            and refuses one of which it cannot; "differences" takes central differences on the manifold. Without it, the first
+            where that can be, else the second: `jacobian_kind` says which, `jacobian_note` why.
         roles: names for the variables, for messages; the function's own argument names otherwise.
         step: of the differences, in tangent units; one number, or for every variable a number or (dof,). A variable of 1e5
             needs a larger one than the default 1e-5.
@@ -127,7 +129,8 @@ class UserResidual(Residual):
                 return
             self.evaluate_into(begin, end, x, index, r, valid)  # with bounds checked, which the derivatives are not
             if self.jacobian_kind == "automatic":
-                self._run(self._loops.linearize, begin, end, rows, (*jacobians, valid))
+                if self._run(self._loops.linearize, begin, end, rows, (*jacobians, valid)):
+                    self._differentiate_flat(self._loops, begin, end, x, index, r, jacobians, valid)
             else:
                 self._run(self._loops.linearize, begin, end, (*rows, *self._steps), (r, *jacobians, valid))
             return
@@ -161,10 +164,17 @@ class UserResidual(Residual):
         """Residuals and validity of rows [begin, end) with one value (end − begin, size) of every variable each."""
         if self._loops is None:
             return self._call_batch(begin, end, values)
-        r, valid = np.zeros((end - begin, self.dim)), np.ones(end - begin, dtype=np.bool_)
-        rows = (np.arange(end - begin, dtype=np.uint32),) * len(values)
-        data = (array if shared else array[begin:end] for array, shared in zip(self.data, self._is_shared, strict=True))
-        self._run(self._loops.evaluate, 0, end - begin, (*values, *rows, *data), (r, valid), first=begin)
+        return self._evaluated(self._loops, slice(begin, end), begin, values)
+
+    def _evaluated(
+        self, loops: Loops, rows: slice | NDArray[np.intp], first: int, values: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """As `_at`, of chosen rows of a compiled function; `first` is the first of them, for messages."""
+        count = len(values[0])
+        r, valid = np.zeros((count, self.dim)), np.ones(count, dtype=np.bool_)
+        index = (np.arange(count, dtype=np.uint32),) * len(values)
+        data = (array if shared else array[rows] for array, shared in zip(self.data, self._is_shared, strict=True))
+        self._run(loops.evaluate, 0, count, (*values, *index, *data), (r, valid), first=first)
         return r, valid
 
     def _call_batch(
@@ -213,6 +223,41 @@ class UserResidual(Residual):
                     reach += np.where(is_known, abs(delta[k]), 0.0)[:, None]
                 jacobians[slot][begin:end, :, k] = difference / np.where(reach > 0.0, reach, 1.0)
 
+    def _differentiate_flat(
+        self, loops: Loops, begin: int, end: int, x: Arrays, index: Rows, r: Array, jacobians: Arrays, valid: Mask
+    ) -> None:
+        """Derivatives of rows that a branch leaves early at this very point (if n < eps: return 0), by differences.
+
+        Such a row is zero in the Jacobian and a straight line beside the point. What does not move, a corner and what is curved
+        have the derivative zero that they were given.
+        """
+        flat = valid[begin:end, None] & ~np.logical_or.reduce([J[begin:end].any(axis=2) for J in jacobians])
+        rows = begin + np.flatnonzero(flat.any(axis=1))
+        steps = [table[:, 0] for table in self._steps]
+
+        def at(deltas: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+            moved = [values[chosen[rows]] for values, chosen in zip(x, index, strict=True)]
+            for slot, delta in deltas.items():
+                moved[slot] = self.manifolds[slot].boxplus(moved[slot], delta)
+            found, known = self._evaluated(loops, rows, int(rows[0]), moved)
+            found[~known] = np.nan  # nothing is straight beside a singular residual
+            return found
+
+        # Most do not move at all: one look along a direction that is nobody's own.
+        aside = at({slot: h * np.cos(np.arange(1.0 + slot, 1.0 + slot + len(h))) for slot, h in enumerate(steps)})
+        moves = flat[rows - begin] & np.isfinite(aside) & (aside != r[rows])
+        rows = rows[moves.any(axis=1)]
+        if not len(rows):
+            return
+        here, flat = r[rows], flat[rows - begin]
+        for slot, h in enumerate(steps):
+            for k, e in enumerate(np.diag(h)):
+                ahead, behind, further, before = (at({slot: scale * e}) for scale in (1.0, -1.0, 2.0, -2.0))
+                rise = ahead - behind
+                bend = np.maximum(np.abs(ahead + behind - 2.0 * here), np.abs(further - before - 2.0 * rise))
+                straight = flat & (rise != 0.0) & (bend <= _STRAIGHT * np.abs(rise))
+                jacobians[slot][rows, :, k] = np.where(straight, rise / (2.0 * h[k]), jacobians[slot][rows, :, k])
+
     @property
     def _name(self) -> str:
         return str(getattr(self.function, "__name__", "the function"))
@@ -226,14 +271,15 @@ class UserResidual(Residual):
         out: tuple[NDArray[Any], ...],
         *,
         first: int = 0,
-    ) -> None:
-        """Call a compiled loop over rows [begin, end), of which the first one is residual `first + begin` of the group."""
+    ) -> int:
+        """What a compiled loop over rows [begin, end) returns; the first of them is residual `first + begin` of the group."""
         try:
             wrong = loop(begin, end, *rows, *out)
         except IndexError:
             raise self._beyond(first + self._first_beyond(loop, begin, end, rows, out)) from None
-        if wrong:
+        if wrong > 0:
             raise InputError(f"{self.dim} numbers from {self._name}", f"{wrong - 1}", "return as many as dim says")
+        return wrong
 
     @staticmethod
     def _first_beyond(

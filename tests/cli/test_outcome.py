@@ -13,7 +13,9 @@ from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from boxplus.cli import app
+from boxplus.cli.ground_truth import Comparison
 from boxplus.cli.outcome import Outcome, reported
+from boxplus.cli.terminal import Terminal
 from boxplus.errors import InputError, OutputError
 
 KEYS = ["input", "output", "outcome", "exit_code", "error", "evaluation", "run"]
@@ -68,6 +70,42 @@ def test_an_end_and_its_code(state: str, untrusted: bool, outcome: str, code: in
     found = json.loads(capsys.readouterr().out)
     assert (found["outcome"], found["exit_code"], left) == (outcome, code, code)
     assert found["run"] == {"path_length_m": 3.0}
+
+
+@pytest.mark.parametrize("error", [OutputError("a full disk"), ValueError("no ticks")])
+@pytest.mark.parametrize(("state", "untrusted", "code"), [("finished", False, 1), ("finished", True, 3), ("interrupted", False, 130)])
+def test_a_report_that_cannot_be_drawn_hides_no_run(
+    error: Exception, state: str, untrusted: bool, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(typer.Exit) as end, reported("walk.bag", "out", as_json=True) as told:
+        with told.drawing(Terminal(quiet=True, as_json=True)):
+            raise error
+        told.end(Facts(), state, untrusted=untrusted)
+        told.compare(Comparison("close", {"ate": 0.1}))
+        told.compare(Comparison("not compared", error="other times"))
+    printed = capsys.readouterr()
+    found = Outcome.model_validate_json(printed.out)
+    assert end.value.exit_code == found.exit_code == code and found.run is not None
+    assert found.error is not None and found.error.startswith("the report could not be drawn: ")
+    assert str(error) in found.error and found.error.endswith("; other times")
+    assert ("Traceback" in printed.err) == (not isinstance(error, OutputError))
+
+
+def test_pgo_writes_its_results_where_the_report_cannot_be_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from boxplus.formats.graphs.g2o import write_g2o
+    from boxplus.report.optimization import graph_report
+    from tests.small_problems import loop_graph
+
+    def fail(*arguments: object) -> None:
+        raise OutputError("no room for pictures")
+
+    monkeypatch.setattr(graph_report, "write_graph_report", fail)
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    result = CliRunner().invoke(app, ["pgo", str(tmp_path / "loops.g2o"), "-o", str(tmp_path / "out"), "--json", "-q"])
+    found = json.loads(result.stdout)
+    assert result.exit_code == found["exit_code"] == 1 and found["outcome"] == "finished" and found["run"]["cost"] >= 0.0
+    assert found["error"] == "the report could not be drawn: no room for pictures"
+    assert {"run.json", "optimized.g2o"} <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
 @pytest.mark.parametrize(

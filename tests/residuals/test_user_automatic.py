@@ -213,3 +213,73 @@ def test_automatic_jacobians_are_kept_on_disk(tmp_path: Any, monkeypatch: pytest
     assert jacobian_and_compiled(1.0) == (6.0, True)
     assert jacobian_and_compiled(1.0) == (6.0, False)
     assert jacobian_and_compiled(2.0) == (12.0, True)
+
+
+def gap(x, z):
+    dx, dy = x[0] - z[0], x[1] - z[1]
+    n = math.sqrt(dx * dx + dy * dy)
+    if n < 1e-9:
+        return 0.0, 0.0
+    s = math.sin(n) / n
+    return dx * s, dy * s
+
+
+@compiles
+@pytest.mark.parametrize("jacobian", [None, "automatic"])
+def test_a_branch_at_zero_that_leaves_early_loses_no_derivative(jacobian: Any) -> None:
+    z = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0]])
+    residual = UserResidual(gap, dim=2, manifolds=(bp.Euclidean(2),), data=(z,), jacobian=jacobian, sigma=0.1)
+    assert residual.jacobian_kind == "automatic"
+    report = bp.check_jacobian(residual, [[1.0, 2.0], [0.5, 0.3], [1.1, 2.0]], tolerance=1e-8)
+    assert report.passed, report
+    problem = bp.Problem()
+    point = problem.add_variables(bp.Euclidean(2), [[1.0, 2.0]])
+    problem.add_residuals(UserResidual(gap, dim=2, manifolds=(bp.Euclidean(2),), data=(z[:1],), sigma=0.1), point)
+    assert np.allclose(problem.solve().covariance(point), 0.01 * np.eye(2))
+
+
+@compiles
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_behind_such_a_branch_are_found_beside_others_and_on_manifolds(seed: int) -> None:
+    def turned(T_i, T_j, p, z):  # three rows of rotation, lost where it agrees; one of a distance, which is not
+        qw, qx, qy, qz, x, y, t = between_scalars(T_i, T_j)
+        n = math.sqrt(qx * qx + qy * qy + qz * qz)
+        distance = x * x + y * y + t * t + p[0] - z
+        if n < 1e-9:
+            return 0.0, 0.0, 0.0, distance
+        s = 2.0 * math.atan2(n, qw) / n
+        return s * qx, s * qy, s * qz, distance
+
+    rng = np.random.default_rng(seed)
+    T_i, T_j = (bp.SE3.random(rng, 9) for _ in range(2))
+    T_j[::2, :4] = T_i[::2, :4]
+    p, z = rng.normal(size=(9, 1)), rng.normal(size=9)
+    manifolds = (bp.SE3, bp.SE3, bp.Euclidean(1))
+    ours, by_differences = (
+        UserResidual(turned, dim=4, manifolds=manifolds, data=(z,), jacobian=kind).linearize(T_i, T_j, p)
+        for kind in ("automatic", "differences")
+    )
+    for J, expected in zip(ours.jacobians, by_differences.jacobians, strict=True):
+        assert np.allclose(J, expected, atol=1e-8) and np.abs(expected).max() > 0.1
+
+
+@compiles
+def test_what_is_flat_a_corner_or_curved_keeps_the_derivative_zero() -> None:
+    names = ["max(0.0, t)", "7.0", "abs(t)", "t * t", "t * t * t", "np.floor(t)", "np.sign(t)", "max(0.0, t - 1e-6)", "lost"]
+    lines = ["t = x[0] + 0.0 * x[1]", "lost = 0.0 if abs(t) < 1e-9 else 3.0 * t", f"return {', '.join(names)}"]
+    scope: dict[str, Any] = {"np": np}
+    exec("def f(x):\n    " + "\n    ".join(lines), scope)
+    residual = UserResidual(scope["f"], dim=9, manifolds=(bp.Euclidean(2),), count=1, jacobian="automatic")
+    J = residual.linearize([0.0, 1.0]).jacobians[0][0]
+    assert np.array_equal(J[:8], np.zeros((8, 2))) and np.allclose(J[8], [3.0, 0.0])
+
+
+@compiles
+def test_nothing_is_straight_beside_a_singular_residual() -> None:
+    def half(x):
+        if x[0] < 0.0:
+            return None
+        return 0.0 if x[0] < 1e-9 else x[0]
+
+    residual = UserResidual(half, dim=1, manifolds=(bp.Euclidean(1),), count=2, jacobian="automatic")
+    assert np.array_equal(residual.linearize([[0.0], [0.5]]).jacobians[0][:, 0, 0], [0.0, 1.0])

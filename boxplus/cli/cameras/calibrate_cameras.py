@@ -130,7 +130,7 @@ def cameras(
         if not no_report:
             from boxplus.report.cameras.calibration_report import write_calibration_report
 
-            with terminal.status("drawing the report"):
+            with outcome.drawing(terminal):
                 write_calibration_report(folder / "report.html", summary, found)
         summary.write(folder / "run.json")
         terminal.say(f"{folder}: {', '.join(name for name in FILES if (folder / name).exists())}")

@@ -83,7 +83,7 @@ def run_cameras(
         if report and frames:
             from boxplus.report import write_report
 
-            with terminal.status("drawing the report"):
+            with outcome.drawing(terminal):
                 write_report(folder.path)
     terminal.print_results(summary, shown, folder.path, FILES)
     outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)

@@ -32,6 +32,7 @@ from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.cli.ground_truth import Comparison
+    from boxplus.cli.outcome import Outcome
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.lidar_inertial.config import RunConfig
@@ -97,7 +98,7 @@ def lio(
     """
     from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.lidar.several import run_several, several_recordings
-    from boxplus.cli.outcome import Outcome, reported
+    from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.runs.lidar_inertial.config import load_run_config
 
@@ -118,6 +119,7 @@ def lio(
             recording,
             folder,
             run_config,
+            outcome,
             terminal=terminal,
             ground_truth=truth,
             overwrite=overwrite,
@@ -145,6 +147,7 @@ def run(
     recording: Path,
     folder: Path,
     config: RunConfig,
+    outcome: Outcome,
     *,
     terminal: RunTerminal | None = None,
     ground_truth: Trajectory | None = None,
@@ -158,6 +161,7 @@ def run(
     """Run the odometry with everything a terminal shows: evidence, progress, results.
 
     Args:
+        outcome: takes down a report that could not be drawn; the caller ends it.
         standing: how far an earlier run came in `folder`, which decides in place of `overwrite` and `resume`.
         should_stop: None lets Ctrl-C end the run in good order.
 
@@ -210,7 +214,7 @@ def run(
             if report and summary.scans:
                 from boxplus.report import write_report
 
-                with terminal.status("drawing the report"):
+                with outcome.drawing(terminal):
                     write_report(folder)
         comparison, rows = None, _rows(summary)
         if ground_truth is not None and summary.scans:

@@ -84,7 +84,7 @@ def localize(
             if not no_report:
                 from boxplus.report.localization_page import write_localization_report
 
-                with terminal.status("drawing the report"):
+                with outcome.drawing(terminal):
                     write_localization_report(folder, result)
         summary, files = result.summary, ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
         doubt = summary.contradiction

@@ -101,7 +101,7 @@ def refine_command(
             if not no_report and summary.state == "finished":
                 from boxplus.report.refinement_page import write_refinement_report
 
-                with terminal.status("drawing the report"):
+                with outcome.drawing(terminal):
                     write_refinement_report(folder, summary, result)
         _print(terminal, summary, comparison, folder)
         outcome.end(summary, summary.state)

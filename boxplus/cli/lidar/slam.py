@@ -116,7 +116,7 @@ def slam(
             if not no_report:
                 from boxplus.report import write_report
 
-                with terminal.status("drawing the report"):
+                with outcome.drawing(terminal):
                     write_report(result)
         summary, rows, comparison = result.summary, _rows(result), None
         if truth is not None and summary.scans:

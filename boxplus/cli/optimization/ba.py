@@ -154,7 +154,7 @@ def ba(
         if not no_report:
             from boxplus.report.optimization.bundle_report import write_bundle_report
 
-            with terminal.status("drawing the report"):
+            with outcome.drawing(terminal):
                 write_bundle_report(folder, summary, start, result)
         terminal.conclude(summary, "px", folder, ["report.html", name, "scene.ply"], outcome)
 

@@ -56,7 +56,7 @@ def adjust_line_set(
         if not no_report:
             from boxplus.report.optimization.line_report import write_line_report
 
-            with terminal.status("drawing the report"):
+            with outcome.drawing(terminal):
                 write_line_report(folder, summary, start, result)
         terminal.conclude(summary, "px", folder, ["report.html", _ADJUSTED, "scene.ply"], outcome)
 

@@ -173,7 +173,7 @@ def pgo(
         if not no_report:
             from boxplus.report.optimization.graph_report import write_graph_report
 
-            with terminal.status("drawing the report"):
+            with outcome.drawing(terminal):
                 write_graph_report(folder, summary, graph, result)
         if result.loops is not None or robust is not None:
             _write_edges(folder / "edges.csv", graph, result)
