@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.outliers.convex_start import solve_from_convex
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
@@ -23,13 +23,17 @@ from boxplus.systems.bundle_adjustment.lens import lens_notes
 from boxplus.systems.bundle_adjustment.plausibility import (
     input_notes,
     mirror_notes,
+    misfit_notes,
     outlier_notes,
+    point_notes,
     sigma_doubt,
     sigma_notes,
     structure_notes,
 )
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
+from boxplus.systems.bundle_adjustment.strays import stray_notes, stray_points
 
+_ROUNDS = 3  # of looking for points that have a lower minimum elsewhere
 _MOST = 0.5  # share of the observations that a robust loss may silence
 _BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
@@ -117,17 +121,39 @@ def adjust_bundle(
     errors_start = _errors(problem, start)
     start[cameras.number], start[points.number] = start_values(sound.reconstruction)
     solution = solve_from_convex(problem, config.solver, start=start, callback=callback)
-    errors = _errors(problem, list(solution.values))
     camera_of, point_of = (
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
     )
-    adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
+    strayed: list[NDArray[np.int64]] = []
+    astray = np.zeros(0, dtype=np.int64)
+    while True:
+        errors = _errors(problem, list(solution.values))
+        adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
+        depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
+        is_out = solution.reason.startswith("iteration limit")
+        left = 0 if is_out else config.solver.max_iterations - solution.iterations
+        if len(strayed) == _ROUNDS or (solution.status == "stopped" and not is_out):  # by somebody, who does not wait for more
+            break
+        numbers, places = stray_points(adjusted, sound.used, depth.ratio, config, loss)
+        if left <= 0:
+            astray = numbers
+            break
+        values = [array.copy() for array in solution.values]
+        values[points.number][numbers] = places
+        again = _continued(problem, solution, config, values, left, callback) if len(numbers) else solution
+        if not again.cost < solution.cost:
+            break
+        solution = again
+        strayed.append(numbers)
     cheirality = count_behind(sound, adjusted)
-    depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
     left = _redundancy(problem, points, point_of)
     notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
+    ids = getattr(reconstruction, "point_ids", None)
+    notes += stray_notes(strayed, astray, ids)
+    notes += point_notes(errors, point_of, _weights(problem, solution, loss), ids)
     is_given = "sigma_px" in config.model_fields_set
     notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
+    notes += misfit_notes(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     seen = np.unique(point_of)
     notes += mirror_notes(reconstruction.points[seen], adjusted.points[seen])
     notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
@@ -147,6 +173,31 @@ def adjust_bundle(
         points=points,
         time_s=time.perf_counter() - begin,
     )
+
+
+def _continued(
+    problem: Problem,
+    before: Solution,
+    config: BundleAdjustmentConfig,
+    values: list[NDArray[np.float64]],
+    left: int,
+    callback: Callback | None,
+) -> Solution:
+    """The minimum from other values, with the history of how these came about."""
+    count = before.iterations
+
+    def watch(iteration: Iteration) -> bool:
+        return callback is not None and bool(callback(replace(iteration, number=count + iteration.number)))
+
+    found = problem.solve(config.solver.model_copy(update={"max_iterations": left}), start=values, callback=watch)
+    time_s = before.history[-1].time_s
+    later = (replace(step, number=count + step.number, time_s=time_s + step.time_s) for step in found.history[1:])
+    return replace(found, cost_initial=before.cost_initial, history=(*before.history, *later))
+
+
+def _weights(problem: Problem, solution: Solution, loss: Loss | None) -> NDArray[np.float64] | None:
+    """(k,) of every observation under a robust loss."""
+    return None if loss is None else np.concatenate([group.loss_weights(solution.values) for group in problem.groups])
 
 
 def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]) -> int:

@@ -1,7 +1,8 @@
-"""Whether intrinsics that are held are those of the images: what freeing them for a few steps would gain.
+"""Whether intrinsics that are held are those of the images: what freeing them would gain.
 
-A wrong focal length bends a scene and its cameras by as much as it is wrong, and leaves errors that look like those of noise.
-Where the images tell it, they tell it at once: the cost falls by far more than chance when the focal lengths may move.
+A wrong lens bends a scene and its cameras by as much as it is wrong, and leaves errors that look like those of noise. Where the
+images tell it, they tell it at once: the cost falls by more than chance when the intrinsics may move. One step shows whether it
+does; only where it does others follow, to where it falls.
 """
 
 from __future__ import annotations
@@ -9,18 +10,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_exceeded
 from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
+from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
-_STEPS, _LEAST_S = 5, 1.0
-_CHANCE = 15.0  # of the cost of a number that explains noise, by which chance does not lower it
-_CHANGED = 0.01  # of the focal length; less is what calibrations differ by
+_STEPS, _SETTLED, _LEAST_S = 25, 1e-3, 1.0  # the valley to other intrinsics is bent: the first steps may be rejected
+_CHANCE = 1e-6  # of noise to lower the cost by as much
+_HINT = 0.3  # of the fall of the cost that counts, which the first step that is taken has to show
+_CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
+_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def lens_notes(
@@ -32,7 +37,7 @@ def lens_notes(
     solved: Solution,
     left: int,
 ) -> list[str]:
-    """A sentence where other focal lengths than those that were held explain the images clearly better.
+    """A sentence where another lens than the one that was held explains the images clearly better.
 
     Args:
         adjusted: where bundle adjustment ended, as `solved` tells; only a minimum is examined.
@@ -46,29 +51,56 @@ def lens_notes(
     limit_s = max(time_s, _LEAST_S) if config.solver.time_limit_s is None else config.solver.time_limit_s - time_s
     if solved.status != "converged" or not limit_s > 0.0:
         return []
-    free = config.model_copy(update={"intrinsics": "refined"})
+    free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
     problem.fix(points[dropped])
+    numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
+    # As in an F-test; the noise as the errors have it, not as sigma says.
+    share = 0.5 * chi_square_exceeded(_CHANCE, max(numbers, 1)) / left
+
+    def is_settled(step: Iteration) -> bool:
+        return step.number > 0 and step.accepted and not cost - step.cost > _HINT * share * step.cost
+
     try:
-        solution = problem.solve(config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": limit_s}))
+        limits = {"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": limit_s}
+        solution = problem.solve(config.solver.model_copy(update=limits), callback=is_settled)
     except BoxplusError:
         return []
-    # As in an F-test; the noise as the errors have it, not as sigma says.
-    numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
-    if not cost - solution.cost > _CHANCE * max(numbers, 1) * solution.cost / left:
+    if not cost - solution.cost > share * solution.cost:
         return []
     none = np.zeros(0)
     other = adjusted_reconstruction(adjusted, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-    after_params = other.camera_params if isinstance(other, ColmapModel) else ()
-    changes = []
-    for name, before, after in zip(adjusted.camera_ids, adjusted.camera_params, after_params, strict=True):
-        if abs(after[0] / before[0] - 1.0) > _CHANGED:
-            changes.append(f"{after[0]:.5g} px instead of {before[0]:.5g} px for camera {name}")
+    changes = _changes(adjusted, other) if isinstance(other, ColmapModel) else []
     if not changes:
         return []
-    told = ", ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
+    told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
     return [
-        f"other intrinsics than those held explain the images better, with a focal length of {told}: the cost falls from "
-        f"{cost:.6g} to {solution.cost:.6g} and below; the scene is bent by what they are wrong (--refine-intrinsics)"
+        f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
+        f"{solution.cost:.6g} and below, and the scene is bent by what they are wrong (--refine-intrinsics)"
     ]
+
+
+def _changes(before: ColmapModel, after: ColmapModel) -> list[str]:
+    """What became of each lens that moves its pixels by more than calibrations differ."""
+    seen = Sightings.of(after)
+    rays, found = seen.bearings(np.arange(len(seen.pixels)))
+    lens_of = seen.lens_of[seen.camera_of]
+    changes = []
+    for number, name in enumerate(before.camera_ids):
+        own = np.flatnonzero((lens_of == number) & found)
+        if not len(own):
+            continue
+        pixels = seen.pixels[own]
+        moved = colmap_pinhole(before, number).project(rays[own])[0] - pixels
+        old, new = (colmap_layout(model, number) @ model.camera_params[number] for model in (before, after))
+        size, radius = (float(np.sqrt(np.nanmean((x * x).sum(axis=1)))) for x in (moved, pixels - old[2:4]))
+        if not size > _CHANGED * radius:
+            continue
+        differ = [k for k in range(len(old)) if abs(new[k] - old[k]) > 1e-3 * max(abs(old[k]), 1e-3)]
+        names = list(_NAMES)
+        if new[0] == new[1] and old[0] == old[1]:  # one focal length
+            names[0], differ = "f", [k for k in differ if k != 1]
+        told = ", ".join(f"{names[k]} = {new[k]:.5g} instead of {old[k]:.5g}" for k in differ)
+        changes.append(f"for camera {name} {told}, which moves its pixels by {size:.2g} px")
+    return changes

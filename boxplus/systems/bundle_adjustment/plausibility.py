@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_exceeded, chi_square_quantile, chi_square_sf
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
@@ -17,10 +18,12 @@ _LEAST_PIXEL = 1e-3  # [px] errors below are rounding
 _NARROW = 0.02  # spread of a camera's pixels, as a share of the others' or of the focal length, that asks for their unit
 _FEW = 10  # observations from which on a spread means something
 _OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says: one that was assumed, and one that was given
-_CONTRADICTED = 25.0  # times what a given sigma promises of χ²
+_CONTRADICTED, _MISFIT = 25.0, 2.0  # times what a given sigma promises of χ², for a doubt and for a sentence
 _SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from
 _FAR = 4.0  # times the median distance from the middle
 _CLEARLY = 0.3  # times what is left of the points after a rotation, that a mirror image has to leave
+_STRANGE = 1e-4  # chance that a point of a sound reconstruction, the worst of all, stands out
+_COUNTS = 0.25  # weight of an observation under a robust loss, below which it says nothing; noise comes by it once in a million
 _RAYLEIGH = 1.1774  # median length of a two-dimensional error of standard deviation 1
 
 
@@ -123,6 +126,57 @@ def outlier_notes(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
         f"{np.count_nonzero(gross)} of {len(known)} observations are off by more than {_GROSS:g} times the typical error, with "
         f"{squared[gross].sum() / squared.sum():.0%} of the cost; the largest is {known.max():.4g} px: wrong matches or a wrong "
         "start, to which all else is bent; use a robust loss (--loss huber)"
+    ]
+
+
+def misfit_notes(cost: float, left: int, sigma_px: float, loss: Loss | None, *, is_given: bool) -> list[str]:
+    """A sentence where χ² is more than a sigma that somebody meant promises, though not so much that nothing is to be trusted."""
+    if not is_given or loss is not None or left <= 0 or sigma_doubt(cost, left, sigma_px, loss, is_given=is_given):
+        return []
+    if not (2.0 * cost > _MISFIT * left and chi_square_sf(2.0 * cost, left) < _STRANGE):
+        return []
+    return [
+        f"χ² is {2.0 * cost / left:.3g} times what sigma = {sigma_px:g} px promises: few wrong matches, a wrong lens, or a sigma "
+        "too small"
+    ]
+
+
+def point_notes(
+    errors: NDArray[np.float64], point_of: NDArray[np.int64], weights: NDArray[np.float64] | None, ids: NDArray[np.int64] | None
+) -> list[str]:
+    """A sentence on points whose observations contradict each other: they are somewhere, and nothing confirms where.
+
+    Args:
+        weights: (k,) under a robust loss; None for least squares, where those count that carry most of the cost.
+    """
+    known = np.isfinite(errors)
+    times = np.bincount(point_of[known])
+    if weights is not None:
+        counted = np.bincount(point_of[known], weights[known] >= _COUNTS, len(times))
+        loose = np.flatnonzero((times >= 2) & (counted < 2)).astype(np.int64)
+        if not len(loose):
+            return []
+        return [
+            f"{len(loose)} points rest on fewer than two observations that count under the robust loss, so that nothing confirms "
+            f"where they are: {names_text(loose, ids)}"
+        ]
+    squared = np.bincount(point_of[known], errors[known] ** 2, len(times))
+    able = np.flatnonzero(times >= 2)
+    spare = 2 * times[able] - 3
+    if len(able) < _FEW:
+        return []
+    half, limit = np.zeros(int(spare.max()) + 1), np.zeros(int(spare.max()) + 1)
+    for dof in np.unique(spare):
+        half[dof], limit[dof] = chi_square_quantile(0.5, int(dof)), chi_square_exceeded(_STRANGE / len(able), int(dof))
+    scale = max(float(np.median(squared[able] / half[spare])), _LEAST_PIXEL**2)
+    bad = squared[able] > scale * limit[spare]
+    if not squared[able[bad]].sum() > _LOAD * squared.sum():
+        return []
+    worst = able[bad][np.argsort(-squared[able[bad]] / limit[spare[bad]], kind="stable")]
+    share = squared[worst].sum() / squared.sum()
+    return [
+        f"{len(worst)} points have observations that contradict each other, and carry {share:.0%} of the cost; the worst: "
+        f"{names_text(worst.astype(np.int64), ids)}"
     ]
 
 
