@@ -14,6 +14,7 @@ from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.observability.singularity import describe_null_space
+from boxplus.optimization.terms.misfit import misfit_notes
 from boxplus.optimization.terms.variables import VariableRows, Variables
 
 
@@ -198,8 +199,29 @@ class Solution:
         self._problem.start(self.values)
         return describe_null_space(self._problem, find_null_space(self._problem))
 
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences on what speaks against the values, converged or not.
+
+        Told are residuals under least squares that no noise explains, by the usual ones of their group, and a χ² of nine times
+        what the standard deviations promise, where all groups have some and no robust loss. Costs one evaluation.
+
+        Raises:
+            InputError: variables or residuals were removed since.
+
+        Example:
+            >>> problem = bp.Problem()
+            >>> x = problem.add_variables(bp.Euclidean(1), [0.0])
+            >>> measured = np.append(np.linspace(1.9, 2.1, 20), 50.0)[:, None]  # the last one is wrong
+            >>> prior = bp.residuals.Prior(bp.Euclidean(1), measured, sigma=0.1)
+            >>> group = problem.add_residuals(prior, x[np.zeros(21, int)], name="x")
+            >>> problem.solve().doubts()[0][:33]
+            '1 of the 21 residuals of x (20) a'
+        """
+        self._problem.require_current()
+        return misfit_notes(self._problem.groups, self.values, self._problem.layout.dof)
+
     def summary(self) -> str:
-        """A few lines for a terminal or a log."""
+        """A few lines for a terminal or a log, with what speaks against the values."""
         lines = [
             f"{self.method}, {self.linear_solver}",
             f"cost {self.cost_initial:.6e} → {self.cost:.6e} in {self.iterations} iterations "
@@ -207,7 +229,7 @@ class Solution:
             f"{self.status}: {self.reason}",
         ]
         lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
-        return "\n".join([*lines, *self.notes])
+        return "\n".join([*lines, *self.notes, *self.doubts()])
 
 
 def values_at(blocks: Sequence[Variables], given: Solution | Sequence[NDArray[np.float64]] | None) -> list[NDArray[np.float64]]:

@@ -22,7 +22,10 @@ from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solver_options import options_from
 from boxplus.optimization.terms.connections import check_connections, require_connections
+from boxplus.optimization.terms.faded import faded_notes, faded_shares
 from boxplus.optimization.terms.group import Group, broadcast
+from boxplus.optimization.terms.jacobian_notes import wrong_jacobians
+from boxplus.optimization.terms.misfit import misfit_notes
 from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.relative_pose_2d import RelativePose2D
@@ -345,7 +348,11 @@ class IncrementalProblem:
         """All values and the cost; takes time in proportion to the size of the problem, as opposed to `estimate`."""
         problem = self.as_problem()
         values = tuple(block.values for block in problem.blocks)
-        return IncrementalSolution(values, problem.cost() if problem.groups else 0.0, len(self._off))
+        cost = problem.cost() if problem.groups else 0.0
+        dof = sum(int(np.count_nonzero(~block.is_fixed)) * block.manifold.dof for block in problem.blocks)
+        shares = faded_notes(problem.groups, faded_shares(problem.groups, values))
+        doubts = (*misfit_notes(problem.groups, values, dof), *shares, *wrong_jacobians(problem.groups, values))
+        return IncrementalSolution(values, cost, len(self._off), doubts)
 
     @changes
     def as_problem(self) -> Problem:

@@ -43,11 +43,14 @@ class IncrementalSolution:
         values: (n, size) of every block; also `solution[block]` and `solution[block[rows]]`.
         cost: ½ Σ ρ(‖r‖²) there, whitened, of all residuals.
         waiting: see `IncrementalUpdate`.
+        doubts: what speaks against the values, one sentence each: residuals that no noise explains, a χ² that the standard
+            deviations do not promise, residuals that hardly count under a robust loss, Jacobians of one's own that are wrong.
     """
 
     values: tuple[NDArray[np.float64], ...]
     cost: float
     waiting: int
+    doubts: tuple[str, ...] = ()
 
     def __getitem__(self, selected: Variables | VariableRows) -> NDArray[np.float64]:
         """Values (n, size) of a block, or (k, size) of rows of it."""

@@ -51,6 +51,7 @@ def minimize(
 
     stop = record(0, problem.cost.cost, 0.0, strategy.parameter, True)
     rejected, lost = 0, 0  # steps rejected since the last that was taken, and the most residuals one of them lost
+    broken = 0  # of them, those that led to NaN or infinity
     for number in range(1, options.max_iterations + 1):
         last = history[-1]
         if stop:
@@ -62,7 +63,7 @@ def minimize(
         before = strategy.parameter
         step = strategy.propose(problem)
         if step is None:
-            return "stalled", _stall(strategy, rejected, lost), history
+            return "stalled", _stall(strategy, rejected, lost, broken), history
         parameter, cost = strategy.parameter, problem.cost.cost
         # After rejections, and where damping had to grow for H to be factorised, little is expected because the step was made
         # small, not because the minimum is near.
@@ -86,10 +87,11 @@ def minimize(
         if settled or small:
             # After rejections a step is small because it was made so, not because the minimum is near.
             if rejected:
-                return "stalled", _stall(strategy, rejected, lost), history
+                return "stalled", _stall(strategy, rejected, lost, broken), history
             if settled:
                 return "converged", f"the cost changed by {decrease:.2g}, {options.cost_tolerance:.2g} of it or less", history
             return "converged", f"the step moved nothing by more than {size:.2g}", history
+        broken = 0 if accepted else broken + (not np.isfinite(tried.cost))
         rejected, lost = (0, 0) if accepted else (rejected + 1, max(lost, tried.lost))
     if stop:
         return "stopped", f"the callback asked to stop after iteration {history[-1].number}", history
@@ -102,7 +104,12 @@ def _flat(slope: float, options: SolverOptions) -> str:
     return f"the residuals are at right angles to every tangent (cosine {slope:.2g} ≤ {options.gradient_tolerance:.2g})"
 
 
-def _stall(strategy: Strategy, rejected: int, lost: int) -> str:
+def _stall(strategy: Strategy, rejected: int, lost: int, broken: int) -> str:
+    if broken:
+        return (
+            f"{broken} of the last {rejected} steps that were tried lead to residuals that are NaN or infinite: the way down is "
+            "blocked; let a residual say where it does not exist (return None, or valid = False), or keep variables from there"
+        )
     if lost:
         return (
             f"every step of the last {rejected} that were tried makes residuals invalid ({lost} at most): the way down is blocked"

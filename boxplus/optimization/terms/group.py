@@ -125,6 +125,16 @@ class Group:
         return self.removed | self.left_out
 
     @property
+    def is_white(self) -> bool:
+        """Whether residuals count as they are, because their standard deviations are 1 or were not given."""
+        return self._is_white
+
+    @property
+    def is_weighted(self) -> bool:
+        """Whether residuals count by weights that were set."""
+        return self._root is not None
+
+    @property
     def tangents(self) -> int:
         """Columns of all Jacobians together."""
         return sum(J.shape[2] for J in self.jacobians)

@@ -1,4 +1,9 @@
-"""What a solution says of its Jacobians: which are differences, and which jump where it began or ended."""
+"""What a solution says of its Jacobians: which are differences, which jump where it began or ended, and which are wrong.
+
+A search ends where the gradient that the Jacobians give vanishes. Where these are a user's and wrong, that is no minimum, and
+looks like one. So they are compared with differences where it ended, of some residuals and in one direction of chance, which is
+enough: those that a mistake does not show in have no volume.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.optimization.terms.group import Group
+from boxplus.residuals.residual import Residual
+from boxplus.residuals.user_residual import UserResidual
 
 _LISTED = 5
+_LOOKED_AT, _RUN = 64, 16  # residuals that are compared, so many in a row
+_STEPS = (1e-3, 1e-4, 1e-5, 1e-6)  # of differences; two that agree are right
+_SMOOTH, _WRONG = 1e-3, 1e-2  # of their size, by which these agree, and by which a Jacobian does not
+_ROUNDING = 1e-13  # of the residuals, over the step, that differences are not known better than
 
 
 def jacobian_notes(
@@ -26,4 +37,70 @@ def jacobian_notes(
             if len(rows):
                 listed = ", ".join(map(str, rows[:_LISTED])) + (" …" if len(rows) > _LISTED else "")
                 notes.append(f"{len(rows)} of the residuals of {group.name} ({listed}) {where} half a turn off, {advice}")
-    return tuple(notes)
+    return (*notes, *wrong_jacobians(groups, end))
+
+
+def wrong_jacobians(groups: Sequence[Group], values: Sequence[NDArray[np.float64]]) -> tuple[str, ...]:
+    """A sentence for every group whose Jacobians are somebody's own and contradict differences at values of all blocks."""
+    return tuple(note for group in groups if _is_foreign(group.residual) for note in _contradictions(group, values))
+
+
+def _is_foreign(residual: Residual) -> bool:
+    """Whether its Jacobians are somebody's own."""
+    if isinstance(residual, UserResidual):
+        return residual.jacobian_kind == "analytic"
+    return type(residual).__module__.partition(".")[0] != "boxplus"
+
+
+def _contradictions(group: Group, values: Sequence[NDArray[np.float64]]) -> list[str]:
+    """A sentence where Jacobians contradict differences."""
+    residual, count = group.residual, group.residual.count
+    rng = np.random.default_rng(0)
+    x = tuple(values[c.block.number] for c in group.connections)
+    rows = tuple(np.ascontiguousarray(c.rows, dtype=np.uint32) for c in group.connections)
+    way = {
+        c.block.number: rng.uniform(0.5, 1.0, (len(v), m.dof))
+        for c, v, m in zip(group.connections, x, residual.manifolds, strict=True)
+    }
+    runs = max(1, min(_LOOKED_AT // _RUN, count // _RUN))
+    begins = np.unique(np.linspace(0, max(count - _RUN, 0), runs).astype(int))
+    chosen = np.unique(np.concatenate([np.arange(b, min(b + _RUN, count)) for b in begins]))
+    J = tuple(np.zeros((count, residual.dim, m.dof)) for m in residual.manifolds)
+    r, valid = np.zeros((count, residual.dim)), np.zeros(count, dtype=np.bool_)
+
+    def evaluate(step: float) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Residuals of those chosen with all variables moved along the way."""
+        parts = zip(group.connections, x, residual.manifolds, strict=True)
+        moved = tuple(np.ascontiguousarray(m.boxplus(v, step * way[c.block.number])) for c, v, m in parts)
+        e, known = np.zeros_like(r), np.zeros(count, dtype=np.bool_)
+        for begin in begins:
+            residual.evaluate_into(int(begin), min(int(begin) + _RUN, count), moved, rows, e, known)
+        return e[chosen], known[chosen]
+
+    for begin in begins:
+        residual.linearize_into(int(begin), min(int(begin) + _RUN, count), x, rows, r, J, valid)
+    said = sum(
+        np.einsum("nab,nb->na", own[chosen], way[c.block.number][at[chosen]])
+        for own, c, at in zip(J, group.connections, rows, strict=True)
+    )
+    usable = valid[chosen] if group.removed is None else valid[chosen] & ~group.removed[chosen]
+    is_wrong, worst, before = np.zeros(len(chosen), dtype=np.bool_), 0.0, None
+    for step in _STEPS:
+        (ahead, one), (behind, other) = evaluate(step), evaluate(-step)
+        found = (ahead - behind) / (2.0 * step)
+        usable &= one & other
+        if before is not None:
+            size = np.maximum(np.linalg.norm(found, axis=1), np.linalg.norm(said, axis=1))
+            known = usable & (size > _ROUNDING / step * (1.0 + np.abs(r[chosen]).max(axis=1)) / _SMOOTH)
+            off = np.linalg.norm(found - said, axis=1)
+            bad = known & (np.linalg.norm(found - before, axis=1) <= _SMOOTH * size) & (off > _WRONG * size)
+            is_wrong |= bad
+            worst = max(worst, float((off[bad] / size[bad]).max(initial=0.0)))
+        before = found
+    if not is_wrong.any():
+        return []
+    return [
+        f"{group.name}: the Jacobians of {np.count_nonzero(is_wrong)} of {len(chosen)} residuals that were looked at contradict "
+        f"differences of these, by up to {worst:.0%}: where the search ended need be no minimum, and standard deviations are "
+        "wrong; see check_jacobian"
+    ]

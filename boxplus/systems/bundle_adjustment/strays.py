@@ -75,8 +75,7 @@ def stray_points(
 
     def costs(p_world: NDArray[np.float64]) -> NDArray[np.float64]:
         error = sightings.errors(concerned, p_world[sightings.point_of[concerned]]) / config.sigma_px
-        total: NDArray[np.float64] = np.bincount(sightings.point_of[concerned], _costs(loss, error**2), n)
-        return total[tried]
+        return np.asarray(np.bincount(sightings.point_of[concerned], _costs(loss, error**2), n)[tried], dtype=np.float64)
 
     before, after = costs(sightings.points), costs(moved)
     better = after < (1.0 - _LOWER) * before
