@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -103,6 +104,24 @@ GroundTruthOption = Annotated[
         "--gt", help="Ground truth to compare with at the end: TUM, KITTI, EuRoC or boxplus CSV.", rich_help_panel=RESULTS
     ),
 ]
+
+
+class SaveScans(StrEnum):
+    """Frames of clouds of single scans."""
+
+    body = "body"
+    world = "world"
+
+
+SaveScansOption = Annotated[
+    SaveScans | None,
+    typer.Option(
+        "--save-scans",
+        help="Write every scan of the odometry, corrected for motion, as a cloud of its own, scans/TIME_NS.pcd: in the frame of "
+        "the body, at its pose, or of the world; other formats: --set scans.ending=ply.",
+        rich_help_panel=RESULTS,
+    ),
+]
 QuietOption = Annotated[
     bool,
     typer.Option("--quiet", "-q", help="Print warnings and errors only, on the standard error.", rich_help_panel=PRINTING),
@@ -112,6 +131,11 @@ QuietOption = Annotated[
 def default_threads() -> int:
     """Two, where the machine has them."""
     return min(2, os.cpu_count() or 1)
+
+
+def scan_settings(save_scans: SaveScans | None) -> dict[str, object]:
+    """What `--save-scans` sets."""
+    return {} if save_scans is None else {"frame": save_scans.value}
 
 
 def lidar_settings(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,9 +21,11 @@ from boxplus.cli.options import (
     OverwriteOption,
     QuietOption,
     ResumeOption,
+    SaveScansOption,
     SettingsOption,
     ThreadsOption,
     lidar_settings,
+    scan_settings,
 )
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.errors import InputError
@@ -38,13 +39,6 @@ if TYPE_CHECKING:
     from boxplus.runs.lidar_inertial.config import RunConfig
     from boxplus.runs.lidar_inertial.earlier_run import Standing
     from boxplus.runs.lidar_inertial.summary import RunSummary
-
-
-class SaveScans(StrEnum):
-    """Frames of clouds of single scans."""
-
-    body = "body"
-    world = "world"
 
 
 @takes_recording_options
@@ -72,15 +66,7 @@ def lio(
     view: ViewOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
-    save_scans: Annotated[
-        SaveScans | None,
-        typer.Option(
-            "--save-scans",
-            help="Write every scan, corrected for motion, as a cloud of its own, scans/TIME_NS.pcd: in the frame of the body, at "
-            "its pose, or of the world; other formats: --set scans.ending=ply.",
-            rich_help_panel=RESULTS,
-        ),
-    ] = None,
+    save_scans: SaveScansOption = None,
     no_map: NoMapOption = False,
     no_report: NoReportOption = False,
     overwrite: OverwriteOption = False,
@@ -103,8 +89,9 @@ def lio(
     from boxplus.runs.lidar_inertial.config import load_run_config
 
     kept: dict[str, object] = {"save": False} if no_map else {}
-    clouds: dict[str, object] = {} if save_scans is None else {"frame": save_scans.value}
-    run_config = lidar_settings(load_run_config, config, settings, options, T_imu_lidar, threads, map=kept, scans=clouds)
+    run_config = lidar_settings(
+        load_run_config, config, settings, options, T_imu_lidar, threads, map=kept, scans=scan_settings(save_scans)
+    )
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
 
     def run_one(

@@ -43,7 +43,9 @@ def localize(
     settings: SettingsOption = None,
     T_imu_lidar: MountingOption = None,
     threads: ThreadsOption = None,
-    keep_map: Annotated[bool, typer.Option("--keep-map", help="Write the odometry's own map too.")] = False,
+    keep_map: Annotated[
+        bool, typer.Option("--keep-map", help="Write the odometry's own map too.", rich_help_panel=RESULTS)
+    ] = False,
     no_report: NoReportOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

@@ -10,6 +10,7 @@ import typer
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
+    SETTINGS,
     ConfigOption,
     GroundTruthOption,
     JsonOption,
@@ -20,9 +21,11 @@ from boxplus.cli.options import (
     QuietOption,
     RecordingArgument,
     ResumeOption,
+    SaveScansOption,
     SettingsOption,
     ThreadsOption,
     lidar_settings,
+    scan_settings,
 )
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
@@ -42,7 +45,10 @@ def slam(
         typer.Option("--output", "-o", help="Folder for the results; default: RECORDING_slam here.", rich_help_panel=RESULTS),
     ] = None,
     loops: Annotated[
-        Path | None, typer.Option("--loops", help="YAML file of loops to forbid or to force, pairs as in loops.csv.")
+        Path | None,
+        typer.Option(
+            "--loops", help="YAML file of loops to forbid or to force, pairs as in loops.csv.", rich_help_panel=SETTINGS
+        ),
     ] = None,
     config: ConfigOption = None,
     settings: SettingsOption = None,
@@ -51,9 +57,17 @@ def slam(
     ground_truth: GroundTruthOption = None,
     gnss_lever_arm: Annotated[
         str | None,
-        typer.Option("--gnss-lever-arm", help="Antenna of the satellite receiver in the IMU frame, x,y,z [m]."),
+        typer.Option(
+            "--gnss-lever-arm",
+            help="Antenna of the satellite receiver in the IMU frame, x,y,z [m].",
+            metavar="X,Y,Z",
+            rich_help_panel=SETTINGS,
+        ),
     ] = None,
-    utm: Annotated[bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).")] = False,
+    utm: Annotated[
+        bool, typer.Option("--utm", help="Write the trajectory in UTM, too (extra gnss).", rich_help_panel=RESULTS)
+    ] = False,
+    save_scans: SaveScansOption = None,
     no_map: NoMapOption = False,
     no_report: NoReportOption = False,
     view: ViewOption = None,
@@ -78,7 +92,9 @@ def slam(
     if gnss_lever_arm is not None:
         gnss["lever_arm"] = antenna_offset(gnss_lever_arm).tolist()
     kept: dict[str, object] = {"save": False} if no_map else {}
-    run_config = lidar_settings(load_slam_config, config, settings, options, T_imu_lidar, threads, gnss=gnss, map=kept)
+    run_config = lidar_settings(
+        load_slam_config, config, settings, options, T_imu_lidar, threads, gnss=gnss, map=kept, scans=scan_settings(save_scans)
+    )
     forbidden, forced = read_loop_decisions(loops) if loops is not None else ([], [])
     folder = output or Path(f"{recording.resolve().stem}_slam")
 

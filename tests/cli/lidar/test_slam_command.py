@@ -33,6 +33,7 @@ def test_threads_are_those_of_the_file_unless_an_option_says_otherwise(
 
     def run_slam(recording: object, folder: object, config: Any, **options: object) -> None:
         used.append(config.odometry.threads)
+        assert config.scans.frame == "world"
         raise InputError("a run", "enough of it", "stop")
 
     info = SimpleNamespace(path=Path("walk.bag"), format="ros1", duration_s=1.0, message_count=1, evidence=[])
@@ -40,7 +41,7 @@ def test_threads_are_those_of_the_file_unless_an_option_says_otherwise(
     monkeypatch.setattr(boxplus.runs.slam.slam_run, "run_slam", run_slam)
     (tmp_path / "settings.yaml").write_text("odometry: {threads: 3}\n")
     given = [] if words is None else ["--config", str(tmp_path / "settings.yaml"), *words]
-    result = CliRunner().invoke(app, ["slam", "walk.bag", "-o", str(tmp_path / "out"), *given])
+    result = CliRunner().invoke(app, ["slam", "walk.bag", "-o", str(tmp_path / "out"), "--save-scans", "world", *given])
     assert result.exit_code == 2 and "enough of it" in result.stderr
     assert used == [threads]
 
