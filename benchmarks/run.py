@@ -101,6 +101,7 @@ BENCHMARKS = {
     "vio_nees": Benchmark(("--seeds", "500:502", "--seconds", "4")),
     "closure_nees": Benchmark(("--seeds", "1:5:2", "--only", "block,sessions_city")),
     "vio_start": Benchmark(("--seeds", "2001:2021"), arguments=("--half", "odd", "--seeds", "1:1001")),
+    "fleet": Benchmark(("--recordings", "3", "4", "--index", "200", "400")),
     "marginalize": Benchmark(("--landmarks", "50", "150", "--dense", "50", "--rounds", "2")),
 }
 

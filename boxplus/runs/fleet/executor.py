@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -60,10 +61,11 @@ class RayExecutor:
 
     def __enter__(self) -> RayExecutor:
         try:
+            quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "ignore_reinit_error": True}
             if self._address is None:
-                self._ray.init(num_cpus=self._workers, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+                self._ray.init(num_cpus=self._workers, include_dashboard=False, **quiet)
             else:
-                self._ray.init(address=self._address, log_to_driver=False, ignore_reinit_error=True)
+                self._ray.init(address=self._address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise InputError("a Ray cluster", f"none at {self._address}: {error}", "start it, or leave --address out") from error
         return self

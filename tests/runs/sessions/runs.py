@@ -13,6 +13,7 @@ from boxplus.formats.output import make_folder
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
+from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.runs.lidar_inertial.summary import ExtrinsicFacts, RecordingFacts, RunSummary
 from boxplus.runs.slam.folder import SlamFolder
@@ -34,6 +35,7 @@ def written_run(
     config: DriftConfig,
     seed: int,
     state: Literal["finished", "interrupted"] = "finished",
+    maps_config: LocalMapConfig | None = None,
 ) -> DriftingDrive:
     """The run of a drive; its frame is where the first scan was. Returns the drive."""
     drive = simulate_drifting_drive(world, route, config, seed)
@@ -41,7 +43,7 @@ def written_run(
     start = se3.inverse(drive.T_world_body[0])
     poses = se3.compose(np.broadcast_to(start, drive.T_odo_body.shape), drive.T_odo_body)
     make_folder(folder.odometry.path)
-    stored, builder = LocalMapFolder(folder.local_maps), LocalMapBuilder()
+    stored, builder = LocalMapFolder(folder.local_maps), LocalMapBuilder(maps_config)
     spool, maps = ScanSpool(folder.spool, 0.2), []
     with TrajectoryWriter(path) as writer:
         for time_ns, T, scan in zip(drive.time_ns.tolist(), poses, drive.scans, strict=True):
