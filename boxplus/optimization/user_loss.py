@@ -66,7 +66,11 @@ def compiled_loss(code: UserCode) -> tuple[Callable[..., None], bool]:
 
 def _compiled(code: UserCode) -> Any:
     if numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
-        return getattr(code.function, "py_func", code.function)
+        plain = getattr(code.function, "py_func", code.function)
+        found = plain(1.0)  # no types to look at
+        if not (isinstance(found, tuple) and len(found) == 3 and all(isinstance(number, int | float) for number in found)):
+            raise _not_three(code.name, repr(found))
+        return plain
     one = kernel(code.snapshot(checked=False), inline=True, cached=code.cached())
     try:
         one.compile((types.float64,))
@@ -75,8 +79,12 @@ def _compiled(code: UserCode) -> Any:
         raise InputError("a loss that Numba can compile", f"{code.name}: {reason}", "use numbers and `math` only") from error
     returned: Any = one.overloads[(types.float64,)].signature.return_type
     if not (_is_three_numbers(returned)):
-        raise InputError(f"three numbers from {code.name}", str(returned), "return ρ(s), ρ′(s), ρ″(s)")
+        raise _not_three(code.name, str(returned))
     return one
+
+
+def _not_three(name: str, returned: str) -> InputError:
+    return InputError(f"three numbers from {name}", returned, "return ρ(s), ρ′(s), ρ″(s)")
 
 
 def _is_three_numbers(returned: Any) -> bool:
