@@ -156,6 +156,7 @@ def adjust_lines(
         notes.append("the input has the world behind the cameras, as a mirror image; it was reflected through its origin")
     if not long.all():
         notes.append(f"{int((~long).sum())} segments shorter than 1 px have no direction and were left out")
+    notes += solution.doubts()
     return LineAdjustmentResult(
         data=adjusted,
         errors_start=errors_start,
@@ -164,7 +165,7 @@ def adjust_lines(
         point_errors=point_errors,
         triangulation=found,
         notes=tuple(notes),
-        doubt=_doubt(adjusted, errors, seen, config),
+        doubt=_doubt(adjusted, errors, point_errors, seen, config, loss),
         solution=solution,
         cameras=cameras,
         lines=lines,
@@ -247,7 +248,14 @@ def _adjusted(data: VggLines, poses: Floats, lines: Floats, points: Floats | Non
     return replace(data, T_camera_world=poses, end_points_world=ends, points_world=p_world)
 
 
-def _doubt(adjusted: VggLines, errors: Floats, seen: NDArray[np.intp], config: LineAdjustmentConfig) -> str | None:
+def _doubt(
+    adjusted: VggLines,
+    errors: Floats,
+    point_errors: Floats,
+    seen: NDArray[np.intp],
+    config: LineAdjustmentConfig,
+    loss: Loss | None,
+) -> str | None:
     views, own = adjusted.view_of[seen], adjusted.line_of[seen]
     R = quaternion.to_matrix(np.ascontiguousarray(adjusted.T_camera_world[:, :4]))
     ends = adjusted.end_points_world[own].reshape(-1, 2, 3)
@@ -255,10 +263,20 @@ def _doubt(adjusted: VggLines, errors: Floats, seen: NDArray[np.intp], config: L
     behind = int((depth.max(axis=1) <= 0.0).sum())
     if behind > _BAD_SHARE * len(seen):
         return f"{behind} of {len(seen)} segments show lines that lie behind their cameras: the start is too far off"
-    rms = float(np.sqrt(np.mean(errors[seen][np.isfinite(errors[seen])] ** 2))) if np.isfinite(errors[seen]).any() else np.inf
-    if rms > _MOST_SIGMAS * config.sigma_px:
-        return (
-            f"the ends of the segments are {rms:.2f} px from their lines (root mean square), with a standard deviation of "
-            f"{config.sigma_px:g} px: segments are matched wrongly, or the noise is larger (--sigma)"
-        )
-    return None
+    of_points = np.empty(0) if loss is not None else point_errors
+    reasons = []
+    for rms, sigma, told in (
+        (_rms(errors[seen], np.inf), config.sigma_px, "the ends of the segments are {:.2f} px from their lines"),
+        (_rms(of_points, 0.0), config.sigma_point_px, "the pixels are {:.2f} px from their points"),
+    ):
+        if rms > _MOST_SIGMAS * sigma:
+            reasons.append(
+                f"{told.format(rms)} (root mean square), with a standard deviation of {sigma:g} px: they are matched wrongly, or "
+                "the noise is larger (--sigma)"
+            )
+    return "; ".join(reasons) or None
+
+
+def _rms(errors: Floats, of_none: float) -> float:
+    known = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else of_none

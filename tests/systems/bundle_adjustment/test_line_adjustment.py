@@ -90,3 +90,14 @@ def test_the_published_sets(shared_data: Path, name: str, level: float, with_poi
             assert round(float(np.nanmedian(result.errors)), 3) <= bar
         assert np.nanmedian(together.point_errors) < 0.28
         assert any("mirror image" in note for note in together.notes)
+
+
+def test_points_that_are_matched_wrongly_are_named_and_not_trusted():
+    for seed in (1, 3):
+        data = perturbed(house(seed), seed)
+        assert adjust_lines(data).doubt is None and adjust_lines(data).notes == ()
+        pixels = data.pixels.copy()
+        pixels[47] += [180.0, -120.0]  # of view 2
+        result = adjust_lines(replace(data, pixels=pixels))
+        assert "px from their points" in result.doubt
+        assert any("residuals of points of 002 (7" in note for note in result.notes), result.notes
