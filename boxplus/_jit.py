@@ -56,9 +56,7 @@ def kernel(
         options["no_cpython_wrapper"] = options["no_cfunc_wrapper"] = True
     dispatcher = numba.njit(**options)(function)
     if cached and not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
-        # Without a cache folder that is safe to use the kernel still works; it compiles again in the next process.
-        with contextlib.suppress(RuntimeError):
-            dispatcher._cache = KernelCache(dispatcher.py_func, cached if isinstance(cached, str) else None)
+        dispatcher._cache = KernelCache(dispatcher.py_func, cached if isinstance(cached, str) else None)
     return dispatcher
 
 

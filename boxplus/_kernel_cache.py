@@ -34,7 +34,8 @@ from typing import Any, BinaryIO
 import numba
 from numba.core import environment
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
-from numba.core.runtime.nrt import rtsys
+
+from boxplus._machine_code import rebuild_function, reduce_function, start_runtime
 
 _log = logging.getLogger(__name__)
 _PACKAGE_ROOT = Path(__file__).resolve().parent
@@ -71,10 +72,16 @@ def _module_files(dotted_name: str) -> tuple[Path, ...]:
 
 
 @functools.cache
-def _imported_files(file: Path) -> frozenset[Path]:
-    """The boxplus files that `file` imports directly."""
+def _resolved(file: str) -> Path:
+    return Path(file).resolve()
+
+
+@functools.cache
+def _source(file: Path) -> tuple[bytes, frozenset[Path]]:
+    """Hash of a file, and the boxplus files that it imports directly."""
+    content = file.read_bytes()
     found: set[Path] = set()
-    for package, names, module in _IMPORT.findall(file.read_text(encoding="utf-8")):
+    for package, names, module in _IMPORT.findall(content.decode("utf-8")):
         if package.startswith("."):  # in the stubs; those of a user's file lead to no file of boxplus
             if not file.is_relative_to(_PACKAGE_ROOT):
                 continue
@@ -82,7 +89,7 @@ def _imported_files(file: Path) -> frozenset[Path]:
         candidates = [module] if module else [package]
         candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
         found.update(path for name in candidates for path in _module_files(name))
-    return frozenset(found)
+    return hashlib.sha256(str(file).encode() + b"\n" + content).digest(), frozenset(found)
 
 
 @functools.cache
@@ -90,13 +97,12 @@ def source_key(file: Path) -> str:
     """Hash of `file`, of every boxplus file it depends on, of Numba's version and of the processor."""
     pending, seen = [file], {file}
     while pending:
-        for dependency in _imported_files(pending.pop()) - seen:
+        for dependency in _source(pending.pop())[1] - seen:
             seen.add(dependency)
             pending.append(dependency)
     digest = hashlib.sha256(f"{numba.__version__} {sys.implementation.cache_tag} {processor()}".encode())
-    for path in sorted(seen):
-        digest.update(str(path).encode())
-        digest.update(path.read_bytes())
+    for content in sorted(_source(path)[0] for path in seen):
+        digest.update(content)
     return digest.hexdigest()[:24]
 
 
@@ -168,7 +174,7 @@ class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
         module = hashlib.sha256(py_func.__module__.encode()).hexdigest()[:8]
         # What a user wrote is known by what it does, wherever it stands.
         self._line = 0 if self.key else py_func.__code__.co_firstlineno
-        self._folder = cache_root() / "kernels" / f"{self.key or source_key(Path(py_file).resolve())}-{module}"
+        self._folder = cache_root() / "kernels" / f"{self.key or source_key(_resolved(py_file))}-{module}"
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -208,55 +214,59 @@ class _Unpickler(pickle.Unpickler):
         return super().find_class(module, name)
 
 
+def _unpickle(path: str, content: bytes) -> Any:
+    """What was saved, or None where it cannot be restored here: it is compiled again."""
+    try:
+        return _Unpickler(io.BytesIO(content)).load()
+    except Exception as error:  # noqa: BLE001 - whatever its imports raise: a cache must never stop a program
+        _warn_once("unrestorable", "%s cannot be restored (%r): its kernel is compiled again", path, error)
+        return None
+
+
+def _read(path: str) -> bytes | None:
+    """What was written to `path`, if all of it is there and nobody else can have written it."""
+    try:
+        with open(path, "rb") as file:
+            if _distrusted(path, os.fstat(file.fileno())):
+                return None
+            content = file.read()
+    except OSError:
+        return None
+    digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(payload).digest() == digest:
+        return payload
+    _warn_once("damaged", "%s is damaged (cut or changed): it is discarded and its kernel compiled again", path)
+    with suppress(OSError):
+        os.unlink(path)
+    return None
+
+
+def _write(path: str, payload: bytes) -> None:
+    with _replacing(path) as file:
+        file.write(hashlib.sha256(payload).digest())
+        file.write(payload)
+
+
 class _VerifiedFiles(IndexDataCacheFile):  # type: ignore[misc]
     """The index and the machine code of one function, each behind a checksum that is looked at before anything is unpickled."""
 
     def _load_index(self) -> dict[Any, str]:
-        content = self._read(self._index_path)
+        content = _read(self._index_path)
         if content is None:
             return {}
-        stamp, overloads = self._unpickle(self._index_path, content) or (None, {})
+        stamp, overloads = _unpickle(self._index_path, content) or (None, {})
         return overloads if stamp == self._source_stamp else {}
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
-        self._write(self._index_path, self._dump((self._source_stamp, overloads)))  # type: ignore[no-untyped-call]
+        _write(self._index_path, self._dump((self._source_stamp, overloads)))  # type: ignore[no-untyped-call]
 
     def _load_data(self, name: str) -> Any:
-        content = self._read(self._data_path(name))  # type: ignore[no-untyped-call]
-        return None if content is None else self._unpickle(self._data_path(name), content)  # type: ignore[no-untyped-call]
+        path = self._data_path(name)  # type: ignore[no-untyped-call]
+        content = _read(path)
+        return None if content is None else _unpickle(path, content)
 
     def _save_data(self, name: str, data: Any) -> None:
-        self._write(self._data_path(name), self._dump(data))  # type: ignore[no-untyped-call]
-
-    def _unpickle(self, path: str, content: bytes) -> Any:
-        """What was saved, or None where it cannot be restored here: it is compiled again."""
-        try:
-            return _Unpickler(io.BytesIO(content)).load()
-        except Exception as error:  # noqa: BLE001 - whatever its imports raise: a cache must never stop a program
-            _warn_once("unrestorable", "%s cannot be restored (%r): its kernel is compiled again", path, error)
-            return None
-
-    def _read(self, path: str) -> bytes | None:
-        """What was written to `path`, if all of it is there and nobody else can have written it."""
-        try:
-            with open(path, "rb") as file:
-                if _distrusted(path, os.fstat(file.fileno())):
-                    return None
-                content = file.read()
-        except OSError:
-            return None
-        digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        if hashlib.sha256(payload).digest() == digest:
-            return payload
-        _warn_once("damaged", "%s is damaged (cut or changed): it is discarded and its kernel compiled again", path)
-        with suppress(OSError):
-            os.unlink(path)
-        return None
-
-    def _write(self, path: str, payload: bytes) -> None:
-        with _replacing(path) as file:
-            file.write(hashlib.sha256(payload).digest())
-            file.write(payload)
+        _write(self._data_path(name), self._dump(data))  # type: ignore[no-untyped-call]
 
 
 @contextmanager
@@ -298,32 +308,45 @@ def _forget_old(kernels: Path) -> None:
 class _KeyedCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = [_KeyedLocator]  # noqa: RUF012
 
+    def reduce(self, compiled: Any) -> tuple[Any, ...]:
+        return reduce_function(compiled)
+
+    def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
+        return rebuild_function(target_context, payload)
+
     def check_cachable(self, compiled: Any) -> bool:
         """Not what holds an address of this process, such as that of a large array among a user's globals."""
         return not compiled.lifted and not compiled.library.has_dynamic_globals
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """What a dispatcher loads its machine code from, and saves it to.
+    """What a dispatcher loads its machine code from, and saves it to; does neither where there is no folder that can be used.
 
     Args:
         key: of a function that a user wrote, a hash of all that decides what it does; a function of ours is kept under the
             hash of its file and of what that imports.
-
-    Raises:
-        RuntimeError: there is no folder that can be used.
     """
 
     _impl_class: type[Any] = _KeyedCacheImpl
 
     def __init__(self, py_func: Callable[..., Any], key: str | None = None) -> None:
-        self._key = key
-        if key is not None:
-            locator_class = type("_Locator", (_KeyedLocator,), {"key": key})
+        self._py_func, self._key, self._found = py_func, key, False
+        if key is None:
+            # Now, before somebody edits the file; the folder is asked for by the few functions that are called.
+            source_key(_resolved(py_func.__code__.co_filename))
+
+    def _find(self) -> None:
+        self._found = True
+        if self._key is not None:
+            locator_class = type("_Locator", (_KeyedLocator,), {"key": self._key})
             self._impl_class = type("_Impl", (_KeyedCacheImpl,), {"_locator_classes": [locator_class]})
-        super().__init__(py_func)  # type: ignore[no-untyped-call]
+        try:
+            super().__init__(self._py_func)  # type: ignore[no-untyped-call]
+        except RuntimeError:  # no folder that is safe to use: it compiles again in the next process
+            self.disable()  # type: ignore[no-untyped-call]
+            return
         locator = self._impl.locator
-        if key is not None:
+        if self._key is not None:
             _note_use(Path(locator.get_cache_path()))
         self._cache_file = _VerifiedFiles(  # type: ignore[no-untyped-call]
             cache_path=locator.get_cache_path(), filename_base=self._impl.filename_base, source_stamp=locator.get_source_stamp()
@@ -341,14 +364,35 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         Machine code needs the symbols of Numba's runtime. Those of hashing, which come with the compiler, only functions of
         users may need.
         """
+        start_runtime(target_context, _load_runtime, _save_runtime)
+        if not self._found:
+            self._find()
         if self._key is not None:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        rtsys.initialize(target_context)  # type: ignore[no-untyped-call]
         with self._guard_against_spurious_io_errors():  # type: ignore[no-untyped-call]
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        """As Numba's, of what was asked for with `load_overload` before; not having room for it is no error."""
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:  # a full disk, a folder removed meanwhile: the kernel is compiled all the same
             _warn_once("unwritable", "compiled kernels cannot be kept in %s: %s", self._cache_path, error)
+
+
+def _runtime_file(target_context: Any) -> Path:
+    target = hashlib.sha256(repr(target_context.codegen().magic_tuple()).encode()).hexdigest()[:8]
+    return cache_root() / "kernels" / f"{source_key(Path(__file__).resolve())}-runtime" / f"{target}.runtime"
+
+
+def _load_runtime(target_context: Any) -> Any:
+    file = _runtime_file(target_context)
+    content = _read(str(file)) if _is_usable(file.parent) else None
+    return None if content is None else _unpickle(str(file), content)
+
+
+def _save_runtime(target_context: Any, runtime: Any) -> None:
+    file = _runtime_file(target_context)
+    with suppress(OSError):
+        if _is_usable(file.parent):
+            _write(str(file), pickle.dumps(runtime))

@@ -38,7 +38,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def _forget() -> None:
     _kernel_cache._module_files.cache_clear()
-    _kernel_cache._imported_files.cache_clear()
+    _kernel_cache._source.cache_clear()
     _kernel_cache.source_key.cache_clear()
 
 
@@ -110,7 +110,7 @@ def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(_PROGRAM)
 
     def run(cache: Path) -> str:
-        environment = {"BOXPLUS_CACHE_DIR": str(cache), "PATH": ""}
+        environment = {"BOXPLUS_CACHE_DIR": str(cache), "PATH": "", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}
         done = subprocess.run(
             [sys.executable, str(tmp_path / "program.py")], env=environment, capture_output=True, text=True, check=True
         )
@@ -148,7 +148,7 @@ except ValueError as error:
 """)
 
     def run() -> list[str]:
-        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": ""}
+        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": "", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}
         program = [sys.executable, str(tmp_path / "program.py")]
         return subprocess.run(program, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
 
@@ -163,7 +163,7 @@ def test_a_file_under_another_module_name_has_kernels_of_its_own(tmp_path: Path)
     as_a_module += "import sys; sys.modules[{0!r}] = m; s.loader.exec_module(m)"
 
     def run(*arguments: str) -> str:
-        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": ""}
+        environment = {"BOXPLUS_CACHE_DIR": str(tmp_path / "cache"), "PATH": "", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}
         done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
         assert done.stderr == ""
         return done.stdout.strip()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import uncollected
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -89,16 +90,21 @@ def ba(
     problem does not determine its variables or the results could not be written, 2 bad input, 3 finished but not to be trusted
     (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
     """
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
-    from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
-    from boxplus.cli.outcome import reported
-    from boxplus.errors import InputError
-    from boxplus.formats.reconstructions.reconstruction import read_reconstruction, reconstruction_file_name, write_reconstruction
-    from boxplus.report.optimization.bundle_scene import camera_centers
-    from boxplus.runs.storage.output_folder import output_folder
-    from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
-    from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+    with uncollected():
+        from boxplus.cli.interrupt import stop_on_interrupt
+        from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
+        from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+        from boxplus.cli.outcome import reported
+        from boxplus.errors import InputError
+        from boxplus.formats.reconstructions.reconstruction import (
+            read_reconstruction,
+            reconstruction_file_name,
+            write_reconstruction,
+        )
+        from boxplus.report.optimization.bundle_scene import camera_centers
+        from boxplus.runs.storage.output_folder import output_folder
+        from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+        from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 
     started, terminal = datetime.now(UTC), OptimizationTerminal(quiet=quiet, as_json=as_json)
     robust = parse_loss(loss)

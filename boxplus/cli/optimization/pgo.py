@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli import uncollected
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
     LinearSolverOption,
@@ -119,13 +120,14 @@ def pgo(
     the global minimum, edges that contradict each other, a file that means something else), 130 interrupted (results up to there
     are complete).
     """
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
-    from boxplus.cli.outcome import reported
-    from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
-    from boxplus.runs.storage.output_folder import output_folder
-    from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
-    from boxplus.systems.pose_graph.problem import positions
+    with uncollected():
+        from boxplus.cli.interrupt import stop_on_interrupt
+        from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+        from boxplus.cli.outcome import reported
+        from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
+        from boxplus.runs.storage.output_folder import output_folder
+        from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph
+        from boxplus.systems.pose_graph.problem import positions
 
     started, terminal = datetime.now(UTC), OptimizationTerminal(quiet=quiet, as_json=as_json)
     robust = parse_loss(loss)
