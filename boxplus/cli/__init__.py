@@ -155,6 +155,7 @@ def _common(
 
 def main() -> None:
     """Entry point of the command `boxplus`."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # our threads call it; its own would have to be started, and wait spinning
+    if "OMP_NUM_THREADS" not in os.environ:  # our threads call BLAS; its own would have to be started, and wait spinning
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     atexit.register(gc.freeze)  # what is left goes with the process; to look for garbage among it takes a seventh of a second
     app(prog_name="boxplus")

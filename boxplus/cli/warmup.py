@@ -1,35 +1,61 @@
-"""`boxplus warmup`: compile the kernels of the main jobs before they are needed."""
+"""`boxplus warmup`: compile the kernels of the main jobs before they are needed.
+
+Parts of the work are processes of their own, as many at a time as there are processors: compiling holds the interpreter. They
+share the cache folder, so that each finds there what another one has compiled.
+"""
 
 from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+_MOST_PROCESSES = 4  # of half a gigabyte each
 
 
 def warmup() -> None:
     """Compile everything now, so that the first run does not have to. Takes a minute, once."""
     import time
+    from concurrent.futures import ThreadPoolExecutor, as_completed
 
-    from boxplus._jit import on_compilation
     from boxplus._kernel_cache import cache_root
     from boxplus.cli.console import make_console
+    from boxplus.errors import BoxplusError
 
     console = make_console()
     began = time.perf_counter()
     compiled: set[str] = set()
-    with console.status("compiling kernels …") as status:
-
-        def show(name: str) -> None:
-            compiled.add(name)
-            status.update(f"compiling kernels … {name}")
-
-        with on_compilation(show):
-            _run_odometry()
-            _close_loops()
-            _optimize_pose_graphs()
-            _adjust_bundle()
-            _follow_camera()
-            _follow_camera_and_imu()
-            _calibrate_cameras()
+    with console.status("compiling kernels …") as status, ThreadPoolExecutor(min(os.cpu_count() or 1, _MOST_PROCESSES)) as pool:
+        running = [pool.submit(_compile_apart, part) for part in _PARTS]
+        for done, part in enumerate(as_completed(running), 1):
+            names, failure = part.result()
+            if failure:
+                pool.shutdown(cancel_futures=True)
+                raise BoxplusError(f"kernels cannot be compiled: {failure}")
+            compiled |= names
+            status.update(f"compiling kernels … {done} of {len(running)} parts, {len(compiled)} kernels")
     what = f"{len(compiled)} kernels compiled" if compiled else "nothing to compile, all kernels were ready"
     console.print(f"{what} in {time.perf_counter() - began:.1f} s, kept in {cache_root()}", soft_wrap=True)
+
+
+def _compile_apart(part: str) -> tuple[set[str], str]:
+    """Which kernels a process of its own had to compile for this part, and why it failed."""
+    done = subprocess.run(
+        [sys.executable, "-m", "boxplus.cli.warmup", part], capture_output=True, text=True, encoding="utf-8", check=False
+    )
+    if done.returncode:
+        return set(), f"{part}: {(done.stderr.strip().splitlines() or [f'exit code {done.returncode}'])[-1]}"
+    return set(done.stdout.split()), ""
+
+
+def _compile_here(part: str) -> None:
+    """Do this part, and write the names of the kernels that had to be compiled to the standard output."""
+    from boxplus._jit import on_compilation
+
+    compiled: list[str] = []
+    with on_compilation(compiled.append):
+        _PARTS[part]()
+    sys.stdout.write("\n".join(compiled))
 
 
 def _run_odometry() -> None:
@@ -169,3 +195,18 @@ def _calibrate_cameras() -> None:
     seen = simulate_target_session([camera], mounting, (752, 480), target, frames=24, rate_hz=5.0)
     noise = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3)
     calibrate_cameras(seen.corners, target, CameraCalibrationConfig(max_views=8), imu=seen.imu, noise=noise)
+
+
+# The longest first.
+_PARTS = {
+    "LiDAR-inertial odometry": _run_odometry,
+    "visual-inertial odometry": _follow_camera_and_imu,
+    "loop closure": _close_loops,
+    "calibration of cameras": _calibrate_cameras,
+    "bundle adjustment": _adjust_bundle,
+    "pose graphs": _optimize_pose_graphs,
+    "direct odometry": _follow_camera,
+}
+
+if __name__ == "__main__":
+    _compile_here(sys.argv[1])

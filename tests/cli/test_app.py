@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import re
 import subprocess
 import sys
@@ -11,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import boxplus
-from boxplus.cli import _COMMANDS, app
+from boxplus.cli import _COMMANDS, app, uncollected
 from boxplus.recordings import RecordingOptions
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.recording_writer import write_recording
@@ -116,3 +118,30 @@ def test_help_imports_nothing_heavy() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.splitlines()[-1].strip() == "heavy:"
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_imports_leave_the_collector_as_it_was(enabled: bool) -> None:
+    before = gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        with uncollected():
+            assert not gc.isenabled()
+        assert gc.isenabled() == enabled
+    finally:
+        (gc.enable if before else gc.disable)()
+
+
+def test_the_threads_of_blas_that_a_user_asked_for_stay() -> None:
+    code = (
+        "import os; from boxplus.cli import main\ntry: main()\nexcept SystemExit: print(os.environ.get('OPENBLAS_NUM_THREADS'))"
+    )
+
+    def threads(**given: str) -> str:
+        environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")} | given
+        program = [sys.executable, "-c", code, "--version"]
+        return subprocess.run(program, env=environment, capture_output=True, text=True, check=True).stdout.split()[-1]
+
+    assert threads() == "1"
+    assert threads(OPENBLAS_NUM_THREADS="3") == "3"
+    assert threads(OMP_NUM_THREADS="3") == "None"
