@@ -89,7 +89,9 @@ def _source(file: Path) -> tuple[bytes, frozenset[Path]]:
         candidates = [module] if module else [package]
         candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
         found.update(path for name in candidates for path in _module_files(name))
-    return hashlib.sha256(str(file).encode() + b"\n" + content).digest(), frozenset(found)
+    # The same release in another folder, such as that of a new environment, finds what was compiled before.
+    name = file.relative_to(_PACKAGE_ROOT) if file.is_relative_to(_PACKAGE_ROOT) else file
+    return hashlib.sha256(name.as_posix().encode() + b"\n" + content).digest(), frozenset(found)
 
 
 @functools.cache

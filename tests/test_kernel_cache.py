@@ -75,6 +75,16 @@ def test_the_key_ignores_what_is_not_imported(package: Path, changed: str) -> No
     assert _key(package / "middle.py") == before
 
 
+def test_the_key_is_that_of_the_same_files_elsewhere(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = _key(package / "top.py")
+    package.rename(tmp_path / "moved")
+    monkeypatch.setattr(_kernel_cache, "_PACKAGE_ROOT", tmp_path / "moved")
+    assert _key(tmp_path / "moved" / "top.py") == before
+    outside = tmp_path / "top.py"
+    outside.write_text((tmp_path / "moved" / "top.py").read_text())
+    assert _key(outside) != before
+
+
 def test_files_that_import_one_another_have_a_key(package: Path) -> None:
     (package / "low" / "bottom.py").write_text("from boxplus.top import m\n")
     assert len(_key(package / "top.py")) == 24
