@@ -64,13 +64,19 @@ def _table(summary: RefineSummary) -> str:
                 f"{1e3 * (pair[1] - pair[0]):+.2f} mm",
             )
         )
+    offset = summary.time_offset_s
+    rows.append(
+        ("time offset, IMU − LiDAR", "0.00 ms", f"{1e3 * offset:.2f} ms", f"± {1e3 * summary.time_offset_sigma_s:.2f} ms")
+    )
     rows.append(("vertical", "", "", f"tilted by {summary.gravity_tilt_deg:.3f}°"))
     for number, (first, last) in enumerate(summary.cost):
         rows.append((f"cost of round {number + 1}", f"{first:,.0f}", f"{last:,.0f}", f"{last / max(first, 1e-12):.4f}"))
     text = (
         "Thickness and entropy are those of points that took no part in refining, on planes found before it. "
-        f"The mounting of the LiDAR was {escape(summary.extrinsic)}."
+        f"The mounting of the LiDAR was {escape(summary.extrinsic)}. The time offset was {escape(summary.time_offset)}."
     )
+    if summary.loops:
+        text += f" Of {summary.loops} loops, planes that both visits see took the place of {summary.loops_told_by_planes}."
     return f"<section><h2>Before and after</h2><p>{text}</p>{html_table(rows, ('', 'before', 'after', 'change'))}</section>"
 
 

@@ -138,6 +138,8 @@ def _print(terminal: Terminal, summary: RefineSummary, comparison: Comparison | 
             ("scans", f"{summary.scans}, in {summary.keyframes} keyframes, on {summary.planes} planes"),
             ("moved", f"{1e3 * summary.largest_shift_m:.1f} mm and {summary.largest_turn_deg:.3f} deg at most"),
             ("mounting", summary.extrinsic),
+            ("time offset", summary.time_offset),
+            *_outside(summary),
             *([] if comparison is None else [comparison.row]),
             ("time", ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())),
         ]
@@ -145,3 +147,15 @@ def _print(terminal: Terminal, summary: RefineSummary, comparison: Comparison | 
     for warning in summary.warnings:
         terminal.warn(warning)
     terminal.print_files(folder, ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"))
+
+
+def _outside(summary: RefineSummary) -> list[tuple[str, str]]:
+    """Loops and positions by satellite."""
+    rows = []
+    if summary.loops:
+        text = f"{summary.loops}, {summary.loops_told_by_planes} of them told better by planes that both visits see"
+        rows.append(("loops", text))
+    if (receiver := summary.receiver) is not None:
+        text = f"{receiver.fixes} fixes; heading ± {receiver.heading_sigma_deg:.3f}°, place ± {receiver.position_sigma_m:.2f} m"
+        rows.append(("satellites", text))
+    return rows

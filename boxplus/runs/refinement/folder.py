@@ -23,10 +23,15 @@ class RefineFolder(RunFolder):
         """Points of the scans while the run goes on; gone afterwards."""
         return self.path / "points.spool"
 
+    @property
+    def georeference(self) -> Path:
+        """Where on the Earth the map is; only of a run that was laid there."""
+        return self.path / "georeference.yaml"
+
     def own_files(self) -> Iterator[Path]:
         """See `RunFolder.own_files`."""
         yield from RunFolder.own_files(self)
-        yield from self.existing([self.points], ())
+        yield from self.existing([self.points, self.georeference], ())
 
 
 @contextmanager

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import BoxplusError, InputError, printable
 from boxplus.filtering.nav_state import NavState
 from boxplus.formats.output import atomic_file
@@ -25,23 +27,26 @@ from boxplus.recordings.open import open_recording
 from boxplus.runs.lidar_inertial.config import RunConfig, load_run_config
 from boxplus.runs.lidar_inertial.scan_log import read_scan_log
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
+from boxplus.runs.refinement.closed_run import ClosedRun, read_closed_run
 from boxplus.runs.refinement.config import RefineRunConfig, dump_refine_config
 from boxplus.runs.refinement.folder import RefineFolder
-from boxplus.runs.refinement.summary import MapSharpness, RefineSummary
+from boxplus.runs.refinement.summary import MapSharpness, RefinedReceiver, RefineSummary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import peak_memory_mb, versions
 from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.point_store import PointStore
-from boxplus.systems.refinement.refinement import RefinedState, Refinement, refine
+from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
+from boxplus.systems.refinement.state import RefinedState
 
 Floats = NDArray[np.float64]
 
 _FEWEST_SCANS = 20
 _DOUBTED = 5.0  # standard deviations of the run's, by which a pose moved
 _LEAST_SIGMA_M = 0.002
+_CONTRADICTED = math.sqrt(chi_square_quantile(0.9999, 6))  # standard deviations of a loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +55,8 @@ class OdometryRun:
 
     Attributes:
         folder, summary, config: of it.
-        trajectory: with covariance and status; rows: the same with velocities, biases and mounting.
+        trajectory: with covariance and status; rows: those of the odometry with velocities, biases and mounting.
+        closed: the run of `boxplus slam` that it is part of, whose trajectory is meant then; None without.
     """
 
     folder: RunFolder
@@ -58,6 +64,7 @@ class OdometryRun:
     config: RunConfig
     trajectory: Trajectory
     rows: OdometryRows
+    closed: ClosedRun | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,15 +87,15 @@ class _Stopped(Exception):
 
 
 def read_odometry_run(folder: str | Path) -> OdometryRun:
-    """Read the folder of `boxplus lio`, or the one inside the folder of `boxplus slam`.
+    """Read the folder of `boxplus lio` or of `boxplus slam`.
 
     Raises:
         InputError: another folder; a run that goes on, without an IMU, whose sensors contradict each other, whose mounting is an
             assumption, or too short.
     """
-    path = Path(folder)
+    path, closed = Path(folder), None
     if (path / "run.json").is_file() and program_of(path / "run.json") == "boxplus slam":
-        path = path / "odometry"
+        closed, path = read_closed_run(path), path / "odometry"
     run = RunFolder(path)
     summary = read_summary(run.summary)
     if summary.state not in ("finished", "interrupted"):
@@ -113,7 +120,10 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     R_L = quaternion.to_matrix(log.matrix(("imu_lidar_qw", "imu_lidar_qx", "imu_lidar_qy", "imu_lidar_qz")))
     v, b_w, b_a, g, p_L = [log.column(name) for name in ("velocity", "bias_gyro", "bias_accel", "gravity", "imu_lidar_p")]
     states = [NavState(R[k], trajectory.p[k], v[k], b_w[k], b_a[k], g[k], R_L[k], p_L[k]) for k in range(len(times))]
-    return OdometryRun(run, summary, load_run_config(run.config), trajectory, OdometryRows(times, states, log.status))
+    rows = OdometryRows(times, states, log.status)
+    return OdometryRun(
+        run, summary, load_run_config(run.config), trajectory if closed is None else closed.trajectory, rows, closed
+    )
 
 
 def refine_run(
@@ -186,6 +196,7 @@ class _RefineRun:
             scans = np.flatnonzero(finished.is_end)
             with self._timed("writing"):
                 self._write_trajectory(finished, found, scans, refusal is None)
+                self._write_place()
                 stored = self._write_map(finished, found.after) if refusal is None and self._config.map.save else 0
         summary = self._facts(finished, found, scans, refusal, stored)
         summary.write(self._folder.summary)
@@ -193,15 +204,19 @@ class _RefineRun:
         return RefineResult(summary, finished.time_ns[scans], before, after)
 
     def _collected(self, store: PointStore) -> FinishedRun:
+        closed = self._run.closed
         with open_recording(self._recording, self._run.config.recording) as opened:
 
             def stopped() -> bool:
                 self._tell("reading", opened.progress)
                 return False
 
-            return collect(
+            found = collect(
                 iter(opened), self._run.rows, self._run.config.odometry, self._config.refinement, store, stopped
             )  # fmt: skip
+            if closed is None:
+                return found
+            return replace(found.corrected(closed.outcome.placed), loops=closed.loops(), fixes=closed.fixes(opened))
 
     def _write_trajectory(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64], accepted: bool) -> None:
         """The refined poses, or those of the run; status is the run's."""
@@ -215,6 +230,13 @@ class _RefineRun:
                 covariance = found.pose_covariance[scan] if accepted else own
                 status = "ok" if trajectory.status is None else trajectory.status[row]
                 writer.append(int(finished.time_ns[scan]), R[k], T[k, 4:], covariance, status)
+
+    def _write_place(self) -> None:
+        """`georeference.yaml` of the run: what is written lies on the Earth as the run does, with the same origin."""
+        closed = self._run.closed
+        if closed is not None and closed.folder.georeference.is_file():
+            with atomic_file(self._folder.georeference) as file:
+                file.write(closed.folder.georeference.read_bytes())
 
     def _write_map(self, finished: FinishedRun, state: RefinedState) -> int:
         """Tiles and merged files of the points that were kept."""
@@ -253,7 +275,15 @@ class _RefineRun:
         if refusal is not None:
             warnings.insert(0, f"not accepted, the trajectory is that of the run and no map was written: {refusal}")
         if refusal is None:
-            warnings += self._doubts(finished, found, scans)
+            warnings += found.calibration.doubts + self._doubts(finished, found, scans)
+        far = np.flatnonzero(found.loop_errors > _CONTRADICTED)
+        if len(far) and finished.loops is not None:
+            worst = int(np.argmax(found.loop_errors))
+            which = f"{finished.loops.query[worst]} → {finished.loops.place[worst]}"
+            warnings.append(
+                f"{len(far)} of {len(found.loop_errors)} loops lie up to {found.loop_errors[worst]:.0f} standard deviations "
+                f"({which}) from where refining has put the visits: look at them in the report of 'boxplus slam'"
+            )
         missing = len(self._run.rows.time_ns) - len(scans)
         if missing:
             warnings.append(f"{missing} scans of the run are not in the recording as it was read now, and are left out")
@@ -272,7 +302,15 @@ class _RefineRun:
                 "gravity_tilt_deg": float(np.degrees(tilt)),
                 "T_imu_lidar_before": _matrix(before.T_imu_lidar),
                 "T_imu_lidar_after": _matrix(after.T_imu_lidar),
-                "extrinsic": found.extrinsic,
+                "extrinsic": found.calibration.extrinsic,
+                "extrinsic_sigma": found.calibration.extrinsic_sigma.tolist(),
+                "time_offset": found.calibration.time_offset,
+                "time_offset_s": after.time_offset_s,
+                "time_offset_sigma_s": found.calibration.time_offset_sigma,
+                "loops": len(found.loop_errors),
+                "loops_told_by_planes": int(found.loop_is_told.sum()),
+                "loops_contradicted": int(np.count_nonzero(found.loop_errors > _CONTRADICTED)),
+                "receiver": _receiver(finished, after),
                 "map_points": stored,
                 "warnings": warnings,
             }
@@ -324,3 +362,19 @@ def _matrix(T: Floats) -> list[list[float]]:
     matrix[:3, :3], matrix[:3, 3] = quaternion.to_matrix(T[:4]), T[4:]
     rows: list[list[float]] = matrix.tolist()
     return rows
+
+
+def _receiver(finished: FinishedRun, after: RefinedState) -> RefinedReceiver | None:
+    receiver, fixes = after.receiver, finished.fixes
+    if receiver is None or fixes is None:
+        return None
+    lever, sigma = receiver.lever.tolist(), receiver.sigma.tolist()
+    return RefinedReceiver(
+        fixes=len(fixes),
+        heading_sigma_deg=math.degrees(sigma[2]),
+        position_sigma_m=math.hypot(sigma[3], sigma[4]) / math.sqrt(2.0),
+        lever_arm_m=(lever[0], lever[1], lever[2]),
+        lever_arm_sigma_m=(sigma[6], sigma[7], sigma[8]),
+        delay_s=receiver.delay_s,
+        delay_sigma_s=sigma[9],
+    )

@@ -21,6 +21,18 @@ class MapSharpness(Part):
     planes: int
 
 
+class RefinedReceiver(Part):
+    """What positions by satellite came to."""
+
+    fixes: int = Field(description="that the result rests on")
+    heading_sigma_deg: float
+    position_sigma_m: float = Field(description="of a horizontal axis of the first pose on the Earth [m]")
+    lever_arm_m: tuple[float, float, float] = Field(description="antenna in the IMU's frame")
+    lever_arm_sigma_m: tuple[float, float, float] = Field(description="zero where it was given")
+    delay_s: float = Field(description="by which fixes are stamped late")
+    delay_sigma_s: float
+
+
 class RefineSummary(Part):
     """The facts of a refined run."""
 
@@ -46,6 +58,14 @@ class RefineSummary(Part):
     T_imu_lidar_before: list[list[float]] = Field(default=[])
     T_imu_lidar_after: list[list[float]] = Field(default=[])
     extrinsic: str = Field("", description="whether the mounting was refined, and why not")
+    extrinsic_sigma: list[float] = Field(default=[], description="of T_imu_lidar, [w, v] [rad, m]; zero where it was held")
+    time_offset: str = Field("", description="whether the time offset was refined, and why not")
+    time_offset_s: float = Field(0.0, description="clock of the IMU minus that of the LiDAR, as refined [s]")
+    time_offset_sigma_s: float = Field(0.0, description="zero where it was held")
+    loops: int = Field(0, description="of a run of 'boxplus slam' that it began with")
+    loops_told_by_planes: int = Field(0, description="in the place of which planes stood that both visits see")
+    loops_contradicted: int = Field(0, description="that lie beyond their covariance from where refining has put the visits")
+    receiver: RefinedReceiver | None = Field(None, description="None: without positions by satellite")
     ate_before_m: float | None = Field(None, description="against the ground truth that was given [m]")
     ate_after_m: float | None = None
     map_points: int = 0

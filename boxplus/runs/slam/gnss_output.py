@@ -39,8 +39,14 @@ def lay_onto_earth(
         The outcome as it was, and None, where the recording has no fixes or they were left out. A refusal leaves the local maps
         where they are.
     """
+    found = located(recording, folder, outcome, config)
+    return (outcome if found is None or found.fit is None else outcome.laid(found.fit.T_map, found.fit.T_enu_map)), found
+
+
+def located(recording: Recording, folder: SlamFolder, outcome: SlamOutcome, config: SlamRunConfig) -> Georeference | None:
+    """What the fixes of a recording say of the local maps of a finished odometry; None where there are no fixes."""
     if not recording.info.gnss_topic:
-        return outcome, None
+        return None
     odometry = read_trajectory(folder.odometry.trajectory)
     known = np.ones(len(odometry), dtype=np.bool_)
     if odometry.status is not None:
@@ -48,8 +54,7 @@ def lay_onto_earth(
     T_odo_imu = np.hstack([odometry.q_wxyz, odometry.p])
     graph = outcome.graph(config.slam.gravity_sigma)
     times, antenna = odometry.times[known], recording.info.p_imu_antenna
-    found = georeference(graph, recording.fixes(), times, T_odo_imu[known], config.gnss, antenna)
-    return (outcome if found.fit is None else outcome.laid(found.fit.T_map, found.fit.T_enu_map)), found
+    return georeference(graph, recording.fixes(), times, T_odo_imu[known], config.gnss, antenna)
 
 
 def write_georeference(folder: SlamFolder, found: Georeference, config: GeoreferenceConfig) -> None:

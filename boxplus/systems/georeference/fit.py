@@ -43,6 +43,7 @@ class Fit:
         lever: (3,) in the IMU's frame [m]; lever_sigma: (3,), zero where it was given.
         delay, delay_sigma: by which fixes are stamped late [s].
         is_used: (N,) which fixes the result rests on. errors: (N, 3) predicted less measured, east, north, up [m].
+        fix_covariance: (N, 3, 3) of a fix as it was believed, beside those near to it in time [m²].
         noise_scale: factor of the standard deviations that the fixes needed, at least 1.
         tension: mean square of the odometry's errors, in variances per direction; far below 1 where nothing bends it.
     """
@@ -57,6 +58,7 @@ class Fit:
     delay_sigma: float
     is_used: NDArray[np.bool_]
     errors: Floats
+    fix_covariance: Floats
     noise_scale: float
     tension: float
 
@@ -125,7 +127,7 @@ def fit(
     fixes.set_loss(Squared())
     problem.set_weights(fixes, used.astype(np.float64))
     solution = problem.solve(options, start=found.solution)
-    return _result(solution, problem, x, (world, arm, delay), residual, attached, used, noise_scale)
+    return _result(solution, problem, x, (world, arm, delay), residual, attached, used, covariance, noise_scale)
 
 
 def _result(
@@ -136,6 +138,7 @@ def _result(
     residual: AntennaPosition,
     attached: AttachedFixes,
     used: NDArray[np.bool_],
+    fix_covariance: Floats,
     noise_scale: float,
 ) -> Fit:
     world, arm, delay = others
@@ -154,6 +157,7 @@ def _result(
         delay_sigma=float(solution.standard_deviations(delay)[0, 0]),
         is_used=used,
         errors=errors,
+        fix_covariance=fix_covariance,
         noise_scale=noise_scale,
         tension=tension,
     )

@@ -21,6 +21,10 @@ class RefinementConfig(PlaneVoxelConfig):
     )
     extrinsic_rotation_sigma_deg: float = Field(0.5, gt=0, description="standard deviation of the rotation in T_imu_lidar [deg]")
     extrinsic_translation_sigma: float = Field(0.02, gt=0, description="standard deviation of the translation in T_imu_lidar [m]")
+    time_offset_estimation: Literal["off", "on", "gated"] = Field(
+        "off", description="refine the clock of the IMU against that of the LiDAR: never, always, or where the motion tells it"
+    )
+    time_offset_sigma: float = Field(0.005, gt=0, description="standard deviation of that time offset, about zero [s]")
     plane_roughness: float = Field(
         1.6,
         gt=1,

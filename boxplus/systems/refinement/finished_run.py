@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds import quaternion
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.refinement.outside import RunFixes, RunLoops
+from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +30,7 @@ class FinishedRun:
         imu: samples in order of time.
         noise: of the IMU as it is mounted.
         is_end: (N,) bool, whether a slice is the last one of its scan.
+        loops, fixes: that were closed, and that the world is laid onto the Earth by; None without.
     """
 
     time_ns: NDArray[np.int64]
@@ -38,6 +42,21 @@ class FinishedRun:
     imu: ImuSamples
     noise: ImuNoise
     is_end: NDArray[np.bool_]
+    loops: RunLoops | None = None
+    fixes: RunFixes | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def corrected(self, correction: Correction) -> FinishedRun:
+        """The same where closed loops put it."""
+        T = correction.apply(self.time_ns, self.T_world_imu)
+        turned = quaternion.to_matrix(T[:, :4]) @ np.swapaxes(quaternion.to_matrix(self.T_world_imu[:, :4]), 1, 2)
+        velocity = np.einsum("nij,nj->ni", turned, self.velocity_bias[:, :3])
+        down = (turned @ self.gravity_world).mean(axis=0)
+        return replace(
+            self,
+            T_world_imu=T,
+            velocity_bias=np.hstack([velocity, self.velocity_bias[:, 3:]]),
+            gravity_world=down * np.linalg.norm(self.gravity_world) / np.linalg.norm(down),
+        )

@@ -7,28 +7,37 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds.euclidean import Euclidean
+from boxplus.optimization.problem import Problem
+from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
+from boxplus.residuals.prior import Prior
 from boxplus.systems.refinement.finished_run import FinishedRun
 
 Floats = NDArray[np.float64]
 
+GRAVITY = 9.81  # m/s²
+_BIAS_SIGMA = np.array([0.3] * 3 + [0.03] * 3)  # m/s², rad/s, of the first keyframe
 _LONGEST_GAP_S = 0.15
 _GAP_TURN, _GAP_PUSH = 1.0, 5.0  # rad/s and m/s², that nobody has measured
 
 
-def preintegrated(run: FinishedRun, scans: NDArray[np.int64], velocity_bias: Floats) -> Preintegration:
-    """Between successive ones of `scans`, at the biases (N, 9) of the earlier one.
+def preintegrated(
+    run: FinishedRun, scans: NDArray[np.int64], velocity_bias: Floats, time_offset_s: float = 0.0
+) -> Preintegration:
+    """Between successive ones of `scans`, at the biases (N, 9) of the earlier one; the IMU's clock is `time_offset_s` ahead.
 
     Over a gap of the samples the covariance is that of not knowing how the body moved.
     """
     begin, end = scans[:-1], scans[1:]
-    time_ns, gyro, accel = _covering(run)
+    scan_ns = run.time_ns + round(time_offset_s * 1e9)
+    time_ns, gyro, accel = _covering(run, int(scan_ns[0]), int(scan_ns[-1]))
     found = Preintegration.integrate(
         time_ns,
         gyro,
         accel,
         noise=run.noise,
-        intervals_ns=np.stack([run.time_ns[begin], run.time_ns[end]], axis=1),
+        intervals_ns=np.stack([scan_ns[begin], scan_ns[end]], axis=1),
         bias_accel=velocity_bias[begin, 3:6],
         bias_gyro=velocity_bias[begin, 6:],
     )
@@ -46,13 +55,17 @@ def preintegrated(run: FinishedRun, scans: NDArray[np.int64], velocity_bias: Flo
     return replace(found, covariance=covariance, steps=np.maximum(found.steps, 2))
 
 
-def _covering(run: FinishedRun) -> tuple[NDArray[np.int64], Floats, Floats]:
+def add_bias_prior(problem: Problem, states: Variables) -> None:
+    """What is known of the biases at the begin, and nothing of the velocity."""
+    information = np.diag(np.concatenate([np.full(3, 1e-6), _BIAS_SIGMA**-2]))
+    problem.add_residuals(Prior(Euclidean(9), np.zeros(9), information=information), states[:1], name="biases")
+
+
+def _covering(run: FinishedRun, begin_ns: int, end_ns: int) -> tuple[NDArray[np.int64], Floats, Floats]:
     """The samples, the first and last one held as far as the scans reach."""
     time_ns, gyro, accel = run.imu.time_ns, run.imu.gyro, run.imu.accel
-    if time_ns[0] > run.time_ns[0]:
-        time_ns, gyro, accel = np.insert(time_ns, 0, run.time_ns[0]), np.vstack([gyro[:1], gyro]), np.vstack([accel[:1], accel])
-    if time_ns[-1] < run.time_ns[-1]:
-        time_ns, gyro, accel = (
-            np.append(time_ns, run.time_ns[-1]), np.vstack([gyro, gyro[-1:]]), np.vstack([accel, accel[-1:]]),
-        )  # fmt: skip
+    if time_ns[0] > begin_ns:
+        time_ns, gyro, accel = np.insert(time_ns, 0, begin_ns), np.vstack([gyro[:1], gyro]), np.vstack([accel[:1], accel])
+    if time_ns[-1] < end_ns:
+        time_ns, gyro, accel = np.append(time_ns, end_ns), np.vstack([gyro, gyro[-1:]]), np.vstack([accel, accel[-1:]])
     return time_ns, gyro, accel

@@ -33,12 +33,14 @@ class KeyframeClusters:
 
     Attributes:
         keyframe, plane: (M,) whose.
-        clusters: (M, 4, 4) Σ [ℓ; 1][ℓ; 1]ᵀ in the keyframe's LiDAR frame, divided by the variance of a distance.
+        clusters: (M, 4, 4) Σ w [ℓ; 1][ℓ; 1]ᵀ in the keyframe's LiDAR frame, divided by the variance of a distance.
+        counted: (M,) mean of the weights w of its points, by `weights_of_slices`.
     """
 
     keyframe: Ints
     plane: Ints
     clusters: Floats
+    counted: Floats
 
 
 def lidar_poses(T_world_imu: Floats, T_imu_lidar: Floats) -> Floats:
@@ -108,13 +110,16 @@ def keyframe_clusters(
     keyframe: list[Ints] = []
     plane: list[Ints] = []
     clusters: list[Floats] = []
+    counted: list[Floats] = []
+    squares = np.zeros(len(planes))  # Σ w² of the points
 
     def close(number: int) -> None:
         seen = np.flatnonzero(total[:, 3, 3])
         keyframe.append(np.full(len(seen), number))
         plane.append(seen)
         clusters.append(total[seen] * information[seen, None, None])
-        total[seen] = 0.0
+        counted.append(squares[seen] / total[seen, 3, 3])
+        total[seen], squares[seen] = 0.0, 0.0
 
     current = 0
     for k, R, p, points in _placed(run, T_lidar, judging=False):
@@ -123,10 +128,12 @@ def keyframe_clusters(
             current = int(keyframes.of_scan[k])
         found, own = planes.clusters_of(points, R, p)
         total[found] += weights[k] * _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
+        squares[found] += weights[k] ** 2 * own[:, 3, 3]
     close(current)
     all_planes = np.concatenate(plane)
     often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)
-    return KeyframeClusters(np.concatenate(keyframe)[often], all_planes[often], np.concatenate(clusters)[often])
+    joined = (np.concatenate(rows)[often] for rows in (keyframe, plane, clusters, counted))
+    return KeyframeClusters(*joined)
 
 
 def scan_forms(run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats) -> Floats:

@@ -2,67 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from boxplus.errors import InputError
 from boxplus.evaluation.nees import nees
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.plane_voxels.thickness import Sharpness
-from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import Simulation, SpinningLidar, make_scenario
-from boxplus.simulation.motions import manoeuvres
-from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.config import RefinementConfig
-from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import choose_keyframes
-from boxplus.systems.refinement.refinement import Refinement, refine
+from boxplus.systems.refinement.refinement import refine
 from boxplus.systems.refinement.sightings import weights_of_slices
+from tests.systems.refinement.cases import Case
 from tests.systems.slam.drives import ate
-
-LIDAR = SpinningLidar(channels=16, azimuth_steps=300, vertical_fov_deg=(-25.0, 25.0))
-
-
-@dataclass(frozen=True)
-class Case:
-    events: list[Scan | ImuSamples]
-    rows: OdometryRows
-    config: LioConfig
-    simulation: Simulation
-    T_true: NDArray[np.float64]  # of the rows
-    run: FinishedRun
-    refined: Refinement
-
-    def error(self, T: NDArray[np.float64]) -> float:
-        return ate(T[self.run.is_end][:, 4:], self.T_true[:, 4:])
-
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    scenario = make_scenario("spin", seed=4)
-    trajectory = manoeuvres.handheld(9.0, (-2.5, -1.8, 1.1), (2.5, 1.8, 2.4), 0.8, 0.8, 1.5, seed=5)
-    simulation = Simulation(replace(scenario, trajectory=trajectory, lidar=LIDAR), seed=4, duration_s=8.0)
-    config = LioConfig(T_imu_lidar=tuple(map(tuple, simulation.T_imu_lidar.tolist())))  # type: ignore[call-arg]
-    odometry = LidarInertialOdometry(config)
-    events = list(simulation)
-    estimates = [
-        e for event in events for e in (odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event))
-    ]
-    estimates += odometry.flush()
-    times = np.array([e.time_ns for e in estimates])
-    rows = OdometryRows(times, [e.state for e in estimates], np.array([e.status for e in estimates]))
-    motion = simulation.ground_truth(times)
-    T_true = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
-    refinement = RefinementConfig()  # type: ignore[call-arg]
-    run = collect(events, rows, config, refinement)
-    return Case(events, rows, config, simulation, T_true, run, refine(run, refinement))
 
 
 def test_scans_are_cut_into_slices_that_keep_every_point_but_of_the_first_scan(case: Case) -> None:
