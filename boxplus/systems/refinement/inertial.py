@@ -17,6 +17,7 @@ from boxplus.systems.refinement.finished_run import FinishedRun
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s²
+MARGIN = 5.0  # of the noise that the odometry assumes, over that of the samples
 _BIAS_SIGMA = np.array([0.3] * 3 + [0.03] * 3)  # m/s², rad/s, of the first keyframe
 _LONGEST_GAP_S = 0.15
 _GAP_TURN, _GAP_PUSH = 1.0, 5.0  # rad/s and m/s², that nobody has measured
@@ -53,6 +54,15 @@ def preintegrated(
     covariance = found.covariance.copy()
     covariance[:, np.arange(9), np.arange(9)] += sigma**2
     return replace(found, covariance=covariance, steps=np.maximum(found.steps, 2))
+
+
+def imu_counted(at_rest: NDArray[np.bool_]) -> Floats:
+    """(n − 1,) what the IMU between n successive poses is counted for, of what it is worth, given which of them are at rest.
+
+    The margin that the odometry takes is for what a moving IMU gets wrong: scale, axes, what happens between samples. At rest
+    there is the noise of the samples alone.
+    """
+    return np.where(at_rest[:-1] & at_rest[1:], MARGIN**-2, 1.0)
 
 
 def add_bias_prior(problem: Problem, states: Variables) -> None:

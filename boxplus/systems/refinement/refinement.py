@@ -25,6 +25,7 @@ from boxplus.maps.plane_voxels.thickness import Sharpness
 from boxplus.systems.refinement.calibrated import Calibrated, CalibrationFound
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
+from boxplus.systems.refinement.inertial import MARGIN
 from boxplus.systems.refinement.keyframe_level import move_keyframes
 from boxplus.systems.refinement.keyframes import choose_keyframes
 from boxplus.systems.refinement.scan_level import move_scans
@@ -32,8 +33,6 @@ from boxplus.systems.refinement.sightings import judge, keyframe_clusters, lidar
 from boxplus.systems.refinement.state import RefinedState
 
 Floats = NDArray[np.float64]
-
-_MARGIN = 5.0  # of the noise that the odometry assumes, over that of the samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +141,7 @@ def _bending(run: FinishedRun) -> Floats:
     seconds = np.diff(run.time_ns, prepend=run.time_ns[0]) * 1e-9
     seconds[0] = seconds[1]
     covariance = np.zeros((len(run), 6, 6))
-    turn = (run.noise.gyro / _MARGIN) ** 2 * seconds / 12.0  # half of the points on either side
+    turn = (run.noise.gyro / MARGIN) ** 2 * seconds / 12.0  # half of the points on either side
     covariance[:, np.arange(3), np.arange(3)] = turn[:, None]
     return covariance
 

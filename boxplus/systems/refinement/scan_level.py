@@ -17,7 +17,7 @@ from boxplus.residuals.planes.pose_quadratic import PoseQuadratic
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.counted_less import covariance_of
 from boxplus.systems.refinement.finished_run import FinishedRun
-from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, preintegrated
+from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, imu_counted, preintegrated
 from boxplus.systems.refinement.sightings import scan_forms, weights_of_slices
 from boxplus.systems.refinement.state import RefinedState
 
@@ -39,7 +39,7 @@ def move_scans(
     states = problem.add_variables(Euclidean(9), state.velocity_bias, name="velocity_bias")
     between = preintegrated(run, np.arange(len(run)), state.velocity_bias, state.time_offset_s)
     imu = ImuPreintegration(between, gravity=GRAVITY * state.gravity_direction)
-    problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:], name="imu")
+    by_imu = problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:], name="imu")
     forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, information)
     on_planes = problem.add_residuals(PoseQuadratic(forms, state.T_world_imu[:, 4:]), poses, name="planes")
     add_bias_prior(problem, states)
@@ -49,5 +49,7 @@ def move_scans(
     solution = problem.solve(options)
     covariance = np.zeros((len(run), 6, 6))
     if with_covariance:
-        covariance = covariance_of(problem, solution, poses, {on_planes: weights_of_slices(run)}, {}, options)
+        weights = weights_of_slices(run)
+        counted = {on_planes: weights, by_imu: imu_counted(weights < 1.0)}
+        covariance = covariance_of(problem, solution, poses, counted, {}, options)
     return replace(state, T_world_imu=solution[poses], velocity_bias=solution[states]), covariance

@@ -132,8 +132,12 @@ def keyframe_clusters(
     close(current)
     all_planes = np.concatenate(plane)
     often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)
-    joined = (np.concatenate(rows)[often] for rows in (keyframe, plane, clusters, counted))
-    return KeyframeClusters(*joined)
+    return KeyframeClusters(
+        np.concatenate(keyframe)[often],
+        all_planes[often],
+        np.concatenate(clusters)[often],
+        np.concatenate(counted)[often],
+    )
 
 
 def scan_forms(run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats) -> Floats:
