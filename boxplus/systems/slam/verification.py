@@ -62,6 +62,8 @@ def verify(
         # What was not measured is taken from the odometry, so that it pulls at nothing.
         start = _with_weak_from(found, odometry.between(place.number, query.number)[0])
         found = register(own, there, start, config.registration, bend)
+    if found is not None and len(found.weak):
+        found = _where_less_is_open(found, own, there, bend, odometry.between(place.number, query.number), config)
     if found is None:
         return replace(base, refusal="too few points of one map lie on planes of the other")
     loop = replace(
@@ -85,6 +87,51 @@ def _with_weak_from(found: Registration, T_odo: Floats) -> Floats:
     scale = np.repeat([found.lever_m, 1.0], 3)
     along = np.linalg.qr(found.weak.T)[0]
     return se3.compose(found.T_target_source, se3.exp(along @ (along.T @ (xi * scale)) / scale))
+
+
+def _where_less_is_open(
+    found: Registration, own: Surface, there: Surface, bend: Floats, T_S_odo: tuple[Floats, Floats], config: SlamConfig
+) -> Registration:
+    """Another pose along what the surfaces leave open, where they leave less open and fit better, or as much and fit far better.
+
+    Along a street the ends of its houses tell where one is. Laid two metres beside them, none of their points finds the plane it
+    belongs to, and what they would tell seems open: the query then lies wherever the odometry has put it.
+    """
+    tolerance = _TOLERANCE * max(found.rms, _RMS_FLOOR)
+    best, fitting = found, -1.0
+    for shift in _shifts(found.T_target_source, own, there, T_S_odo, config):
+        other = register(own, there, _shifted(found.T_target_source, shift), config.registration, bend)
+        if other is None or len(other.weak) > len(found.weak) or not _is_open(found, other.T_target_source):
+            continue
+        if fitting < 0.0:
+            fitting = fitting_share(own, there, found.T_target_source, tolerance, config.registration)
+        share = fitting_share(own, there, other.T_target_source, tolerance, config.registration)
+        if share * (1.0 if len(other.weak) < len(best.weak) else config.rival_fit) > fitting:
+            best, fitting = other, share
+    return best
+
+
+def _shifts(T: Floats, own: Surface, there: Surface, T_S_odo: tuple[Floats, Floats], config: SlamConfig) -> Floats:
+    """(k, 2) by which the query may lie elsewhere in the place's x and y, as both look from above."""
+    T_odo, S_odo = T_S_odo
+    R = quaternion.to_matrix(T_odo[:4])
+    S = config.odometry_scale**2 * (R @ S_odo[3:, 3:] @ R.T)[:2, :2] + 1e-6 * np.eye(2)
+    return rival_shifts(
+        own.points,
+        there.points,
+        T,
+        cell=config.descriptor.cell,
+        least=config.rival_distance,
+        sigma=4.0 * S,  # the loop itself may be as far from the odometry as its rival, on the other side
+        share=_RIVAL_AGREEMENT,
+        count=_RIVALS,
+    )
+
+
+def _shifted(T: Floats, shift: Floats) -> Floats:
+    moved = T.copy()
+    moved[4:6] += shift
+    return moved
 
 
 def _deformation(query: LocalMap, place: LocalMap, T_place_query: Floats) -> Floats:
@@ -145,24 +192,11 @@ def _rival(
     """A sentence on another place of the same two maps that fits as well, and that the odometry does not exclude."""
     T_odo, S_odo = odometry.between(loop.place, loop.query)
     T = found.T_target_source
-    R = quaternion.to_matrix(T_odo[:4])
-    S = config.odometry_scale**2 * (R @ S_odo[3:, 3:] @ R.T)[:2, :2] + 1e-6 * np.eye(2)
-    shifts = rival_shifts(
-        own.points,
-        there.points,
-        T,
-        cell=config.descriptor.cell,
-        least=config.rival_distance,
-        sigma=4.0 * S,  # the loop itself may be as far from the odometry as its rival, on the other side
-        share=_RIVAL_AGREEMENT,
-        count=_RIVALS,
-    )
+    shifts = _shifts(T, own, there, (T_odo, S_odo), config)
     tolerance = _TOLERANCE * max(found.rms, _RMS_FLOOR)
     fitting = fitting_share(own, there, T, tolerance, config.registration) if len(shifts) else 0.0
     for shift in shifts:
-        start = T.copy()
-        start[4:6] += shift
-        other = register(own, there, start, config.registration)
+        other = register(own, there, _shifted(T, shift), config.registration)
         if other is None:
             continue
         if fitting_share(own, there, other.T_target_source, tolerance, config.registration) < config.rival_fit * fitting:

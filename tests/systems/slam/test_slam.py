@@ -86,6 +86,23 @@ def test_an_odometry_that_claims_too_much_is_doubted(block: MappedDrive, slam: S
     assert sure.doubt is not None and "standard deviations from the odometry: it drifts more" in sure.doubt
 
 
+@pytest.mark.parametrize("seed", [12, 26])
+def test_with_three_times_the_drift_nothing_is_laid_beside_its_place(seed: int) -> None:
+    """Two metres beside the ends of the houses nothing tells where along the street one is, and a loop stayed where the odometry
+    had put it. It belongs where they tell, and the odometry does not allow that place."""
+    claimed = DriftConfig(channels=24, azimuth_steps=240)
+    config = claimed.model_copy(
+        update={name: 3.0 * getattr(claimed, name) for name in ("yaw_drift", "tilt_drift", "position_drift")}
+    )
+    block = mapped_drive(city(2, 2, seed=seed), ROUTE, config, seed)
+    slam = closed(block)
+    for loop in slam.loops:
+        assert not loop.is_accepted or np.linalg.norm(block.error(loop)[3:]) < 0.5
+    found = [loop for loop in slam.loops if loop.measured == 6 and min(loop.overlap) > 0.6]
+    assert max(np.linalg.norm(block.error(loop)[3:]) for loop in found) < 0.3
+    assert slam.doubt is not None and "it drifts more than claimed" in slam.doubt
+
+
 def test_a_map_without_points_is_a_link_of_the_chain_only(block: MappedDrive) -> None:
     slam, none = Slam(SlamConfig(nearby=0.0)), np.zeros((0, 3), np.float32)
     for local_map in block.maps:
