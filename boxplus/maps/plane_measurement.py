@@ -69,6 +69,7 @@ class PlaneMeasurement:
         n = len(p_lidar)
         self._p_lidar = p_lidar
         self._tree = tree
+        self._cell = tree.cell_size or config.map_cell
         self._config = config
         self._with_extrinsic = with_extrinsic
         self._weight = weight
@@ -120,7 +121,7 @@ class PlaneMeasurement:
         delta = np.zeros(TANGENT)
         boxminus_into(x, self._matched_at, delta)
         shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
-        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._config.map_cell
+        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._cell
 
     @property
     def points(self) -> int:
@@ -181,7 +182,7 @@ class PlaneMeasurement:
             covariance,
             LEVERAGE * mean_leverage,
             config.max_neighbour_distance**2,
-            (DENSE_CELLS * config.map_cell) ** 2,
+            (DENSE_CELLS * self._cell) ** 2,
             config.plane_threshold,
             self._planes,
             self._fate,
@@ -198,8 +199,8 @@ class PlaneMeasurement:
             self._p_lidar,
             covariance,
             MEAN_LEVERAGE * mean_leverage,
-            (FILLED_CELLS * config.map_cell) ** 2,
-            config.map_cell,
+            (FILLED_CELLS * self._cell) ** 2,
+            self._cell,
             config.map_sigma**2,
             self._planes,
             self._fate,

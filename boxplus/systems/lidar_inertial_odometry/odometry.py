@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.iterated_update import Posterior, iterated_update
+from boxplus.filtering.iterated_update import iterated_update
 from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
@@ -25,12 +25,14 @@ from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.lidar_inertial_agreement.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
-from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction, Status, WeakDirection
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
+from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
+from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
@@ -195,7 +197,7 @@ class LidarInertialOdometry(Snapshots):
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
         (first, *rest), self._waiting = self._waiting, []
         p_lidar = deskew_first(first, found.state, self.config)
-        self._insert(found.state.to_world(self._voxel_filter(p_lidar)[1]))
+        self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
@@ -215,7 +217,7 @@ class LidarInertialOdometry(Snapshots):
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
-        points, map_points = self._voxel_filter(p_lidar)
+        points, map_points = self._thinned(p_lidar)
         clock.lap("voxel filter")
         measurement = self._measurement(frame, points)
         x_prior, cov_prior = self._x.copy(), self._cov.copy()
@@ -242,7 +244,7 @@ class LidarInertialOdometry(Snapshots):
             self._insert(map_points_world)
         clock.lap("map insertion")
         status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
-        return self._estimate(frame, p_lidar, _Outcome(measurement, posterior, taken, cov_prior, status), clock.laps)
+        return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, status), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
@@ -310,6 +312,13 @@ class LidarInertialOdometry(Snapshots):
         for low, high in self._box.follow(state.p_world_imu + state.R_world_imu @ state.p_imu_lidar):
             self.map.delete_box(low, high)
 
+    def _thinned(self, p_lidar: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Centroids and representatives of a scan; the map's cells become those that suit it."""
+        voxel = self._voxel_filter.voxel_size
+        points, map_points = self._voxel_filter(p_lidar)
+        self.map.cell_size = map_cell_for(points, voxel, self.config)
+        return points, map_points
+
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
         config = self.config
         with_extrinsic = config.extrinsic_estimation == "on" or (
@@ -332,7 +341,7 @@ class LidarInertialOdometry(Snapshots):
         self,
         frame: Frame,
         p_lidar: NDArray[np.float32],
-        outcome: _Outcome | None = None,
+        outcome: Outcome | None = None,
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
@@ -367,34 +376,3 @@ class LidarInertialOdometry(Snapshots):
             intensity=frame.scan.intensity,
             lidar=frame.scan.lidar,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Outcome:
-    """What became of one scan: `taken` says whether the posterior became the state."""
-
-    measurement: PlaneMeasurement
-    posterior: Posterior
-    taken: bool
-    cov_prior: NDArray[np.float64]
-    status: Status
-
-    @property
-    def weak_directions(self) -> tuple[WeakDirection, ...]:
-        return WeakDirection.all_of(self.posterior.last.directions) if self.taken else ()
-
-    @property
-    def points_used(self) -> int:
-        return self.posterior.last.used if self.taken else 0
-
-    @property
-    def rejected(self) -> dict[str, int]:
-        unused = {} if self.taken else {"scan without an update": self.posterior.last.used}
-        return {**self.measurement.rejected(), **unused}
-
-    def lidar_share(self, cov: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) 1 − posterior / prior variance of the pose."""
-        if not self.taken:
-            return np.zeros(6)
-        share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / self.cov_prior.diagonal()[:6], 0.0, 1.0)
-        return share
