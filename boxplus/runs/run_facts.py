@@ -14,7 +14,7 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
 
 State = Literal["running", "finished", "interrupted", "failed"]
-FactsT = TypeVar("FactsT", bound="RunFacts")
+PartT = TypeVar("PartT", bound="Part")
 
 
 class Part(BaseModel):
@@ -140,7 +140,7 @@ class RunFacts(Part, ABC):
         return f"interrupted (the process ended without a word) after at least {reached}: {complete}"
 
 
-def read_facts(kind: type[FactsT], path: str | Path) -> FactsT:
+def read_facts(kind: type[PartT], path: str | Path) -> PartT:
     """Read `run.json`.
 
     Raises:

@@ -6,11 +6,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
-from boxplus.runs.run_facts import Part
+from boxplus.runs.run_facts import Part, read_facts
 
 
 class SessionFacts(Part):
@@ -64,11 +63,4 @@ def read_merge_summary(path: Path) -> MergeSummary:
     Raises:
         InputError: missing, cut, not of this version, or of another program.
     """
-    try:
-        return MergeSummary.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise InputError(
-            "run.json as this version of 'boxplus map merge' writes it",
-            f"{path}: {error}",
-            "give its output folder, or merge again",
-        ) from error
+    return read_facts(MergeSummary, path)

@@ -6,11 +6,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file
-from boxplus.runs.run_facts import Part, State
+from boxplus.runs.run_facts import Part, State, read_facts
 
 LEFT_IN_PLACE = "no loop was closed: trajectory and map are those of the odometry"
 
@@ -94,9 +93,4 @@ def read_slam_summary(path: Path) -> SlamSummary:
     Raises:
         InputError: missing, cut, not of this version, or of another kind of run.
     """
-    try:
-        return SlamSummary.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise InputError(
-            "run.json as this version of 'boxplus slam' writes it", f"{path}: {error}", "give its output folder, or run it again"
-        ) from error
+    return read_facts(SlamSummary, path)

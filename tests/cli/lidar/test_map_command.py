@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.cli.lidar.map import map_app
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import read_cloud
@@ -74,3 +75,10 @@ def test_export_of_an_interrupted_run_warns(folder: Path) -> None:
 def test_no_map(tmp_path: Path) -> None:
     result = CliRunner().invoke(map_app, ["info", str(tmp_path)])
     assert isinstance(result.exception, InputError)
+
+
+def test_the_folder_of_another_command_is_named_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"program": "boxplus slam", "state": "finished"}', encoding="utf-8")
+    result = CliRunner().invoke(app, ["map", "update", str(tmp_path), str(tmp_path / "later")])
+    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+    assert "expected the output folder of 'boxplus map merge' – got one of 'boxplus slam'" in result.stderr
