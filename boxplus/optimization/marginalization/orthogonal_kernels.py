@@ -100,7 +100,9 @@ def eliminate_columns(
     return np.int64(rank)
 
 
-@kernel(fastmath=True)
+# Inlined: of a helper's copies in several libraries a process runs the one it loads first, and the sums of its own one are in
+# another order, so that the process that compiled it would have other bits than all later ones.
+@kernel(fastmath=True, inline=True)
 def _reflect(
     A: NDArray[np.float64],
     X: NDArray[np.float64],
