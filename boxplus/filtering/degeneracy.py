@@ -17,13 +17,18 @@ noise for the question, and would hide how well the others measure.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
+from boxplus.filtering.small_linalg import symmetric_eigen_into
+
 # No normal is known better than this [rad]: edges of the world are not that straight, and N must not vanish.
 _LEAST_TILT = 1e-3
+_TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +78,71 @@ def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: f
         lever_arm: root mean square distance of the points from the IMU [m].
         threshold: least ratio of S to N of a measured direction.
     """
-    scale = np.array([1.0 / lever_arm] * 3 + [1.0] * 3)
-    scales = np.outer(scale, scale)
+    ratios, vectors, basis = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
+    if not _directions_into(S, N, lever_arm, ratios, vectors, basis):
+        raise np.linalg.LinAlgError("the information of the normals' noise is not positive semidefinite")
+    return PoseDirections(ratios, vectors, lever_arm, ratios < threshold, basis)
+
+
+@kernel
+def _directions_into(
+    S: NDArray[np.float64],
+    N: NDArray[np.float64],
+    lever_arm: float,
+    ratios: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    basis: NDArray[np.float64],
+) -> bool:
+    """The generalised eigenvalue problem, in units of the lever arm; False where N is no covariance's."""
+    scale = np.ones(6)
+    scale[:3] = 1.0 / lever_arm
     # The position rows carry unit normals: their trace is the sum of the weights.
-    floor = max(_LEAST_TILT**2 * float(np.trace(S[3:6, 3:6])), np.finfo(float).tiny)
-    root = np.linalg.cholesky(N * scales + floor * np.eye(6))
-    whitening = np.linalg.inv(root)
-    ratios, rotated = np.linalg.eigh(whitening @ (S * scales) @ whitening.T)
-    scaled = whitening.T @ rotated
-    vectors = scaled / np.linalg.norm(scaled, axis=0)
-    return PoseDirections(ratios, vectors, lever_arm, ratios < threshold, scale[:, None] * scaled)
+    floor = max(_LEAST_TILT * _LEAST_TILT * (S[3, 3] + S[4, 4] + S[5, 5]), _TINY)
+    root, whitening = np.zeros((6, 6)), np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            total = N[i, j] * scale[i] * scale[j] + (floor if i == j else 0.0)
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                root[i, i] = math.sqrt(total)
+            else:
+                root[i, j] = total / root[j, j]
+    for j in range(6):
+        whitening[j, j] = 1.0 / root[j, j]
+        for i in range(j + 1, 6):
+            total = 0.0
+            for k in range(j, i):
+                total -= root[i, k] * whitening[k, j]
+            whitening[i, j] = total / root[i, i]
+    half, white = np.empty((6, 6)), np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            half[i, j] = 0.0
+            for k in range(i + 1):
+                half[i, j] += whitening[i, k] * S[k, j] * scale[k] * scale[j]
+    for i in range(6):
+        for j in range(i + 1):
+            white[i, j] = 0.0
+            for k in range(j + 1):
+                white[i, j] += half[i, k] * whitening[j, k]
+            white[j, i] = white[i, j]
+    rotated = root
+    symmetric_eigen_into(white, ratios, rotated)
+    for j in range(6):
+        norm = 0.0
+        for i in range(6):
+            vectors[i, j] = 0.0
+            for k in range(i, 6):
+                vectors[i, j] += whitening[k, i] * rotated[k, j]
+            norm += vectors[i, j] * vectors[i, j]
+            basis[i, j] = scale[i] * vectors[i, j]
+        norm = math.sqrt(norm)
+        for i in range(6):
+            vectors[i, j] /= norm
+    return True
 
 
 def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> PoseDirections:

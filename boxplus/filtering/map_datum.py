@@ -28,12 +28,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.filtering.degeneracy import PoseDirections, strong_covariance
 from boxplus.filtering.nav_state import MEASURED, P, R
+from boxplus.filtering.small_linalg import symmetric_eigen_into
 
 _FIRST, _MARKED = 0, 1  # the pose that errors are counted against
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)
+_NOTHING = np.zeros((6, 6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,23 +99,16 @@ class MapDatum:
             x: (36,) posterior; cov_prior, cov: (n, n), covariance of the filter before and after the scan, the pose first.
             correction: by the scan; None if the filter took none.
         """
-        shift = x[P : P + 3] - self._p_world_imu
-        move = np.eye(6)  # a small motion about the last position, as one about this position
-        move[3:, :3] = [[0.0, shift[2], -shift[1]], [-shift[2], 0.0, shift[0]], [shift[1], -shift[0], 0.0]]
-        both = np.kron(np.eye(2), move)
-        joint = both @ self._joint @ both.T
-        prior = _along_world(cov_prior[_POSE, _POSE], x)
-        joint[:, _POSE, _POSE] += positive_part(prior - move @ self._filter @ move.T)
         if correction is not None:
-            joint[:, _MAP, _MAP] += self._shared * self._new_share * _along_world(correction.alone, x)
+            shift = float(np.linalg.norm(x[P : P + 3] - self._p_world_imu))
+            self._local_points *= math.exp(-shift / correction.lever_arm)
+        gain, noise, alone = (_NOTHING,) * 3 if correction is None else (correction.gain, correction.noise, correction.alone)
+        brought = self._shared * self._new_share
+        _follow(
+            x, cov_prior, cov, gain, noise, alone, self._shared, brought, self._p_world_imu, self._filter, self._joint
+        )  # fmt: skip
+        if correction is not None:
             self._new_share = 0.0
-            self._local_points *= math.exp(-float(np.linalg.norm(shift)) / correction.lever_arm)
-            step = np.eye(12)
-            step[_POSE, _MAP] = _along_world(correction.gain, x)
-            step[_POSE, _POSE] -= step[_POSE, _MAP]
-            joint = step @ joint @ step.T
-            joint[:, _POSE, _POSE] += self._shared * _along_world(correction.noise, x)
-        self._joint, self._filter, self._p_world_imu = joint, _along_world(cov[_POSE, _POSE], x), x[P : P + 3].copy()
 
     def insert(self, points: int) -> None:
         """The map has taken in so many points of the scan."""
@@ -147,6 +143,106 @@ class MapDatum:
         return _turned(self._joint[_MARKED, _POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
 
 
+@kernel
+def _follow(
+    x: NDArray[np.float64],
+    cov_prior: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    alone: NDArray[np.float64],
+    shared: float,
+    brought: float,
+    p_world_imu: NDArray[np.float64],
+    before: NDArray[np.float64],
+    joint: NDArray[np.float64],
+) -> None:
+    """The joint covariances (2, 12, 12), the filter's (6, 6) `before` and the position (3,), from scan to scan, in place.
+
+    `noise` and `alone` count `shared` and `brought` times; `gain`, `noise` and `alone` (6, 6) are zero where nothing corrected.
+    """
+    rotation, move, step = x[R : R + 9], np.eye(6), np.eye(12)
+    prior, turned, work = np.empty((6, 6)), np.empty((6, 6)), np.empty((12, 12))
+    sx, sy, sz = x[P] - p_world_imu[0], x[P + 1] - p_world_imu[1], x[P + 2] - p_world_imu[2]
+    # A small motion about the last position, as one about this position.
+    move[3, 1], move[3, 2], move[4, 0], move[4, 2], move[5, 0], move[5, 1] = sz, -sy, -sz, sx, sy, -sx
+    _turn_into(cov_prior, rotation, prior)
+    _congruence(move, before, work, turned)
+    added = prior - turned
+    positive_part_into(added)
+    _turn_into(gain, rotation, turned)
+    for i in range(6):
+        for j in range(6):
+            step[i, j] -= turned[i, j]
+            step[i, 6 + j] = turned[i, j]
+    _turn_into(noise, rotation, turned)
+    _turn_into(alone, rotation, prior)
+    both, moved = np.zeros((12, 12)), np.empty((12, 12))
+    both[:6, :6] = move
+    both[6:, 6:] = move
+    for k in range(2):
+        _congruence(both, joint[k], work, moved)
+        for i in range(6):
+            for j in range(6):
+                moved[i, j] += added[i, j]
+                moved[6 + i, 6 + j] += brought * prior[i, j]
+        _congruence(step, moved, work, joint[k])
+        for i in range(6):
+            for j in range(6):
+                joint[k, i, j] += shared * turned[i, j]
+    _turn_into(cov, rotation, before)
+    for i in range(3):
+        p_world_imu[i] = x[P + i]
+
+
+@kernel
+def _congruence(T: NDArray[np.float64], M: NDArray[np.float64], work: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """out = T M Tᵀ for symmetric M (n, n)."""
+    n = T.shape[0]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += T[i, k] * M[k, j]
+            work[i, j] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n):
+                total += work[i, k] * T[j, k]
+            out[i, j] = total
+            out[j, i] = total
+
+
+@kernel
+def _turn_into(M: NDArray[np.float64], rotation: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """The first six rows and columns of M, over [θ about the IMU's axes, p], with θ about the world's; rotation (9,)."""
+    half = np.empty((6, 6))
+    for j in range(6):
+        for i in range(3):
+            half[i, j] = rotation[3 * i] * M[0, j] + rotation[3 * i + 1] * M[1, j] + rotation[3 * i + 2] * M[2, j]
+            half[3 + i, j] = M[3 + i, j]
+    for i in range(6):
+        for j in range(3):
+            out[i, j] = rotation[3 * j] * half[i, 0] + rotation[3 * j + 1] * half[i, 1] + rotation[3 * j + 2] * half[i, 2]
+            out[i, 3 + j] = half[i, 3 + j]
+
+
+@kernel
+def positive_part_into(M: NDArray[np.float64]) -> None:
+    """The positive semidefinite part of a symmetric matrix takes its place."""
+    n = M.shape[0]
+    values, vectors = np.empty(n), np.empty((n, n))
+    symmetric_eigen_into(M, values, vectors)
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n):
+                total += vectors[i, k] * max(values[k], 0.0) * vectors[j, k]
+            M[i, j] = total
+            M[j, i] = total
+
+
 def _along_world(M: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """A (6, 6) over [θ about the IMU's axes, p], with θ about the world's."""
     return _turned(M, x[R : R + 9].reshape(3, 3))
@@ -161,6 +257,6 @@ def _turned(M: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np
 
 def positive_part(M: NDArray[np.float64]) -> NDArray[np.float64]:
     """The positive semidefinite part of a symmetric matrix."""
-    values, vectors = np.linalg.eigh(M)
-    positive: NDArray[np.float64] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    positive: NDArray[np.float64] = np.array(M, dtype=np.float64)
+    positive_part_into(positive)
     return positive

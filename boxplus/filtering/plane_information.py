@@ -111,10 +111,10 @@ def accumulate_planes(
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
-        A, b: (12, 12), (12,), added to; the upper triangle of A is filled only.
+        A, b: (12, 12), (12,), added to.
         with_criterion: whether `signal` and `noise` are wanted.
         signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
-            alone would give; the upper triangles are filled only.
+            alone would give.
         sums: (2,) += [used points, Σ z²].
     """
     h = np.empty(MEASURED_DOF)
@@ -157,3 +157,15 @@ def accumulate_planes(
             _add_criterion(x, (sx, sy, sz), plane, weight, h, row, signal, noise)
         sums[0] += 1.0
         sums[1] += z * z
+    _mirror(A)
+    if with_criterion:
+        _mirror(signal)
+        _mirror(noise)
+
+
+@kernel(inline=True)
+def _mirror(A: NDArray[np.float64]) -> None:
+    """The lower triangle from the upper one."""
+    for i in range(A.shape[0]):
+        for j in range(i):
+            A[i, j] = A[j, i]

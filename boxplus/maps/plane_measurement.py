@@ -78,6 +78,7 @@ class PlaneMeasurement:
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
+        self._points_moved = 0.0  # since the last search, root mean square [m]
         self._matched_at = np.zeros(PACKED)
         self._directions: PoseDirections
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
@@ -88,12 +89,11 @@ class PlaneMeasurement:
         matches = rematch or not self._matched
         if matches:
             self._match(x)
-        A, b, signal, noise, sums = total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
-        if matches and self._confirm:
-            self._look_closer(x, total)
-        A += np.triu(A, 1).T
+        total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
+        if matches and self._confirm and self._look_closer(x, total):
+            total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=True)
+        A, b, signal, noise, sums = total
         if matches:  # in between the planes stay, and what they can tell
-            signal, noise = signal + np.triu(signal, 1).T, noise + np.triu(noise, 1).T
             self._directions = pose_directions(signal, noise, self.lever_arm, self._config.weak_threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
@@ -113,15 +113,23 @@ class PlaneMeasurement:
             for begin, end in pairwise(bounds)
         ]
         A, b = np.array([part[0] for part in sums]), np.array([part[1] for part in sums])
-        A += np.swapaxes(np.triu(A, 1), 1, 2)
         return whole, A * self._weight, b * self._weight
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
-        """Whether the points have moved far enough since the last search for some to have other neighbours."""
+        """Whether the points have moved far enough since the last search for some to have other neighbours; before any, yes."""
+        if not self._matched:
+            return True
         delta = np.zeros(TANGENT)
         boxminus_into(x, self._matched_at, delta)
         shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
-        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._cell
+        shift += float(np.linalg.norm(delta[:3])) * self.lever_arm + self._points_moved
+        return shift > _SAME_NEIGHBOURS * self._cell
+
+    def move_points(self, p_lidar: NDArray[np.float64]) -> None:
+        """The same points (n, 3), LiDAR frame, compensated with a motion that is better known."""
+        off = p_lidar - self._p_lidar
+        self._points_moved += float(np.sqrt(np.einsum("ij,ij->i", off, off).mean())) if len(off) else 0.0
+        self._p_lidar[:] = p_lidar
 
     @property
     def points(self) -> int:
@@ -161,18 +169,21 @@ class PlaneMeasurement:
         accumulate_planes(x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, signal, noise, sums)
         return A, b, signal, noise, sums
 
-    def _look_closer(self, x: NDArray[np.float64], total: tuple[NDArray[np.float64], ...]) -> None:
+    def _look_closer(self, x: NDArray[np.float64], total: tuple[NDArray[np.float64], ...]) -> bool:
         """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
 
         Args:
             x: (36,) packed state.
-            total: what all planes add up to (`_sums`), brought up to date.
+            total: what all planes add up to (`_sums`).
+
+        Returns:
+            Whether any was refused or bent.
         """
         config, A, used = self._config, total[0][:6, :6], max(int(total[4][0]), 1)
         try:
-            covariance = np.linalg.inv(A + np.triu(A, 1).T)
+            covariance = np.linalg.inv(A)
         except np.linalg.LinAlgError:  # nothing at all measures some direction
-            return
+            return False
         mean_leverage = 6.0 / used
         refused = confirm_planes(
             self._tree.view(),
@@ -189,8 +200,6 @@ class PlaneMeasurement:
             np.zeros(CONFIRMING, dtype=np.float32),
             np.zeros(STACK_DEPTH + CONFIRMING, dtype=STACK),
         )
-        if refused:
-            self._add(x, np.flatnonzero(self._fate == UNCONFIRMED), total, -1.0)
         which, bent = np.empty(self.points, dtype=np.int64), np.empty((self.points, PLANE))
         count = bend_planes(
             self._tree.view(),
@@ -209,19 +218,8 @@ class PlaneMeasurement:
             np.zeros(PATCH, dtype=np.float32),
             np.zeros(STACK_DEPTH + PATCH, dtype=STACK),
         )
-        if count:
-            self._add(x, which[:count], total, -1.0)
-            self._planes[which[:count]] = bent[:count]
-            self._add(x, which[:count], total, 1.0)
-
-    def _add(
-        self, x: NDArray[np.float64], which: NDArray[np.int64], total: tuple[NDArray[np.float64], ...], factor: float
-    ) -> None:
-        """Add what the planes `which` say to `total`, `factor` times."""
-        fate = np.full(len(which), USED, dtype=np.uint8)
-        parts = self._sums(x, self._p_lidar[which], self._planes[which], fate, criterion=True)
-        for whole, part in zip(total, parts, strict=True):
-            whole += factor * part
+        self._planes[which[:count]] = bent[:count]
+        return bool(refused or count)
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config
@@ -248,4 +246,4 @@ class PlaneMeasurement:
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
         settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
-        self._matched_at = x.copy()
+        self._matched_at, self._points_moved = x.copy(), 0.0

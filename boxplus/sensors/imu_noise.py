@@ -25,6 +25,8 @@ def sample_noise(imu: ImuSamples) -> NDArray[np.float64]:
         np.float64(0.0)
     """
     step_s = float(np.median(np.diff(imu.time_ns))) * 1e-9
-    squares = [(np.diff(values, n=2, axis=0) ** 2).mean(axis=0) for values in (imu.gyro, imu.accel)]
-    noise: NDArray[np.float64] = np.sqrt(np.array(squares) / _SECOND_DIFFERENCE * step_s)
+    values = np.concatenate([imu.gyro, imu.accel], axis=1)
+    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    squares = np.einsum("ij,ij->j", second, second).reshape(2, 3) / len(second)
+    noise: NDArray[np.float64] = np.sqrt(squares / _SECOND_DIFFERENCE * step_s)
     return noise

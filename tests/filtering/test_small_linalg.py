@@ -1,11 +1,11 @@
-"""The inverse by Cholesky against LAPACK."""
+"""The inverse by Cholesky and the eigenvectors by rotations, against LAPACK."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.filtering.small_linalg import cholesky_inverse_into
+from boxplus.filtering.small_linalg import cholesky_inverse_into, symmetric_eigen_into
 from tests.filtering.random_states import random_covariance
 
 seeds = st.integers(0, 2**32 - 1)
@@ -28,3 +28,28 @@ def test_against_lapack(seed: int, size: int) -> None:
 )
 def test_what_is_not_positive_definite_is_refused(A: np.ndarray) -> None:
     assert not cholesky_inverse_into(A, np.zeros((3, 3)), np.zeros((3, 3)))
+
+
+@given(seeds, st.sampled_from([1, 2, 6, 12]), st.sampled_from([0, 1, 3]))
+def test_eigenvectors_against_lapack(seed: int, size: int, equal: int) -> None:
+    """Of either sign, over twelve orders of magnitude, `equal` of them the same."""
+    random = np.random.default_rng(seed)
+    Q = np.linalg.qr(random.normal(size=(size, size)))[0]
+    expected = random.choice([-1.0, 1.0], size) * 10.0 ** random.uniform(-6.0, 6.0, size)
+    expected[: min(equal, size)] = expected[0]
+    A = (Q * expected) @ Q.T
+    A = 0.5 * (A + A.T)
+    values, vectors = np.zeros(size), np.zeros((size, size))
+    symmetric_eigen_into(A.copy(), values, vectors)
+    size_of = np.abs(expected).max()
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(A), rtol=0.0, atol=1e-14 * size * size_of)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(size), atol=1e-14 * size)
+    np.testing.assert_allclose((vectors * values) @ vectors.T, A, atol=1e-14 * size * size_of)
+
+
+@pytest.mark.parametrize("A", [np.zeros((3, 3)), np.diag([3.0, 1.0, 2.0]), np.full((3, 3), np.nan)])
+def test_eigenvectors_of_what_is_diagonal_and_of_nothing(A: np.ndarray) -> None:
+    values, vectors = np.zeros(3), np.zeros((3, 3))
+    symmetric_eigen_into(A.copy(), values, vectors)
+    np.testing.assert_array_equal(values, np.sort(A.diagonal()))
+    assert np.isnan(A).any() or (np.abs(vectors).sum(axis=0) == 1.0).all()
