@@ -52,7 +52,7 @@ class RayExecutor:
         workers: tasks at a time on this machine, where one is started; None: as many as it has cores.
 
     Raises:
-        InputError: Ray, the extra `fleet`, is not installed; no cluster at the address.
+        InputError: Ray, the extra `fleet`, is not installed; no cluster at the address, or none that would start.
     """
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
@@ -66,8 +66,12 @@ class RayExecutor:
                 self._ray.init(num_cpus=self._workers, include_dashboard=False, **quiet)
             else:
                 self._ray.init(address=self._address, **quiet)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise InputError("a Ray cluster", f"none at {self._address}: {error}", "start it, or leave --address out") from error
+        except Exception as error:
+            if self._address is None:
+                found, advice = "none that would start on this machine", "try again when it has less to do, or give --address"
+            else:
+                found, advice = f"none at {self._address}", "start it, or leave --address out"
+            raise InputError("a Ray cluster", f"{found}: {error}", advice) from error
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:

@@ -287,6 +287,22 @@ def test_without_opencv_no_recording_is_begun(tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        (None, "none that would start on this machine: timed out – try again"),
+        ("10.0.0.5:6379", "none at 10.0.0.5:6379: timed out"),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_no_traceback(address: str | None, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: object) -> None:
+        raise Exception("timed out")  # as Ray does
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    with pytest.raises(InputError, match=message), RayExecutor(address):
+        pass
+
+
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"boxplus\[fleet\]"):
