@@ -26,8 +26,8 @@ def demo(
     import os
 
     from boxplus.cli.lidar.lio import run
-    from boxplus.cli.outcome import reported
     from boxplus.cli.options import without_report
+    from boxplus.cli.outcome import reported
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config

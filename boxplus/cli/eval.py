@@ -139,8 +139,8 @@ def evaluate_command(
         return
     truth = transformed(
         read_trajectory(ground_truth, ground_truth_format.value),
-        left=None if transform_left is None else parse_transform(transform_left, "--transform-left"),
-        right=None if transform_right is None else parse_transform(transform_right, "--transform-right"),
+        left=None if transform_left is None else parse_transform(transform_left, "--transform-left", key=None),
+        right=None if transform_right is None else parse_transform(transform_right, "--transform-right", key=None),
     )
     plane: Plane | None = None if project_to_plane is None else project_to_plane.value
     one = functools.partial(

@@ -22,14 +22,16 @@ _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Of the JSON files in which evo keeps a transform."""
 
 
-def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]:
+def parse_transform(text: str, name: str = "T_imu_lidar", *, key: str | None = "T_imu_lidar") -> NDArray[np.float64]:
     """Read a rigid transform; for `T_imu_lidar` it maps LiDAR coordinates to IMU coordinates (p_imu = T p_lidar).
 
     Args:
         text: 16 numbers (row-major), or the first 12; tagged numbers (`xyz_qwxyz: …`, `xyz_qxyzw: …`, `xyz_rpy_deg: …` with
-            R = Rz(yaw) Ry(pitch) Rx(roll), `xyz: …` without a turn), or a file with one of these, or a YAML or JSON file with the
-            key `T_imu_lidar`, or with `R_imu_lidar` and `p_imu_lidar` (or `t_imu_lidar`), or with x, y, z, qx, qy, qz and qw.
+            R = Rz(yaw) Ry(pitch) Rx(roll), `xyz: …` without a turn), or a file with one of these, or a YAML or JSON file with x,
+            y, z, qx, qy, qz and qw, or with `key`, or, where that is `T_imu_lidar`, with `R_imu_lidar` and `p_imu_lidar` (or
+            `t_imu_lidar`).
         name: of the transform, for the messages.
+        key: its name in files; None where it has none.
 
     Returns:
         (4, 4) float64.
@@ -46,12 +48,12 @@ def parse_transform(text: str, name: str = "T_imu_lidar") -> NDArray[np.float64]
     if stripped.startswith("{"):
         mapping = _mapping(stripped)
         if mapping is not None:
-            return _from_mapping(mapping, name)
+            return _from_mapping(mapping, name, key)
     elif tag is None and re.search(r"[^\s,;\[\]()0-9eE+.-]", body):
         stripped = _read_file(stripped, name)
         mapping = _mapping(stripped)
         if mapping is not None:
-            return _from_mapping(mapping, name)
+            return _from_mapping(mapping, name, key)
         tag, body = _split_tag(stripped)
     try:
         numbers = np.array([float(word) for word in re.split(r"[\s,;\[\]()]+", body) if word])
@@ -83,17 +85,17 @@ def _mapping(text: str) -> dict[str, object] | None:
     return content if isinstance(content, dict) and not set(content) <= set(_TAGS) else None
 
 
-def _from_mapping(content: dict[str, object], name: str) -> NDArray[np.float64]:
+def _from_mapping(content: dict[str, object], name: str, key: str | None) -> NDArray[np.float64]:
     try:
-        if name in content:
-            return _from_numbers(None, np.array(content[name], dtype=np.float64).ravel(), name)
-        suffix = name.removeprefix("T_")
-        position = content.get(f"p_{suffix}", content.get(f"t_{suffix}"))
+        if key is not None and key in content:
+            return _from_numbers(None, np.array(content[key], dtype=np.float64).ravel(), name)
         if set(_KEYS) <= set(content):
             if content.get("scale", 1.0) != 1.0:
                 raise InputError(f"{name} as a rigid transform", f"one with the scale {content['scale']}", "leave the scale out")
-            return _from_numbers("xyz_qxyzw", np.array([content[key] for key in _KEYS], dtype=np.float64), name)
-        if f"R_{suffix}" in content and position is not None:
+            return _from_numbers("xyz_qxyzw", np.array([content[part] for part in _KEYS], dtype=np.float64), name)
+        suffix = "" if key is None else key.removeprefix("T_")
+        position = content.get(f"p_{suffix}", content.get(f"t_{suffix}"))
+        if suffix and f"R_{suffix}" in content and position is not None:
             T = np.eye(4)
             T[:3, :3] = np.array(content[f"R_{suffix}"], dtype=np.float64).reshape(3, 3)
             T[:3, 3] = np.array(position, dtype=np.float64).reshape(3)
@@ -102,10 +104,11 @@ def _from_mapping(content: dict[str, object], name: str) -> NDArray[np.float64]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"numbers for {name}", str(error), "correct the file") from error
+    named = "the keys" if key is None else f"the key {key}, or R_{suffix} and p_{suffix}, or"
     raise InputError(
-        f"the key {name}, or R_{suffix} and p_{suffix}, or {', '.join(_KEYS)}",
+        f"{named} {', '.join(_KEYS)} in the file for {name}",
         f"the keys {', '.join(map(str, content))}",
-        "rename the keys; the name says the direction",
+        "rename the keys" if key is None else "rename the keys; the name says the direction",
     )
 
 

@@ -73,7 +73,9 @@ def test_an_end_and_its_code(state: str, untrusted: bool, outcome: str, code: in
 
 
 @pytest.mark.parametrize("error", [OutputError("a full disk"), ValueError("no ticks")])
-@pytest.mark.parametrize(("state", "untrusted", "code"), [("finished", False, 1), ("finished", True, 3), ("interrupted", False, 130)])
+@pytest.mark.parametrize(
+    ("state", "untrusted", "code"), [("finished", False, 1), ("finished", True, 3), ("interrupted", False, 130)]
+)
 def test_a_report_that_cannot_be_drawn_hides_no_run(
     error: Exception, state: str, untrusted: bool, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

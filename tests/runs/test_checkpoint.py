@@ -25,6 +25,7 @@ from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.scan_log import read_scan_log
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
 from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.storage import state_codec
 from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation import SpinningLidar, simulate
@@ -135,6 +136,28 @@ def test_a_checkpoint_of_other_code_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"one of an earlier boxplus \(.*\) – start the run anew"):
         run_odometry(walk(), out, resume=True)
     assert read_summary(out / "run.json").state == "interrupted"
+
+
+def test_the_code_that_counts_is_that_of_estimators(tmp_path: Path) -> None:
+    for room in ("cli", "systems"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "a.py").write_text("x = 1\n")
+    before = state_codec.program_of_files(tmp_path)
+    (tmp_path / "cli" / "a.py").write_text("x = 2\n")
+    assert state_codec.program_of_files(tmp_path) == before
+    (tmp_path / "systems" / "a.py").write_text("x = 2\n")
+    assert state_codec.program_of_files(tmp_path) != before
+
+
+def test_whose_checkpoint_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    write_state(path, {"x": np.arange(3)})
+    assert state_codec.is_of_this_program(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert not state_codec.is_of_this_program(path)
+    write_state(path, {})
+    rewritten(path, program="boxplus 9.9.9, code 0123")
+    assert not state_codec.is_of_this_program(path)
 
 
 def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def lio(
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.runs.lidar_inertial.config import load_run_config
+    from boxplus.runs.lidar_inertial.earlier_run import standing
+    from boxplus.runs.run_folder import RunFolder
 
     kept: dict[str, object] = {"save": False} if no_map else {}
     run_config = lidar_settings(
@@ -99,7 +101,6 @@ def lio(
         folder: Path,
         outcome: Outcome,
         should_stop: Callable[[], bool] | None = None,
-        standing: Standing | None = None,
     ) -> None:
         truth = read_ground_truth(ground_truth)
         summary, comparison = run(
@@ -110,8 +111,7 @@ def lio(
             terminal=terminal,
             ground_truth=truth,
             overwrite=overwrite,
-            resume=resume,
-            standing=standing,
+            standing=standing(RunFolder(folder)) if resume else None,
             view=view,
             report=not no_report,
             should_stop=should_stop,
@@ -123,7 +123,7 @@ def lio(
     if several is not None:
         if len(several) > 1 and (view is not None or ground_truth is not None):
             raise InputError("one recording with --view or --gt", f"{len(several)}", "run them one by one, or leave it out")
-        raise typer.Exit(run_several(several, output, run_one, terminal, resume=resume, as_json=as_json))
+        raise typer.Exit(run_several(several, output, run_one, terminal, as_json=as_json))
     recording = recordings[0]
     folder = output or Path(f"{recording.resolve().stem}_boxplus")
     with reported(recording, folder, as_json=as_json) as outcome:
@@ -139,7 +139,6 @@ def run(
     terminal: RunTerminal | None = None,
     ground_truth: Trajectory | None = None,
     overwrite: bool = False,
-    resume: bool = False,
     standing: Standing | None = None,
     view: str | None = None,
     report: bool = True,
@@ -149,7 +148,7 @@ def run(
 
     Args:
         outcome: takes down a report that could not be drawn; the caller ends it.
-        standing: how far an earlier run came in `folder`, which decides in place of `overwrite` and `resume`.
+        standing: how far an earlier run came in `folder`, where one is to go on; it decides in place of `overwrite`.
         should_stop: None lets Ctrl-C end the run in good order.
 
     Raises:
@@ -166,9 +165,11 @@ def run(
     from boxplus.runs.run_folder import RunFolder, claim_run_folder
 
     terminal = terminal or RunTerminal()
+    resume = standing == "stopped"
     if standing is not None:
-        resume = standing == "stopped"
-        overwrite = standing == "stopped before its first checkpoint"
+        overwrite = standing in ("stopped before its first checkpoint", "stopped under another boxplus")
+    if standing == "stopped under another boxplus":
+        terminal.warn(f"{folder.name}: its checkpoint is damaged or of another version of boxplus: the run begins anew")
     with ExitStack() as stack:
         shown = stack.enter_context(viewing("LiveView", recording.name, view))
         asked = should_stop or stack.enter_context(stop_on_interrupt(terminal.announce_stop))

@@ -15,10 +15,9 @@ from boxplus.errors import BoxplusError, InputError
 
 if TYPE_CHECKING:
     from boxplus.cli.run_terminal import RunTerminal
-    from boxplus.runs.lidar_inertial.earlier_run import Standing
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
-    RunOne = Callable[[Path, Path, Outcome, Callable[[], bool], Standing | None], None]
+    RunOne = Callable[[Path, Path, Outcome, Callable[[], bool]], None]
 
 _HEADINGS = ("recording", "came out", "scans", "weak or lost", "path length", "duration", "× real time", "folder")
 
@@ -46,7 +45,6 @@ def run_several(
     run_one: RunOne,
     terminal: RunTerminal,
     *,
-    resume: bool,
     as_json: bool,
 ) -> int:
     """Run them and print the table; returns the exit code.
@@ -54,9 +52,7 @@ def run_several(
     Args:
         recordings: by name.
         output: each gets a folder with its name in it; None for NAME_boxplus here.
-        run_one: runs a recording into a folder and says what became of it; it asks whether to stop, and is told how far the run
-            had come where it is to go on.
-        resume: go on with those that were stopped, leave those that are finished, and begin the others.
+        run_one: runs a recording into a folder and says what became of it; it asks whether to stop.
         as_json: print a line for each as it ends, and for those that were not begun.
     """
     outcomes: dict[str, Outcome] = {}
@@ -65,7 +61,7 @@ def run_several(
             folder = Path(f"{name}_boxplus") if output is None else output / name
             outcome = outcomes[name] = Outcome(input=str(recording), output=str(folder))
             if not should_stop():
-                _run(recording, folder, run_one, outcome, should_stop, resume=resume)
+                _run(recording, folder, run_one, outcome, should_stop)
             if as_json:
                 outcome.print_json()
         stopped = should_stop()
@@ -84,17 +80,12 @@ def _run(
     run_one: RunOne,
     outcome: Outcome,
     should_stop: Callable[[], bool],
-    *,
-    resume: bool,
 ) -> None:
     """One of them, whatever becomes of it."""
-    from boxplus.runs.lidar_inertial.earlier_run import standing
-    from boxplus.runs.run_folder import RunFolder
-
     log = folder.with_name(f"{folder.name}.traceback.txt")
     try:
         log.unlink(missing_ok=True)  # of an earlier run
-        run_one(recording, folder, outcome, should_stop, standing(RunFolder(folder)) if resume else None)
+        run_one(recording, folder, outcome, should_stop)
     except (BoxplusError, KeyboardInterrupt) as error:
         outcome.stop(error)
     except Exception as error:  # noqa: BLE001 - nobody foresaw it: the others have nothing to do with it

@@ -62,6 +62,12 @@ def load_run_config(
     return load_settings(RunConfig, path, settings, overrides)
 
 
+_HEAD = (
+    "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config FILE' repeats it.\n"
+    "# For another recording delete the lines of section 'recording' that shall be found anew.\n"
+)
+
+
 def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
     """The text of `config.yaml`: everything as used, readings found from the data included, so that it repeats the run."""
     used = config.model_dump()
@@ -78,8 +84,13 @@ def dump_run_config(config: RunConfig, info: RecordingInfo) -> str:
             other["point_time_field"] = read.point_time.field or NO_POINT_TIME
             if read.point_time.field is not None:
                 other["point_time_unit"], other["point_time_reference"] = read.point_time.unit, read.point_time.reference
-    head = (
-        "# Settings of this run, those found from the data included: 'boxplus lio RECORDING --config FILE' repeats it.\n"
-        "# For another recording delete the lines of section 'recording' that shall be found anew.\n"
-    )
-    return dump_settings(head, used)
+    return dump_settings(_HEAD, used)
+
+
+def redump_run_config(path: Path) -> str:
+    """The text of a `config.yaml` as it would be written now: settings that came since have their defaults.
+
+    Raises:
+        InputError: it cannot be read, or has a setting that is gone.
+    """
+    return dump_settings(_HEAD, load_run_config(path).model_dump())

@@ -7,13 +7,14 @@ from typing import Literal
 from boxplus.errors import InputError
 from boxplus.recordings.recording import Recording
 from boxplus.runs.checkpoint import refuse_other_settings
-from boxplus.runs.lidar_inertial.config import RunConfig, dump_run_config
+from boxplus.runs.lidar_inertial.config import RunConfig, dump_run_config, redump_run_config
 from boxplus.runs.lidar_inertial.extrinsic import Extrinsic
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.storage.output_folder import program_of
+from boxplus.runs.storage.state_codec import is_of_this_program
 
-Standing = Literal["not begun", "stopped", "stopped before its first checkpoint", "finished"]
+Standing = Literal["not begun", "stopped", "stopped before its first checkpoint", "stopped under another boxplus", "finished"]
 
 
 def standing(folder: RunFolder) -> Standing:
@@ -23,7 +24,7 @@ def standing(folder: RunFolder) -> Standing:
         InputError: a `run.json` of this command that cannot be read.
     """
     if folder.checkpoint.is_file():
-        return "stopped"
+        return "stopped" if is_of_this_program(folder.checkpoint) else "stopped under another boxplus"
     if not folder.summary.is_file() or program_of(folder.summary) != RunSummary.model_fields["program"].default:
         return "not begun"
     return "finished" if read_summary(folder.summary).state == "finished" else "stopped before its first checkpoint"
@@ -56,5 +57,5 @@ def finished_run(folder: RunFolder, recording: Recording, config: RunConfig, ext
             "choose another folder with --output, or replace it with --overwrite",
         )
     used = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
-    refuse_other_settings(folder, folder.config.read_text(encoding="utf-8"), dump_run_config(used, info))
+    refuse_other_settings(folder, redump_run_config(folder.config), dump_run_config(used, info))
     return summary

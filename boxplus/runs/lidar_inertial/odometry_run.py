@@ -170,7 +170,9 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             self._tiles = stack.enter_context(tiles)
             tiles.stored = TileStore.open(self._folder.tiles).point_count if self.resumed else 0
         if self._config.scans.frame != "none":
-            self._scan_clouds = ScanCloudWriter(self._folder.scan_clouds, self._config.scans)
+            self._scan_clouds = ScanCloudWriter(
+                self._folder.scan_clouds, self._config.scans, 1 + len(self._recording.info.other_lidars)
+            )
 
     def push(self, event: Scan | ImuSamples) -> list[Estimate]:
         """See `RunLoop.push`."""

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import cloud_writer
 from boxplus.formats.output import make_folder
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
@@ -36,15 +37,23 @@ class ScanCloudWriter:
     Args:
         folder: made where it does not exist.
         config: with a frame.
+        lidars: that are merged; of several, each point has the number of its own.
 
     Raises:
-        InputError: the library that the format needs is not installed.
+        InputError: the library that the format needs is not installed, or the format has no place for those numbers.
         OutputError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, config: ScanCloudConfig) -> None:
+    def __init__(self, folder: Path, config: ScanCloudConfig, lidars: int = 1) -> None:
         self._folder, self._config = make_folder(folder), config
-        cloud_writer(self._path(0)).abort()  # refuses now what it would refuse at the first scan
+        first = cloud_writer(self._path(0))  # refuses now what it would refuse at the first scan
+        first.abort()
+        if lidars > 1 and not first.holds({"lidar": np.zeros(0, np.uint8)}):
+            raise InputError(
+                f"files for the scans of {lidars} LiDARs that can hold which of them saw a point (pcd, ply, las, laz)",
+                f"scans.ending={config.ending}",
+                "choose another ending; 'boxplus convert' makes such files of them, without the numbers",
+            )
 
     def write(self, estimate: Estimate) -> None:
         """Write one scan; in the world those that are lost are left out: nobody knows where they belong.

@@ -7,7 +7,6 @@ it asks for one. A file is therefore read by the code alone that wrote it.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import importlib
 import json
@@ -28,6 +27,7 @@ from boxplus.formats.output import atomic_file
 
 _PLAIN = (bool, int, float, str, type(None))
 _LOCK = type(threading.Lock())
+_WITHOUT_STATES = ("cli", "report", "simulation")  # nothing that estimates imports these rooms
 
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
@@ -41,7 +41,7 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
     """
     encoder = _Encoder()
     tree = encoder.encode(state)
-    text, program = (np.frombuffer(words.encode(), np.uint8) for words in (json.dumps(tree), _program()))
+    text, program = (np.frombuffer(words.encode(), np.uint8) for words in (json.dumps(tree), _PROGRAM))
     with atomic_file(path) as file:
         arrays: dict[str, Any] = {f"a{k}": values for k, values in enumerate(encoder.arrays)}
         np.savez(file, tree=text, program=program, **arrays)
@@ -55,10 +55,10 @@ def read_state(path: Path) -> dict[str, Any]:
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
-            program = stored["program"].tobytes().decode() if "program" in stored.files else "an earlier boxplus"
-            if program != _program():
+            program = _program_of(stored)
+            if program != _PROGRAM:
                 raise InputError(
-                    f"the checkpoint of a run, of this version of boxplus ({_program()})",
+                    f"the checkpoint of a run, of this version of boxplus ({_PROGRAM})",
                     f"one of {program} ({path})",
                     "start the run anew, or go on with the boxplus that it began with",
                 )
@@ -77,14 +77,31 @@ def read_state(path: Path) -> dict[str, Any]:
     return found
 
 
-@functools.cache
-def _program() -> str:
-    """Which boxplus this is: its version, and a digest of its code, which changes between versions."""
-    package = Path(boxplus.__file__).parent
+def is_of_this_program(path: Path) -> bool:
+    """Whether a checkpoint was written by the code that runs now, so that it can be gone on from; a damaged one was by nobody."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return _program_of(stored) == _PROGRAM
+    except Exception:  # noqa: BLE001 - NumPy and zipfile find many ways to say that a file is damaged
+        return False
+
+
+def _program_of(stored: Any) -> str:
+    return str(stored["program"].tobytes().decode()) if "program" in stored.files else "an earlier boxplus"
+
+
+def program_of_files(package: Path) -> str:
+    """The version, and a digest of the code that can have a part in a state, as it lies in this folder."""
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
-        digest.update(source.relative_to(package).as_posix().encode() + b"\0" + source.read_bytes())
+        inside = source.relative_to(package)
+        if inside.parts[0] not in _WITHOUT_STATES:
+            digest.update(inside.as_posix().encode() + b"\0" + source.read_bytes())
     return f"boxplus {boxplus.__version__}, code {digest.hexdigest()[:12]}"
+
+
+# Before a run begins, not when it first writes: an upgrade in between would give old states the name of the new code.
+_PROGRAM = program_of_files(Path(boxplus.__file__).parent)
 
 
 class _Encoder:

@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 import boxplus.report
 import boxplus.runs.lidar_inertial.odometry_run as odometry_run
 from boxplus.cli import app
+from boxplus.runs.storage import state_codec
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.recording_writer import write_recording
 
@@ -113,6 +114,38 @@ def test_what_was_finished_with_other_settings_is_not_passed_off_as_these(bags: 
     found = lines(result)
     assert found["a"]["outcome"] == "failed" and "map_cell: 0.25" in found["a"]["error"] and "0.4" in found["a"]["error"]
     assert found["b"]["outcome"] == found["c"]["outcome"] == "finished"
+
+
+def test_what_was_finished_before_a_setting_was_added_is_finished_still(bags: Path, tmp_path: Path) -> None:
+    words = ("lio", bags / "in" / "a.bag", "-o", tmp_path / "a", *FAST, "--json", "--resume")
+    first = call(*words)  # nothing stands there: it is begun
+    assert first.exit_code == 0, first.stderr
+    written, rows = tmp_path / "a" / "config.yaml", tmp_path / "a" / "trajectory.csv"
+    before, text = rows.stat().st_mtime_ns, written.read_text()
+    assert "  map_cell: 0.25\n" in text
+    written.write_text(text.replace("  map_cell: 0.25\n", ""))
+    again = call(*words)
+    assert again.exit_code == 0 and "a: finished before" in again.stderr and rows.stat().st_mtime_ns == before
+    assert lines(again)["a"]["run"] == lines(first)["a"]["run"]
+    refused = call(*words, "--set", "map_cell=0.4")
+    assert refused.exit_code == 2 and "map_cell: 0.25" in lines(refused)["a"]["error"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT is sent differently on Windows")
+@pytest.mark.parametrize("batch", [False, True])
+def test_what_was_stopped_under_another_boxplus_begins_anew(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: bool
+) -> None:
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 1)
+        given = (bags / "in", "-o", tmp_path) if batch else (bags / "in" / "a.bag", "-o", tmp_path / "a")
+        assert call("lio", *given, *FAST).exit_code == 130
+    monkeypatch.setattr(state_codec, "_PROGRAM", "boxplus 9.9.9, code 0123")
+    again = call("lio", *given, *FAST, "--json", "--resume")
+    assert again.exit_code == 0, again.stderr
+    assert "warning: a: its checkpoint is damaged or of another version of boxplus: the run begins anew" in again.stderr
+    found = lines(again)["a"]
+    assert found["outcome"] == "finished" and found["run"]["resumed"] == 0 and found["run"]["scans"] == 29
 
 
 def test_one_that_fails_as_nobody_foresaw_leaves_the_others_unharmed(

@@ -149,6 +149,19 @@ def test_wrong_keys_in_a_file(tmp_path: Path) -> None:
         parse_transform(str(file))
 
 
+def test_a_transform_without_a_name_in_files_is_asked_for_by_its_numbers(tmp_path: Path) -> None:
+    file = tmp_path / "T.json"
+    file.write_text('{"x": 0.1, "y": 0, "z": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}')
+    assert parse_transform(str(file), "--transform-right", key=None)[0, 3] == 0.1
+    for content in ('{"p": [1, 2, 3]}', '{"T_imu_lidar": [1]}', '{"--transform-right": [1]}'):
+        file.write_text(content)
+        with pytest.raises(
+            InputError,
+            match=r"expected the keys x, y, z, qx, qy, qz, qw in the file for --transform-right – got .* – rename the keys$",
+        ):
+            parse_transform(str(file), "--transform-right", key=None)
+
+
 @pytest.mark.parametrize("text", ["odometry: {1: 2}", "map:\n  null: 3", "recording: {2.5: a}"])
 def test_a_setting_without_a_name_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.yaml").write_text(text)

@@ -16,6 +16,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.lidar_inertial import odometry_run
 from boxplus.runs.lidar_inertial.config import load_run_config
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudWriter
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
@@ -89,6 +90,28 @@ def test_scans_that_are_lost_have_no_place_in_the_world(
     for frame, count in (("body", True), ("world", False)):
         run_odometry(recording, tmp_path / frame, load_run_config(settings=[*SETTINGS, f"scans.frame={frame}"]))
         assert bool(clouds(tmp_path / frame / "scans")) == count
+
+
+@pytest.mark.parametrize("ending", ["pcd", "ply", "las", "laz", "e57"])
+def test_of_several_lidars_the_number_is_kept_or_the_ending_refused(recording: Recording, tmp_path: Path, ending: str) -> None:
+    for library in {"las": ["laspy"], "laz": ["laspy"], "e57": ["pye57"]}.get(ending, []):
+        pytest.importorskip(library)
+    config = load_run_config(settings=[f"scans.ending={ending}", "scans.frame=body"]).scans
+    kept = Kept()
+    run_odometry(
+        recording, tmp_path / "run", load_run_config(settings=SETTINGS), view=kept, should_stop=lambda: bool(kept.estimates)
+    )
+    several = replace(kept.estimates[0], lidar=(np.arange(len(kept.estimates[0].p_lidar)) % 2).astype(np.uint8))
+    if ending == "e57":
+        ScanCloudWriter(tmp_path / "one", config)
+        with pytest.raises(
+            InputError, match=r"expected files for the scans of 2 LiDARs .* – got scans.ending=e57 – choose another"
+        ):
+            ScanCloudWriter(tmp_path / "scans", config, 2)
+        return
+    ScanCloudWriter(tmp_path / "scans", config, 2).write(several)
+    cloud = read_cloud(tmp_path / "scans" / f"{several.time_ns}.{ending}", everything=True)
+    assert np.array_equal(cloud.columns["lidar"], several.lidar)
 
 
 def test_a_format_without_its_library_is_refused_before_the_run(

@@ -2,9 +2,10 @@
 
 A body at rest is recognised in milliseconds, so rest is looked for all the time. A start in motion takes as long as ten frames,
 and where sensors do not belong together it never comes: the next attempt waits for a fifth of the time that attempts have failed
-for, two seconds at most. A start that becomes possible t seconds after the first attempt is found t / 5 later at the latest (and
-the 0.15 s between two looks), and ten seconds without one cost some twenty attempts instead of seventy. Frames are kept for
-longer than the longest wait, so that no motion is missed.
+for, two seconds at most, and at most as long as frames are kept beside those that a start takes: no motion falls between two
+attempts, but what comes in the last wait of a recording is not looked at. A start that becomes possible t seconds after the first
+attempt is found t / 5 later at the latest (and the 0.15 s between two looks), and ten seconds without one cost some twenty
+attempts instead of seventy.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class StartSearch:
             self._motion_problem = moving
             self._first_attempt_ns = self._first_attempt_ns or now_ns
             wait_ns = round(_SHARE * (now_ns - self._first_attempt_ns))
-            self._next_attempt_ns = now_ns + min(max(wait_ns, _EVERY_NS), _LONGEST_WAIT_NS)
+            spare_ns = round((_LONGEST_START - 1.0) * config.start_duration * 1e9) - _EVERY_NS
+            self._next_attempt_ns = now_ns + max(min(wait_ns, _LONGEST_WAIT_NS, spare_ns), _EVERY_NS)
         self.problem = f"not at rest: {rest}; moving: {self._motion_problem}"
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,3 +65,23 @@ def test_attempts_get_rarer_and_frames_outlast_the_longest_wait() -> None:
     for time_s in np.arange(0.0, 20.0, FRAME_S):
         search.add(frame(float(time_s)), VioConfig())
     assert 1e-9 * (search.seen[-1].time_ns - search.seen[0].time_ns) == pytest.approx(4.0, abs=FRAME_S)
+
+
+@given(st.sampled_from([0.3, 0.4, 0.5, 1.0, 2.0]), st.sampled_from([0.02, 0.05]))
+def test_every_motion_as_long_as_a_start_is_within_the_frames_of_an_attempt(start_duration: float, frame_s: float) -> None:
+    spans: list[tuple[int, int]] = []
+
+    def attempt(seen: Sequence[Tracks], *_: object) -> str:
+        spans.append((seen[0].time_ns, seen[-1].time_ns))
+        return "too early"
+
+    config, search = VioConfig(start_duration=start_duration), StartSearch()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "find_rest", lambda *_: "it moves")
+        patch.setattr(module, "moving_start", attempt)
+        for time_s in np.arange(0.0, 30.0, frame_s):
+            search.add(frame(float(time_s)), config)
+            search.look(NO_IMU, rig(1), config)
+    assert len(spans) > 10
+    shared = [before[1] - after[0] for before, after in itertools.pairwise(spans)]  # of two attempts in a row
+    assert min(shared) >= 1e9 * (start_duration - 2 * frame_s)
