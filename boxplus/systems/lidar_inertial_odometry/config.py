@@ -64,7 +64,7 @@ class LioConfig(LidarOdometryConfig):
         0.005, gt=0, description="standard deviation of the translation in T_imu_lidar, along each axis [m]"
     )
     extrinsic_estimation: Literal["off", "on", "gated"] = Field(
-        "off", description="refine T_imu_lidar while running: never, always, or only while the motion makes it observable"
+        "off", description="refine T_imu_lidar while running: never, always, or only while the platform turns"
     )
     max_iterations: int = Field(4, ge=1, le=50, description="most Gauss-Newton steps after the first, per scan")
     gyro_noise: float | None = Field(

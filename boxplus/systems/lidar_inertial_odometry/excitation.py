@@ -1,4 +1,4 @@
-"""Whether the motion makes the extrinsic observable."""
+"""Whether the motion shows something of the extrinsic."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from boxplus.filtering.propagation import N_TIME, N_W
 
 
 class RotationExcitation:
-    """Decides from the recent turn rates whether the extrinsic can be estimated.
+    """Decides from the recent turn rates whether a scan is asked about the extrinsic.
 
-    The rotation between IMU and LiDAR shows only when the platform turns, and all of it only when it turns about two
-    axes. The second largest singular value of the turn rates of the last seconds is the rate about the second axis.
+    Rotation and lever arm show only when the platform turns. How much of them shows, about one axis or two, the covariance of the
+    state says (`unknown_mounting`); held while it turns, a wrong one would be taken for biases and motion.
 
     Args:
-        min_rate: root mean square rate needed about the second axis [rad/s].
+        min_rate: root mean square rate needed about some axis [rad/s].
         memory_s: time over which older rates fade to 1/e [s].
     """
 
@@ -33,5 +33,5 @@ class RotationExcitation:
 
     @property
     def sufficient(self) -> bool:
-        """Whether two axes are turned about fast enough."""
-        return bool(np.linalg.eigvalsh(self._moment)[1] > self._min_rate**2)
+        """Whether the platform turns fast enough."""
+        return bool(np.linalg.eigvalsh(self._moment)[2] > self._min_rate**2)

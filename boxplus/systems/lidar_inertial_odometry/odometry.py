@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.iterated_update import iterated_update
+from boxplus.filtering.iterated_update import Posterior, iterated_update
 from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
@@ -39,7 +39,13 @@ from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import UnknownMounting
+from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+    HeldMounting,
+    UnknownMounting,
+    mounting_known,
+    moved_sensitivity,
+    with_mounting,
+)
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 
@@ -189,7 +195,8 @@ class LidarInertialOdometry(Snapshots):
         self.start, self.start_problem, self._unstarted = found, None, UnstartedScans(self.config)
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
-        self._datum = MapDatum(self._x, self._cov if self._gap is None else with_unknown_pose(self._cov), _SHARED_ERRORS)
+        known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]
+        self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), _SHARED_ERRORS)
         self._mounting = UnknownMounting(self._x, self.config)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
         self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
@@ -220,17 +227,16 @@ class LidarInertialOdometry(Snapshots):
         points, map_points = self._thinned(p_lidar)
         clock.lap("voxel filter")
         measurement = self._measurement(frame, points)
-        x_prior, cov_prior = self._x.copy(), self._cov.copy()
-        limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
-        posterior = self._unshown.mark(iterated_update(x_prior, cov_prior, measurement, **limits))
+        x_prior = self._x.copy()
+        posterior, cov_prior, cov_known = self._updated(measurement)
         on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-        correction = Correction.of(self._cov, posterior.A, posterior.last.directions) if taken else None
-        self._datum.follow(self._x, cov_prior, self._cov, correction)
+        correction = Correction.of(cov_known, posterior.A, posterior.last.directions) if taken else None
+        self._datum.follow(self._x, cov_prior, cov_known if taken else cov_prior, correction)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
         state = NavState.unpack(self._x)
         map_points_world = state.to_world(map_points)
@@ -244,7 +250,24 @@ class LidarInertialOdometry(Snapshots):
             self._insert(map_points_world)
         clock.lap("map insertion")
         status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
-        return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, status), clock.laps)
+        return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, cov_known, status), clock.laps)
+
+    def _updated(self, measurement: PlaneMeasurement) -> tuple[Posterior, NDArray[np.float64], NDArray[np.float64]]:
+        """The posterior, and the covariances before and after it with the mounting known."""
+        limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
+        if self.config.extrinsic_estimation == "off":
+            posterior = self._unshown.mark(iterated_update(self._x, self._cov, measurement, **limits))
+            return posterior, self._cov.copy(), posterior.cov
+        known, B = mounting_known(self._cov)
+        if self.config.extrinsic_estimation == "on" or self._excitation.sufficient:
+            posterior = self._unshown.mark(iterated_update(self._x, self._cov, measurement, **limits))
+            return posterior, known, mounting_known(posterior.cov)[0]
+        held = HeldMounting(measurement)
+        posterior = self._unshown.mark(iterated_update(self._x, known, held, **limits))
+        after = posterior.cov
+        if posterior.valid:
+            B = moved_sensitivity(B, after, replace(held.last, directions=posterior.last.directions))
+        return replace(posterior, cov=with_mounting(after, B)), known, after
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
@@ -320,12 +343,9 @@ class LidarInertialOdometry(Snapshots):
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
-        config = self.config
-        with_extrinsic = config.extrinsic_estimation == "on" or (
-            config.extrinsic_estimation == "gated" and self._excitation.sufficient
-        )
+        with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
+        return PlaneMeasurement(points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap
@@ -362,7 +382,7 @@ class LidarInertialOdometry(Snapshots):
             pose_covariance=self._mounting.widened(pose, self._x),
             status=outcome.status if outcome else "ok" if self._gap is None else "lost",
             weak_directions=outcome.weak_directions if outcome else (),
-            lidar_share=outcome.lidar_share(self._cov) if outcome else np.zeros(6),
+            lidar_share=outcome.lidar_share if outcome else np.zeros(6),
             points_raw=len(frame.scan) + sum(frame.scan.rejected.values()),
             points_filtered=outcome.measurement.points if outcome else 0,
             points_used=outcome.points_used if outcome else 0,

@@ -19,7 +19,7 @@ class Outcome:
     Attributes:
         measurement, posterior: the scan against the map, and the update.
         taken: whether the posterior became the state.
-        cov_prior: (24, 24) of the prediction.
+        cov_prior, cov: (24, 24) of the prediction and after the update, with the mounting known.
         status: of the estimate.
     """
 
@@ -27,6 +27,7 @@ class Outcome:
     posterior: Posterior
     taken: bool
     cov_prior: NDArray[np.float64]
+    cov: NDArray[np.float64]
     status: Status
 
     @property
@@ -45,9 +46,10 @@ class Outcome:
         unused = {} if self.taken else {"scan without an update": self.posterior.last.used}
         return {**self.measurement.rejected(), **unused}
 
-    def lidar_share(self, cov: NDArray[np.float64]) -> NDArray[np.float64]:
+    @property
+    def lidar_share(self) -> NDArray[np.float64]:
         """(6,) 1 − posterior / prior variance of the pose."""
         if not self.taken:
             return np.zeros(6)
-        share: NDArray[np.float64] = np.clip(1.0 - cov.diagonal()[:6] / self.cov_prior.diagonal()[:6], 0.0, 1.0)
+        share: NDArray[np.float64] = np.clip(1.0 - self.cov.diagonal()[:6] / self.cov_prior.diagonal()[:6], 0.0, 1.0)
         return share

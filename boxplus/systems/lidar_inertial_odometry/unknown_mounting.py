@@ -1,19 +1,34 @@
-"""What an uncertain mounting makes of the path.
+"""What an uncertain mounting makes of state and path.
 
-The LiDAR shows how the LiDAR moves, L = T_lidar0_lidar. The path of the IMU is A = T L T⁻¹ with T = T_imu_lidar: where T is off
-by an angle, the whole path is turned by it against the first pose, however well every scan fits. A mounting that was estimated
-beforehand is uncertain from the first scan on, and refining it later does not move the map that was made with it. This is kept
-beside the filter, as a constant that it does not know (a consider state: Schmidt, 1966).
+The LiDAR shows how the LiDAR moves: the map is made of what it sees, and a scan tells where the LiDAR is in it, L. The IMU is at
+L T⁻¹, T = T_imu_lidar: an error of T is one of all poses of the IMU alike, and no scan tells one from the other. Only the motion
+does, by how the IMU feels it. A filter that takes both for independent takes the one for the other: after the first turn it has
+the lever arm to millimetres, and wrong. The covariance of the state therefore has both, from the first scan on,
+
+    P = P_T + B Σ Bᵀ        P_T: the rest of the state, T known;  Σ: of T;  B: how the rest moves with T        (with_mounting)
+
+While T is not to be estimated, because a platform that does not turn shows nothing of it, scans move P_T and B alone: what they
+say of T is not listened to (a consider state: Schmidt, 1966).
+
+Against the first pose, the path of the IMU is A = T L T⁻¹: where T is off by an angle, the whole path is turned by it, however
+well every scan fits. Refining T while running does not move the map that was made with it.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import PL, RL, P, R
+from boxplus.filtering.degeneracy import project_out_weak
+from boxplus.filtering.iterated_update import Information, Measurement
+from boxplus.filtering.nav_state import PL, RL, T_G, T_P, T_THETA, T_THETA_L, TANGENT, G, P, R
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_REST, _MOUNTING = slice(0, T_THETA_L), slice(T_THETA_L, TANGENT)
+_POSE = slice(0, 6)
 
 
 class UnknownMounting:
@@ -31,12 +46,107 @@ class UnknownMounting:
         self._variance = np.repeat([0.0 if is_known else rotation**2, 0.0 if is_known else translation**2], 3)
 
     def widened(self, cov: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A covariance (6, 6) of the pose at x (36,), [θ about the IMU's axes, p along the world's], and that of the mounting."""
+        """What the mounting adds to a covariance (6, 6) of the pose at x (36,), [θ about the IMU's axes, p along the world's].
+
+        As uncertain as it was at first, for the map was made with it; and where it has changed since, the first pose was not
+        where it is known to have been now, which counts as it is.
+        """
         if not self._variance.any():
             return cov
-        J = mounting_jacobian(self._first, x)
-        wide: NDArray[np.float64] = cov + (J * self._variance) @ J.T
+        J, off = mounting_jacobian(self._first, x), self._moved_since(x)
+        wide: NDArray[np.float64] = cov + (J * self._variance) @ J.T + np.outer(off, off)
         return wide
+
+    def _moved_since(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6,) how the pose at x (36,) would move if the path began, with the present mounting, where it was said to begin."""
+        first, T_first = _pose(self._first), _mounted(self._first)
+        T_now, mounted = _pose(x), _mounted(x)
+        moved = first @ mounted @ np.linalg.inv(first @ T_first) @ T_now
+        return np.concatenate([so3.log(T_now[:3, :3].T @ moved[:3, :3]), moved[:3, 3] - T_now[:3, 3]])
+
+
+class HeldMounting:
+    """A measurement of pose and mounting that is asked about the pose alone.
+
+    Args:
+        measurement: of both.
+
+    Attributes:
+        last: what it said of both at the last iterate.
+    """
+
+    def __init__(self, measurement: Measurement) -> None:
+        self._measurement = measurement
+        self.last: Information
+
+    def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
+        """See `Measurement`."""
+        self.last = self._measurement.at(x, rematch=rematch)
+        A, b = self.last.A.copy(), self.last.b.copy()
+        A[6:], A[:, 6:], b[6:] = 0.0, 0.0, 0.0
+        return replace(self.last, A=A, b=b)
+
+    def has_moved(self, x: NDArray[np.float64]) -> bool:
+        """See `Measurement`."""
+        return self._measurement.has_moved(x)
+
+
+def _pose(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) T_world_imu of a state (36,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = x[R : R + 9].reshape(3, 3), x[P : P + 3]
+    return T
+
+
+def _mounted(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) T_imu_lidar of a state (36,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = x[RL : RL + 9].reshape(3, 3), x[PL : PL + 3]
+    return T
+
+
+def first_sensitivity(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(18, 6) how the state at rest moves with the mounting, the LiDAR's pose and what the accelerometer shows held.
+
+    With φ = R_imu_lidar δθ_L:    δθ = −φ,    δp = −R [p_L]ₓ φ − R δp_L,    δg = [g]ₓ R φ
+    """
+    rotation, R_imu_lidar = x[R : R + 9].reshape(3, 3), x[RL : RL + 9].reshape(3, 3)
+    B = np.zeros((T_THETA_L, 6))
+    B[T_THETA : T_THETA + 3, :3] = -R_imu_lidar
+    B[T_P : T_P + 3, :3] = -rotation @ so3.hat(x[PL : PL + 3]) @ R_imu_lidar
+    B[T_P : T_P + 3, 3:] = -rotation
+    B[T_G : T_G + 3, :3] = so3.hat(x[G : G + 3]) @ rotation @ R_imu_lidar
+    return B
+
+
+def with_mounting(cov: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
+    """P (24, 24) of a covariance with the mounting known, and how the rest of the state moves with it, B (18, 6)."""
+    whole = cov.copy()
+    shared = B @ cov[_MOUNTING, _MOUNTING]
+    whole[_REST, _REST] += shared @ B.T
+    whole[_REST, _MOUNTING], whole[_MOUNTING, _REST] = shared, shared.T
+    return whole
+
+
+def mounting_known(cov: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The same backwards: P (24, 24) with the mounting known, its own variances beside, and B (18, 6)."""
+    B: NDArray[np.float64] = np.linalg.solve(cov[_MOUNTING, _MOUNTING], cov[_MOUNTING, _REST]).T
+    known = cov.copy()
+    known[_REST, _REST] -= B @ cov[_MOUNTING, _REST]
+    known[_REST, _MOUNTING], known[_MOUNTING, _REST] = 0.0, 0.0
+    return known, B
+
+
+def moved_sensitivity(B: NDArray[np.float64], cov: NDArray[np.float64], information: Information) -> NDArray[np.float64]:
+    """B (18, 6) after a scan that was not asked about the mounting: B − K (H_x B + H_T), K H = P A.
+
+    Args:
+        B: before it; cov: (24, 24) after it, with the mounting known.
+        information: what the scan says of pose and mounting.
+    """
+    A, _ = project_out_weak(information.A, information.b, information.directions)
+    moved: NDArray[np.float64] = B - cov[_REST, _POSE] @ (A[:6, :6] @ B[_POSE] + A[:6, 6:])
+    return moved
 
 
 def mounting_jacobian(first: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import (
     wide_prior,
 )
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.unknown_mounting import first_sensitivity, with_mounting
 
 _SLOPE_STD = 0.01  # of the scale of an accelerometer in order
 _ACCEL_BIAS_STD = 0.15  # m/s²
@@ -95,17 +97,23 @@ def static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tup
     covariance = _first_covariance(
         config, gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=gravity_sigma
     )
+    if config.extrinsic_estimation != "off":
+        covariance = with_mounting(covariance, first_sensitivity(state.pack()))
     return state, covariance
 
 
-def moving_fit(frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> TranslationFit | None:
-    """Velocity, gravity and bias from the LiDAR's path and the accelerometer, with the mounting and metres as given."""
+def moving_fit(
+    frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, extrinsic: NavState, config: LioConfig
+) -> TranslationFit | None:
+    """Velocity, gravity and bias from the LiDAR's path and the accelerometer, with metres as given and the mounting as known."""
     mean, std = wide_prior()
     mean[ARM], std[ARM] = extrinsic.p_imu_lidar, 0.01
     # Over a second the mean specific force is gravity but for the mean acceleration.
     R_path_imu = path.R_path_lidar[len(path) // 2] @ extrinsic.R_imu_lidar.T
     mean[GRAVITY], std[GRAVITY] = -R_path_imu @ imu.accel.mean(axis=0), _MEAN_ACCEL_STD
     std[SLOPE], std[BIAS], std[TURN] = _SLOPE_STD, _ACCEL_BIAS_STD, _MOUNTING_STD
+    if config.extrinsic_estimation != "off":
+        std[ARM], std[TURN] = config.extrinsic_translation_sigma, np.deg2rad(config.extrinsic_rotation_sigma_deg)
     bias_gyro = gyro_bias(path, imu, extrinsic)
     seconds = (frames[-1].scan.end_ns - frames[0].scan.start_ns) * 1e-9
     return compare_accelerations(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0.0, (mean, std), stretch_s=seconds + 1.0)
@@ -127,17 +135,20 @@ def moving_state(
     """State and covariance at the end of the first scan, carried there from the beginning of the batch."""
     first = fit.stretches[0]
     bias_gyro = gyro_bias(path, imu, extrinsic)
+    known = _with_mounting_known(fit, extrinsic, config)
+    bias = fit.bias + known.change[6:]
     attitude = BodyAttitude(path, imu, extrinsic.R_imu_lidar, bias_gyro, 0)
     end_ns = frames[0].scan.end_ns
     grid = np.unique(
         np.concatenate([[first.time_ns, end_ns], imu.time_ns[(imu.time_ns > first.time_ns) & (imu.time_ns < end_ns)]])
     )
     R_grid = attitude.at(grid)
-    accel = np.stack([np.interp(grid, imu.time_ns, imu.accel[:, i]) for i in range(3)], axis=1) - fit.bias
+    accel = np.stack([np.interp(grid, imu.time_ns, imu.accel[:, i]) for i in range(3)], axis=1) - bias
     force = np.einsum("nij,nj->ni", R_grid, accel)
     dt = np.diff(grid)[:, None] * 1e-9
-    v_path = first.state[3:] + (0.5 * (force[1:] + force[:-1]) * dt).sum(axis=0) + fit.gravity * float(dt.sum())
-    gravity = fit.gravity * (STANDARD_GRAVITY / float(np.linalg.norm(fit.gravity)))
+    gravity = fit.gravity + known.change[3:6]
+    v_path = first.state[3:] + known.change[:3] + (0.5 * (force[1:] + force[:-1]) * dt).sum(axis=0) + gravity * float(dt.sum())
+    gravity *= STANDARD_GRAVITY / float(np.linalg.norm(gravity))
     R_path_imu = R_grid[-1]
     R_world_path = _gravity_rotation(-gravity) if config.gravity_aligned else R_path_imu.T
     state = NavState(
@@ -145,7 +156,7 @@ def moving_state(
         np.zeros(3),
         R_world_path @ v_path,
         bias_gyro,
-        fit.bias,
+        bias,
         R_world_path @ gravity,
         extrinsic.R_imu_lidar,
         extrinsic.p_imu_lidar,
@@ -153,12 +164,42 @@ def moving_state(
     covariance = _first_covariance(config, gyro_sigma=_GYRO_BIAS_STD, accel_sigma=0.0, velocity_sigma=0.0, gravity_sigma=0.0)
     open_turns = extrinsic.R_imu_lidar @ shown_turns(path)[1]
     covariance[T_BW : T_BW + 3, T_BW : T_BW + 3] += _ANY_GYRO_BIAS_STD**2 * open_turns @ open_turns.T
-    # [velocity, gravity, bias] of the batch: velocity and gravity along the path's axes.
-    known = np.r_[3:6, 6 + GRAVITY.start : 6 + GRAVITY.stop, 6 + BIAS.start : 6 + BIAS.stop]
     turn = np.zeros((9, 9))
     turn[:3, :3] = turn[3:6, 3:6] = R_world_path
     turn[6:, 6:] = np.eye(3)
     into = np.r_[T_V : T_V + 3, T_G : T_G + 3, T_BA : T_BA + 3]
     floor = np.diag(np.repeat([0.02, 0.05, 0.02], 3) ** 2)
-    covariance[np.ix_(into, into)] = _TWICE * turn @ first.covariance[np.ix_(known, known)] @ turn.T + floor
-    return state, covariance
+    covariance[np.ix_(into, into)] = _TWICE * turn @ known.covariance @ turn.T + floor
+    if config.extrinsic_estimation == "off":
+        return state, covariance
+    B = first_sensitivity(state.pack())
+    B[into] = turn @ known.moves
+    return state, with_mounting(covariance, B)
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """[velocity, gravity, bias] of a batch (9) with the mounting as it is given; velocity and gravity along the path's axes.
+
+    Attributes:
+        change: (9,) what they differ by from the batch, which may have moved the mounting.
+        covariance: (9, 9) with the mounting known.
+        moves: (9, 6) how they move with it, [δθ_L, δp_L].
+    """
+
+    change: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    moves: NDArray[np.float64]
+
+
+def _with_mounting_known(fit: TranslationFit, extrinsic: NavState, config: LioConfig) -> _Known:
+    C = fit.stretches[0].covariance
+    z = np.r_[3:6, 6 + GRAVITY.start : 6 + GRAVITY.stop, 6 + BIAS.start : 6 + BIAS.stop]
+    if config.extrinsic_estimation == "off":
+        return _Known(np.zeros(9), C[np.ix_(z, z)], np.zeros((9, 6)))
+    a = np.r_[6 + TURN.start : 6 + TURN.stop, 6 + ARM.start : 6 + ARM.stop]
+    moves: NDArray[np.float64] = np.linalg.solve(C[np.ix_(a, a)], C[np.ix_(a, z)]).T
+    change = moves @ np.concatenate([-fit.turn, extrinsic.p_imu_lidar - fit.p_imu_lidar])
+    covariance = C[np.ix_(z, z)] - moves @ C[np.ix_(a, z)]
+    moves[:, :3] = moves[:, :3] @ extrinsic.R_imu_lidar  # Exp(turn) R_imu_lidar = R_imu_lidar Exp(δθ_L)
+    return _Known(change, covariance, moves)

@@ -257,7 +257,7 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
 
 def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
     """Velocity, gravity and bias from path and accelerometer, where both fit each other."""
-    fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic)
+    fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
         raise seen.not_moving("the surroundings do not show how the platform turns")
     if fit.sigma > _LARGEST_MISFIT_M:
