@@ -130,7 +130,7 @@ def with_mounting(cov: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[n
 
 def mounting_known(cov: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The same backwards: P (24, 24) with the mounting known, its own variances beside, and B (18, 6)."""
-    B: NDArray[np.float64] = np.linalg.solve(cov[_MOUNTING, _MOUNTING], cov[_MOUNTING, _REST]).T
+    B = np.linalg.solve(cov[_MOUNTING, _MOUNTING], cov[_MOUNTING, _REST]).T.astype(np.float64)
     known = cov.copy()
     known[_REST, _REST] -= B @ cov[_MOUNTING, _REST]
     known[_REST, _MOUNTING], known[_MOUNTING, _REST] = 0.0, 0.0
