@@ -51,8 +51,8 @@ def filtered_world(estimate: Estimate, voxel_filter: VoxelFilter) -> NDArray[np.
 
 def run_pass(events: Sequence[Event], config: LioConfig, *, opponent: bool) -> Pass:
     """Feed the events; every `EVERY`-th scan the opponent follows ours at once."""
-    # The machine is shared: one thread is timed by what the processor worked for it, two by the wall clock.
-    clock = time.process_time if config.threads == 1 else time.perf_counter
+    # The machine is shared: one thread is timed by what a processor worked for it, two by the wall clock.
+    clock = time.thread_time if config.threads == 1 else time.perf_counter
     ours, voxel_filter = Boxplus(config, clock), VoxelFilter(config.scan_voxel)
     result = Pass()
     tree: cKDTree | None = None
