@@ -10,7 +10,6 @@ import pytest
 from boxplus.errors import InputError, OutputError
 from boxplus.runs.fleet.store import ObjectStore, SharedFolder, Store, open_store
 
-pytest.importorskip("fsspec", reason="needs fsspec, the extra fleet")
 
 
 @pytest.fixture(params=["folder", "file", "memory", "local"])
