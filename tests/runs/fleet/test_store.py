@@ -11,7 +11,6 @@ from boxplus.errors import InputError, OutputError
 from boxplus.runs.fleet.store import ObjectStore, SharedFolder, Store, open_store
 
 
-
 @pytest.fixture(params=["folder", "file", "memory", "local"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
     if request.param == "local":  # objects, whose store is a disk
