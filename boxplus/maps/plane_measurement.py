@@ -78,7 +78,6 @@ class PlaneMeasurement:
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
-        self._points_moved = 0.0  # since the last search, root mean square [m]
         self._matched_at = np.zeros(PACKED)
         self._directions: PoseDirections
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
@@ -116,20 +115,11 @@ class PlaneMeasurement:
         return whole, A * self._weight, b * self._weight
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
-        """Whether the points have moved far enough since the last search for some to have other neighbours; before any, yes."""
-        if not self._matched:
-            return True
+        """Whether the points have moved far enough since the last search for some to have other neighbours."""
         delta = np.zeros(TANGENT)
         boxminus_into(x, self._matched_at, delta)
         shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
-        shift += float(np.linalg.norm(delta[:3])) * self.lever_arm + self._points_moved
-        return shift > _SAME_NEIGHBOURS * self._cell
-
-    def move_points(self, p_lidar: NDArray[np.float64]) -> None:
-        """The same points (n, 3), LiDAR frame, compensated with a motion that is better known."""
-        off = p_lidar - self._p_lidar
-        self._points_moved += float(np.sqrt(np.einsum("ij,ij->i", off, off).mean())) if len(off) else 0.0
-        self._p_lidar[:] = p_lidar
+        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._cell
 
     @property
     def points(self) -> int:
@@ -246,4 +236,4 @@ class PlaneMeasurement:
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
         settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
-        self._matched_at, self._points_moved = x.copy(), 0.0
+        self._matched_at = x.copy()

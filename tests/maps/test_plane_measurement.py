@@ -98,29 +98,6 @@ def test_reusing_the_neighbours_where_nothing_moved() -> None:
         assert other.residual_rms == first.residual_rms
 
 
-@settings(max_examples=10)
-@given(seeds)
-def test_points_that_are_moved_say_what_points_at_that_place_say(seed: int) -> None:
-    """A little, with the planes they have; farther, and they ask for a search."""
-    random = np.random.default_rng(seed)
-    tree, x = IkdTree(_faces(random, 4000)), _pose(random)
-    points = _look(_faces(random, 300), x)
-    measurement = _measure(points.copy(), tree)
-    assert measurement.has_moved(x.pack())  # nothing has been searched yet
-    measurement.at(x.pack(), rematch=True)
-    assert not measurement.has_moved(x.pack())
-    cell = RegistrationConfig().map_cell
-    for share, asks in ((0.02, False), (0.04, False), (0.08, True), (0.5, True)):
-        measurement.move_points(points + share * cell * np.array([0.0, 0.6, -0.8]))
-        assert measurement.has_moved(x.pack()) == asks
-    moved = measurement.at(x.pack(), rematch=True)
-    assert not measurement.has_moved(x.pack())
-    there = _measure((points + 0.5 * cell * np.array([0.0, 0.6, -0.8])).astype(np.float32), tree).at(x.pack(), rematch=True)
-    assert moved.used == there.used
-    np.testing.assert_allclose(moved.A, there.A, rtol=1e-6, atol=1e-6 * np.abs(there.A).max())
-    np.testing.assert_allclose(moved.b, there.b, rtol=1e-6, atol=1e-6 * np.abs(there.b).max())
-
-
 def test_the_parts_add_up() -> None:
     random = np.random.default_rng(2)
     tree, x = IkdTree(_faces(random, 4000)), _pose(random)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.filtering.plane_information import ONE_LINE
 from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
@@ -37,7 +38,8 @@ _MOST_MAP_POINTS = 5000  # that it leaves in the map
 _MOST_RAW = 12_000  # that it is undistorted and filtered from
 _PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
 _NODES = 21  # within a scan, of a known turning
-_WEAK = 0.7  # the steps of a path have a floor of noise: a direction may count that says hardly more than noise
+# The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
+_WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
@@ -47,6 +49,7 @@ _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
+
 
 Poses = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 """Times (K,) [ns], attitudes (K, 3, 3) and positions (K, 3) [m] of the LiDAR, in any frame."""
@@ -324,12 +327,6 @@ class LidarMotion:
         nodes[-1, N_W : N_W + 3] = rates[-1]
         return nodes
 
-    def _still(
-        self, scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64], x: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
-        """The points undistorted with the motion that was found on the way here; `velocity` along the path's axes."""
-        return undistorted(scan, self._nodes(scan, at_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity), at_ns)
-
     def _register(
         self, scan: Scan, middle_ns: int, step_s: float, rate: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> _Fit | None:
@@ -337,28 +334,30 @@ class LidarMotion:
         x = self._x.copy()
         x[R : R + 9] = (R_before @ so3.exp(rate * step_s)).ravel()
         x[P : P + 3] = p_before + velocity * step_s
-        still = self._still(scan, middle_ns, rate, velocity, x)
-        points = self._filter(still)[0]
-        # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
-        share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
-        measurement, passes = PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share), 0
-        while True:
+        directions: PoseDirections | None = None
+        for _ in range(_PASSES):
+            # Within the scan the motion is what it was found to be on the way here.
+            nodes = self._nodes(scan, middle_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity)
+            still = undistorted(scan, nodes, middle_ns)
+            points = self._filter(still)[0]
+            # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
+            share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
+            measurement = PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share)
             directions = align(x, measurement, self._config)
             if directions is None:
                 return None
             moved = so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
             change = max(np.abs(moved[0] - rate).max(), np.abs(moved[1] - velocity).max()) * step_s
-            (rate, velocity), passes = moved, passes + 1
-            if change < _SAME_MOTION or passes == _PASSES:
+            rate, velocity = moved
+            if change < _SAME_MOTION:
                 break
-            still = self._still(scan, middle_ns, rate, velocity, x)
-            measurement.move_points(self._filter.means(still))  # the points of the same voxels, hardly elsewhere
-        information = measurement.at(x, rematch=measurement.has_moved(x))
+        information = measurement.at(x, rematch=True)
         # A point among map points of one scan line is not used, but it does lie on the map.
         on_line = measurement.rejected().get(REASONS[ONE_LINE], 0)
         share = (information.used + on_line) / max(len(points), 1)
         if (
-            information.used < FEWEST_USED
+            directions is None
+            or information.used < FEWEST_USED
             or share < _LEAST_SHARE
             or max(np.abs(rate).max() / _FASTEST[0], np.abs(velocity).max() / _FASTEST[1]) > 1.0
         ):

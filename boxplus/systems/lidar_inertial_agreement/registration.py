@@ -55,8 +55,8 @@ def align(
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None
-    for _ in range(steps):
-        information = measurement.at(x, rematch=measurement.has_moved(x))
+    for step in range(steps):
+        information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
         if information.used < config.min_points:
             return None
         directions = information.directions
