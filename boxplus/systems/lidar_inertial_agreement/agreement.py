@@ -42,6 +42,7 @@ _SCAN_NS = 100_000_000
 FEET_PER_METRE = 3.28084
 _THICK_M = 0.08  # median misfit of a path: of sound ones the foliage of a forest reaches 5 cm
 ROTATION_KNOWN_RAD = 0.05
+_COARSELY_RAD = 0.2
 _DECLARED_ARM_STD = 0.02  # m
 
 
@@ -162,7 +163,7 @@ def _compared(
     rotation = compare_rotations(path, imu, None if T_guess is None else R) if len(imu) > 1 else None
     # What explains little of the rotation says nothing of mounting, bias and clocks either.
     fits = rotation is not None and rotation.explained > _EXPLAINED
-    if rotation is not None and fits and (T_declared is None or apart(rotation, R)[0] > apart_allowed(rotation)):
+    if rotation is not None and fits and (T_declared is None or contradicted_within(rotation, R) is not None):
         R = rotation.R_imu_lidar
     translation = None
     if len(path) > 0 and len(imu) > 1 and (fits or T_declared is not None):
@@ -189,7 +190,7 @@ def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
         unit = max(unit_of(rotation.scale), 1.0)
         strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(found.gyro_power)) / unit)
         return strong > float(_TURNING_RAD_S)
-    return T_declared is not None and apart(rotation, T_declared[:3, :3])[0] > apart_allowed(rotation)
+    return T_declared is not None and contradicted_within(rotation, T_declared[:3, :3]) is not None
 
 
 def _off(slope: float) -> bool:
@@ -232,15 +233,29 @@ def unit_of(scale: float) -> float:
     return degrees if 30.0 < scale < 110.0 else 1.0 / degrees if 30.0 < 1.0 / max(scale, 1e-9) < 110.0 else 1.0
 
 
-def apart(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
-    """How far a mounting is from the found one [rad], about the axes known to three degrees; and which these are (3,)."""
+def apart(
+    fit: RotationFit, R_imu_lidar: NDArray[np.float64], known_rad: float = ROTATION_KNOWN_RAD
+) -> tuple[float, NDArray[np.bool_]]:
+    """How far a mounting is from the found one [rad], about the axes known to three degrees, or `known_rad`; which, (3,)."""
     std, axes = fit.rotation_std
-    seen = std < ROTATION_KNOWN_RAD
+    seen = std < known_rad
     angle = axes.T @ so3.log(fit.R_imu_lidar @ R_imu_lidar.T)
     return float(np.linalg.norm(angle[seen])), seen
 
 
-def apart_allowed(fit: RotationFit) -> float:
+def apart_allowed(fit: RotationFit, known_rad: float = ROTATION_KNOWN_RAD, deviations: float = 3.0) -> float:
     """How far a right mounting may seem to be from the found one [rad]."""
     std, _ = fit.rotation_std
-    return float(np.deg2rad(2.5)) + 3.0 * float(np.linalg.norm(std[std < ROTATION_KNOWN_RAD]))
+    return float(np.deg2rad(2.5)) + deviations * float(np.linalg.norm(std[std < known_rad]))
+
+
+def contradicted_within(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> float | None:
+    """Whether the mounting is another one: how well the axes are known that show it [rad]; None where it may be right.
+
+    By the axes known to three degrees, or by those known to eleven: where all of them are known coarsely, a LiDAR that is turned
+    by a quarter is turned by many standard deviations still.
+    """
+    for known_rad, deviations in ((ROTATION_KNOWN_RAD, 3.0), (_COARSELY_RAD, 5.0)):
+        if apart(fit, R_imu_lidar, known_rad)[0] > apart_allowed(fit, known_rad, deviations):
+            return known_rad
+    return None

@@ -14,6 +14,7 @@ from boxplus.systems.lidar_inertial_agreement.agreement import (
     Agreement,
     apart,
     apart_allowed,
+    contradicted_within,
     unit_of,
 )
 from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
@@ -24,6 +25,7 @@ from boxplus.systems.lidar_inertial_agreement.lengths import (
     feet_finding,
     slope_finding,
 )
+from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
 
@@ -46,6 +48,7 @@ _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MOUNTED = 0.95  # share of the turning that a mounting explains
 _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
+_MIRRORED_RAD, _NEARLY_ALL = np.deg2rad(2.5), 0.12  # a tilt of which a mirrored axis leaves so little is hardly a bias
 
 
 def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None) -> list[Finding]:
@@ -217,30 +220,30 @@ def _reversed(translation: TranslationFit) -> bool:
 def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
     if T_declared is None or rotation.explained < _FITS:
         return None
-    angle, seen = apart(rotation, T_declared[:3, :3])
-    if not seen.any() or angle < apart_allowed(rotation):
+    known = contradicted_within(rotation, T_declared[:3, :3])
+    if known is None:
         return None
+    angle, seen = apart(rotation, T_declared[:3, :3], known)
     text = (
         f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the given T_imu_lidar (known to "
         f"{np.degrees(np.linalg.norm(rotation.rotation_std[0][seen])):.1f} deg)"
     )
-    inverse, mirrored = apart(rotation, T_declared[:3, :3].T)[0], _from_mirrored(rotation, T_declared[:3, :3])
+    inverse, mirrored = apart(rotation, T_declared[:3, :3].T, known)[0], _from_mirrored(rotation, T_declared[:3, :3], known)
     if inverse < min(0.3 * angle, mirrored):
         advice = f"its inverse fits to {np.degrees(inverse):.1f} deg: T_imu_lidar maps LiDAR coordinates to IMU coordinates"
-    elif abs(angle - np.pi) < _HALF_TURN_RAD or mirrored < apart_allowed(rotation):
+    elif abs(angle - np.pi) < _HALF_TURN_RAD or mirrored < apart_allowed(rotation, known):
         advice = "half a turn: the gyroscope's sign is flipped, the points are mirrored, or T_imu_lidar is of another mounting"
     else:
-        advice = (
-            "check T_imu_lidar and that the topics are those of this mounting; found R_imu_lidar = "
-            f"{matrix_text(rotation.R_imu_lidar)}"
-        )
+        advice = "check T_imu_lidar and that the topics are those of this mounting"
+        if known == ROTATION_KNOWN_RAD:
+            advice += f"; found R_imu_lidar = {matrix_text(rotation.R_imu_lidar)}"
     return Finding("extrinsic", f"{text}; {advice}")
 
 
-def _from_mirrored(rotation: RotationFit, R_imu_lidar: NDArray[np.float64]) -> float:
+def _from_mirrored(rotation: RotationFit, R_imu_lidar: NDArray[np.float64], known_rad: float) -> float:
     """How far a turning is from that of points with one axis of the other sign, half a turn about it [rad]; the nearest one."""
     half_turns = [2.0 * np.outer(axis, axis) - np.eye(3) for axis in np.eye(3)]
-    return min(apart(rotation, R_imu_lidar @ half_turn)[0] for half_turn in half_turns)
+    return min(apart(rotation, R_imu_lidar @ half_turn, known_rad)[0] for half_turn in half_turns)
 
 
 def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
@@ -264,7 +267,7 @@ def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDA
 def _of_planes(agreement: Agreement) -> Finding | None:
     """Where no motion shows the mounting, gravity does, if what stands around stands upright."""
     planes = agreement.planes
-    if planes is None or planes.tilt < _UPRIGHT_RAD + 3.0 * planes.std:
+    if planes is None or planes.tilt < _least_tilt(planes):
         return None
     text = (
         f"{'three' if planes.directions == 3 else 'two'} directions of planes, orthogonal to each other, are "
@@ -275,6 +278,16 @@ def _of_planes(agreement: Agreement) -> Finding | None:
         text += f"with {'xyz'[axis]} of the points mirrored they are upright; else "
     advice = "check T_imu_lidar, and that the topics are those of this mounting, unless the place itself is tilted"
     return Finding("extrinsic", text + advice)
+
+
+def _least_tilt(planes: PlaneTilt) -> float:
+    """The tilt that contradicts a mounting [rad].
+
+    A bias of the accelerometer tilts the world anyhow. That one of three axes, given the other sign, takes seven eighths of the
+    tilt away happens by chance once in twenty times, so that less of a tilt will do.
+    """
+    mirrored = planes.directions == 3 and float(planes.mirrored.min()) < _NEARLY_ALL * planes.tilt
+    return float(_MIRRORED_RAD if mirrored else _UPRIGHT_RAD) + 3.0 * planes.std
 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:

@@ -203,6 +203,22 @@ def test_points_that_may_be_mirrored_are_said_to_be(axis: int) -> None:
     assert "mirrored" not in contradictions(replace(seen, rotation=other), T)[0].text
 
 
+@pytest.mark.parametrize(("std_deg", "off_deg", "named"), [(4.0, 80.0, True), (4.0, 15.0, False), (15.0, 80.0, False)])
+def test_a_quarter_turn_is_seen_where_the_mounting_is_known_coarsely(std_deg: float, off_deg: float, named: bool) -> None:
+    """As from attitudes of a stairwell, none of whose axes is known to three degrees."""
+    simulation = handheld(3)
+    T = simulation.T_imu_lidar
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=T)
+    assert agreement.rotation is not None
+    covariance = agreement.rotation.covariance.copy()
+    covariance[:3, :3] = np.deg2rad(std_deg) ** 2 * np.eye(3)
+    coarse = replace(agreement, rotation=replace(agreement.rotation, covariance=covariance), translation=None)
+    assert contradictions(coarse, T) == []
+    found = contradictions(coarse, turned(T, off_deg, 1))
+    assert [finding.cause for finding in found] == ["extrinsic"] * named
+    assert not named or (f"{off_deg:.0f} deg apart" in found[0].text and "found R_imu_lidar" not in found[0].text)
+
+
 def test_attitudes_known_coarsely_show_no_lengths() -> None:
     simulation = handheld(4)
     agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)

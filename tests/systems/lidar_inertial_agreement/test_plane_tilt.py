@@ -22,14 +22,16 @@ from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 LIDAR = SpinningLidar(channels=24, azimuth_steps=120)
 
 
-def straight(world: World, seed: int, speed: float = 0.5, T: NDArray[np.float64] | None = None) -> Simulation:
+def straight(
+    world: World, seed: int, speed: float = 0.5, T: NDArray[np.float64] | None = None, imu: ImuModel | None = None
+) -> Simulation:
     """Straight on at a constant velocity and attitude: neither gyroscope nor accelerometer shows the mounting."""
     random = np.random.default_rng(seed)
     if T is None:
         T = mounting(random.uniform(-15.0, 15.0), random.uniform(-15.0, 15.0), random.uniform(-180.0, 180.0), (0.1, 0.0, 0.1))
     attitude = manoeuvres.level(random.uniform(-np.pi, np.pi), *random.uniform(-0.1, 0.1, 2))
     motion = manoeuvres.constant_velocity(3.0, np.array([-1.0, 0.2, 1.5]), (speed, 0.0, 0.0), attitude)
-    return Simulation(Scenario("straight", world, motion, LIDAR, ImuModel(), T), seed, 2.6)
+    return Simulation(Scenario("straight", world, motion, LIDAR, imu or ImuModel(), T), seed, 2.6)
 
 
 def tilt_of(simulation: Simulation, T: NDArray[np.float64], fault: Fault | None = None) -> PlaneTilt | None:
@@ -79,6 +81,22 @@ def test_mirrored_points_are_upright_with_their_mirror() -> None:
     T = simulation.T_imu_lidar
     (finding,) = contradictions(compare_sensors(*data(simulation, faults.mirror_points(1)), CONFIG, T_declared=T), T)
     assert "with y of the points mirrored they are upright" in finding.text
+
+
+@pytest.mark.parametrize("seed", [2, 9])
+def test_a_mirror_is_told_where_a_tilt_alone_might_be_a_bias(seed: int) -> None:
+    """The y axis of the points lies 1.7 deg out of level: mirrored, what stands around is tilted by twice that."""
+    room = worlds.room(seed=seed)
+    straightened = straight(room, seed, T=np.eye(4))
+    R_world_imu = straightened.ground_truth(np.array([straightened.start_ns])).R_world_imu[0]
+    T = mounting(0.0, 0.0, 0.0, (0.1, 0.0, 0.1))
+    T[:3, :3] = R_world_imu.T @ so3.exp(np.array([0.0, 0.0, 0.7])) @ so3.exp(np.deg2rad([1.7, 0.9, 0.0]))
+    simulation = straight(room, seed, T=T, imu=ImuModel(accel_bias=(0.0, 0.0, 0.0)))  # a bias is a tilt as well
+    (finding,) = contradictions(compare_sensors(*data(simulation, faults.mirror_points(1)), CONFIG, T_declared=T), T)
+    assert "with y of the points mirrored they are upright" in finding.text
+    assert float(finding.text.split(" deg from upright")[0].split()[-1]) <= 4.0
+    biased = leaning(simulation, (0.6, 0.8, 0.0), 3.4)
+    assert contradictions(compare_sensors(*data(simulation), CONFIG, T_declared=biased), biased) == []
 
 
 def test_a_forest_says_nothing() -> None:
