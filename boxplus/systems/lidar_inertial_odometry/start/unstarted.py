@@ -15,7 +15,8 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem_of
 from boxplus.systems.lidar_inertial_odometry.start.start import joined_imu
 
-_STRETCH_S, _STRETCHES = 4.0, 2  # as long as the comparisons of a run: a start is sought in less, and shows less
+_STRETCH_S = 4.0  # as long as the comparisons of a run: a start is sought in less, and shows less
+_ENDS_AGO_S = (0.0, 2.0, 4.0)  # overlapping: a path that breaks, or knows too few attitudes, may do better two seconds on
 _MOST_POINTS = 6000  # of a scan
 
 
@@ -33,7 +34,7 @@ class UnstartedScans:
     def add(self, frames: Sequence[Frame]) -> int:
         """Take scans that no start will begin with, in order of time; returns how many they are."""
         self._frames.extend(replace(frame, scan=thinned(frame.scan, _MOST_POINTS)) for frame in frames)
-        while self._frames and self._seconds_ago(self._frames[0]) > _STRETCHES * _STRETCH_S:
+        while self._frames and self._seconds_ago(self._frames[0]) >= _ENDS_AGO_S[-1] + _STRETCH_S:
             self._frames.popleft()
         return len(frames)
 
@@ -44,8 +45,8 @@ class UnstartedScans:
     def contradictions(self) -> list[str]:
         """What the sensors contradict, a sentence each: by the newest stretch that shows anything."""
         found: list[str] = []
-        for number in range(_STRETCHES):
-            stretch = [frame for frame in self._frames if self._seconds_ago(frame) // _STRETCH_S == number]
+        for end_s in _ENDS_AGO_S:
+            stretch = [frame for frame in self._frames if 0.0 <= self._seconds_ago(frame) - end_s < _STRETCH_S]
             found = found or self._contradicted(stretch)
         return found
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
+from boxplus.sensors.scan import Scan
 from boxplus.simulation.faults import wrong_time_unit
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
+from boxplus.systems.lidar_inertial_odometry.start import unstarted as unstarted_module
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
 from tests.systems.lidar_inertial_odometry.small_drives import before_a_wall, config, frames, room_walk, turning_by
 
@@ -36,6 +41,29 @@ def test_a_wrong_unit_of_the_point_times_is_named(seconds: float) -> None:
     assert "scans come every 100 ms: check the unit of the point times" in found
     sound.add(frames(simulation.events())[-4:])
     assert sound.contradictions() == []
+
+
+def test_a_stretch_that_shows_what_its_neighbours_do_not_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths break, and know too little: what only shows from six to three seconds before the end is named."""
+    simulation = room_walk(8.5)
+    unstarted = UnstartedScans(config(simulation))
+    seen = frames(simulation.events())
+    unstarted.add(seen)
+    last_ns = seen[-1].scan.end_ns
+
+    def compared(scans: Sequence[Scan], *_: object, **__: object) -> tuple[float, float]:
+        return (last_ns - scans[0].start_ns) * 1e-9, (last_ns - scans[-1].end_ns) * 1e-9
+
+    def contradicted(stretch: tuple[float, float], _: object) -> list[Finding]:
+        begun_s, ended_s = stretch
+        assert begun_s - ended_s < 4.11
+        return [Finding("gyro_sign", "the sign is wrong")] if begun_s > 5.5 and ended_s < 2.5 else []
+
+    monkeypatch.setattr(unstarted_module, "compare_sensors", compared)
+    monkeypatch.setattr(unstarted_module, "contradictions", contradicted)
+    monkeypatch.setattr(unstarted_module, "untilted_plane", lambda *_: None)
+    monkeypatch.setattr(unstarted_module, "tilted_plane", lambda *_: None)
+    assert unstarted.contradictions() == ["the sign is wrong"]
 
 
 def test_without_scans_nothing_is_said() -> None:
