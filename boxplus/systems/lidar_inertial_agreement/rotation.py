@@ -29,6 +29,7 @@ _SEEN_RAD = 0.01  # of a registration, about its least known axis
 _LONG_S, _SEEN_LONG_RAD = 0.4, 0.05  # where most registrations know less: intervals over which that is as good a rate
 _MOST = 0.5
 _DEGREES = 180.0 / np.pi
+_SLOPE_S = 0.05  # each way, over which rates change: the noise of a gyroscope changes at every sample
 _LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration alone
 _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
 _IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
@@ -133,7 +134,9 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     count = float(weight.sum()) / pairs.overlap
     noise = (weight[:, None] * residual).T @ residual / pairs.overlap
     variance = max(float(np.trace(noise)) / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0)
-    covariance = _covariance(H / variance, noise / variance, count) + np.diag(_FLOOR**2)
+    changes = 3.0 * count * _change_variance(imu, float(np.median(step_s))) / unit**2
+    covariance = _covariance(_without_noise_of_changes(H / variance, changes / variance, count), noise / variance, count)
+    covariance += np.diag(_FLOOR**2)
     centred = rate_lidar - rate_lidar.mean(axis=0)
     power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
     total = float((centred**2).sum())
@@ -248,6 +251,31 @@ def _covariance(H: NDArray[np.float64], noise: NDArray[np.float64], count: float
     return covariance
 
 
+def _change_variance(imu: ImuSamples, step_s: float) -> float:
+    """What noise adds to the squared change of a mean rate over `step_s`, by which an offset is known; an axis, own unit²/s²."""
+    if len(imu) < 3:
+        return 0.0
+    second = np.diff(imu.gyro, n=2, axis=0)
+    sample = float(np.median((second**2).sum(axis=1))) / (2.37 * 6.0)  # the median of the square of a 3-d normal's length
+    mean = sample * float(np.median(np.diff(imu.time_ns))) * 1e-9 / step_s
+    return 2.0 * mean * min(2.0 * _SLOPE_S / step_s, 1.0) / (2.0 * _SLOPE_S) ** 2
+
+
+def _without_noise_of_changes(H: NDArray[np.float64], added: float, count: float) -> NDArray[np.float64]:
+    """The information H (8, 8) without what the gyroscope's noise added to that of the offset, as `_covariance` for the rotation.
+
+    Args:
+        H: of [θ, bias, log scale, offset]; added: the sum of squared changes that is noise, over the same variance.
+        count: of rates.
+    """
+    others = H[:7, :7] + 1e-9 * np.eye(7)
+    known = 1.0 + float(H[7, 7] - H[7, :7] @ np.linalg.solve(others, H[:7, 7]))  # by itself to a second
+    rest = max(known - (1.0 + 3.0 * np.sqrt(2.0 / max(3.0 * count, 1.0))) * added, 1.0)
+    H = H.copy()
+    H[7, 7] -= known - rest**2 / known
+    return H
+
+
 def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which of the intervals [begin, end] (K,) lie, in part, between samples that are too far apart to be integrated over."""
     gap = np.flatnonzero(np.diff(time_ns) > _LONGEST_GAP_NS)
@@ -271,7 +299,7 @@ class _Refined:
         self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
         for _ in range(_ROUNDS):
             rate_imu = exact(self.offset_s)
-            slope = (exact(self.offset_s + 0.005) - exact(self.offset_s - 0.005)) / 0.01
+            slope = (exact(self.offset_s + _SLOPE_S) - exact(self.offset_s - _SLOPE_S)) / (2.0 * _SLOPE_S)
             seen = self.scale * rate_lidar @ self.R.T
             self.residual = rate_imu - seen - self.bias
             norm = np.linalg.norm(self.residual, axis=1)

@@ -121,3 +121,34 @@ def test_the_mounting_is_as_far_off_as_it_says(count: int, second: float) -> Non
     largest = np.degrees(np.array(known).max(axis=1))
     assert (largest > 40.0).all() if second < 0.01 else True
     assert np.median(largest) < 2.0 if second > 0.1 else True
+
+
+@pytest.mark.parametrize("amplitude_deg_s", [2.0, 5.0])
+@pytest.mark.parametrize("density", [0.0, 4e-4])
+def test_the_noise_of_a_gyroscope_brings_no_clocks_together(density: float, amplitude_deg_s: float) -> None:
+    """Rates that noise changes from sample to sample look as if an offset were well known, and zero."""
+    K, step_s, late_s, off = 80, 0.05, 0.035, []
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        R_imu_lidar, phase, hz = so3.exp(random.normal(size=3)), random.uniform(0.0, 6.0, 3), random.uniform(0.1, 0.4, 3)
+
+        def rate(time_s: np.ndarray, hz: np.ndarray = hz, phase: np.ndarray = phase) -> np.ndarray:
+            swing: np.ndarray = np.deg2rad(amplitude_deg_s) * np.sin(2.0 * np.pi * hz * time_s[:, None] + phase)
+            return swing
+
+        R = [np.eye(3)]
+        for turn in so3.exp(rate(np.arange(0.0025, K * step_s, 0.005)) * 0.005):
+            R.append(R[-1] @ turn)
+        R_path = np.array(R)[::10] @ so3.exp(2e-4 * random.normal(size=(K + 1, 3)))
+        zeros = np.zeros(K + 1)
+        time_ns = (np.arange(K + 1) * step_s * 1e9).astype(np.int64)
+        information = np.tile(1e6 * np.eye(6), (K + 1, 1, 1))
+        path = LidarPath(time_ns, R_path, np.zeros((K + 1, 3)), information, zeros.astype(int), zeros > 1.0, zeros, zeros, 0)
+        imu_s = np.arange(-0.7, K * step_s + 0.7, 0.005)
+        gyro = rate(imu_s) @ R_imu_lidar.T + density / np.sqrt(0.005) * random.normal(size=(len(imu_s), 3))
+        samples = ImuSamples(np.round((imu_s + late_s) * 1e9).astype(np.int64), gyro, np.zeros_like(gyro))
+        fit = compare_rotations(path, samples, R_imu_lidar)
+        assert fit is not None
+        off.append((fit.offset_s - late_s) / fit.offset_std_s)
+    assert np.max(np.abs(off)) < 4.0
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
