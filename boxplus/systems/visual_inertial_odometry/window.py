@@ -214,8 +214,8 @@ class Window:
         self._track = np.append(self._track, lone[chosen])
         self._anchor = np.append(self._anchor, numbers[anchor[chosen]])
         there = np.isfinite(pixels[:, chosen][..., 0]) & (anchor[chosen] <= np.arange(len(keyframes))[:, None])[:, :, None]
-        of, camera, k = np.nonzero(there.transpose(0, 2, 1))
-        self._seen.add(numbers[of], ids[k], camera, pixels[of, chosen[k], camera])
+        of, camera, which = np.nonzero(there.transpose(0, 2, 1))
+        self._seen.add(numbers[of], ids[which], camera, pixels[of, chosen[which], camera])
 
     def wants_keyframe(self, tracks: Tracks, pose: Floats) -> bool:
         """Whether a frame at the predicted pose (7,) shows enough that is new, or little of what is known."""
@@ -341,7 +341,7 @@ class Window:
         if self._views is not None:
             group, _ = self._views
             squares = (group.jacobians[-1][:, :, 2] ** 2).sum(axis=1)
-            information = np.bincount(group.connections[-1].rows, squares, len(self.points))
+            information[:] = np.bincount(group.connections[-1].rows, squares, len(self.points))
         return self._creep.weight / np.sqrt(np.maximum(information, 1e-12))
 
     def _remove_landmarks(self, gone: NDArray[np.bool_]) -> None:

@@ -292,7 +292,7 @@ class FeatureTracker:
 @kernel
 def _mean_and_deviation(grey: Grey) -> tuple[float, float]:
     """Mean and standard deviation of grey values (H, W)."""
-    total, squares, count = 0, 0, grey.size
+    total, squares, count = np.int64(0), np.int64(0), grey.size
     for row in range(grey.shape[0]):
         for column in range(grey.shape[1]):
             value = np.int64(grey[row, column])
