@@ -32,6 +32,7 @@ def chi_square_quantile(probability: float, dof: float) -> float:
     return _first(lambda x: chi_square_cdf(x, dof) >= probability, dof)
 
 
+@functools.lru_cache(maxsize=256)
 def chi_square_exceeded(probability: float, dof: float) -> float:
     """What it exceeds with this probability, be it small."""
     return _first(lambda x: chi_square_sf(x, dof) <= probability, dof)

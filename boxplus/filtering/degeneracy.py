@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.filtering.small_linalg import symmetric_eigen_into
+from boxplus.filtering.small_linalg import inverse_root_into, symmetric_eigen_into
 
 # No normal is known better than this [rad]: edges of the world are not that straight, and N must not vanish.
 _LEAST_TILT = 1e-3
@@ -98,25 +98,12 @@ def _directions_into(
     scale[:3] = 1.0 / lever_arm
     # The position rows carry unit normals: their trace is the sum of the weights.
     floor = max(_LEAST_TILT * _LEAST_TILT * (S[3, 3] + S[4, 4] + S[5, 5]), _TINY)
-    root, whitening = np.zeros((6, 6)), np.zeros((6, 6))
+    noise, whitening = np.empty((6, 6)), np.zeros((6, 6))
     for i in range(6):
-        for j in range(i + 1):
-            total = N[i, j] * scale[i] * scale[j] + (floor if i == j else 0.0)
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                root[i, i] = math.sqrt(total)
-            else:
-                root[i, j] = total / root[j, j]
-    for j in range(6):
-        whitening[j, j] = 1.0 / root[j, j]
-        for i in range(j + 1, 6):
-            total = 0.0
-            for k in range(j, i):
-                total -= root[i, k] * whitening[k, j]
-            whitening[i, j] = total / root[i, i]
+        for j in range(6):
+            noise[i, j] = N[i, j] * scale[i] * scale[j] + (floor if i == j else 0.0)
+    if not inverse_root_into(noise, whitening):
+        return False
     half, white = np.empty((6, 6)), np.empty((6, 6))
     for i in range(6):
         for j in range(6):
@@ -129,7 +116,7 @@ def _directions_into(
             for k in range(j + 1):
                 white[i, j] += half[i, k] * whitening[j, k]
             white[j, i] = white[i, j]
-    rotated = root
+    rotated = noise
     symmetric_eigen_into(white, ratios, rotated)
     for j in range(6):
         norm = 0.0

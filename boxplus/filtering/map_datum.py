@@ -249,9 +249,8 @@ def _along_world(M: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _turned(M: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    turned = M.copy()
-    turned[:3] = rotation @ turned[:3]
-    turned[:, :3] = turned[:, :3] @ rotation.T
+    turned = np.empty((6, 6))
+    _turn_into(np.ascontiguousarray(M), rotation.ravel(), turned)
     return turned
 
 

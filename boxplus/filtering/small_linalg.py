@@ -14,8 +14,8 @@ _OFF = 1e-32  # squared, what is left off the diagonal against what is on it
 
 
 @kernel
-def cholesky_inverse_into(A: NDArray[np.float64], inverse: NDArray[np.float64], work: NDArray[np.float64]) -> bool:
-    """inverse = A⁻¹ for symmetric positive definite A (n, n) by Cholesky; False, and nothing useful, if A is not."""
+def inverse_root_into(A: NDArray[np.float64], work: NDArray[np.float64]) -> bool:
+    """work = L⁻¹ below its diagonal, A = L Lᵀ symmetric positive definite (n, n); False, and nothing useful, if A is not."""
     n = A.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -36,6 +36,15 @@ def cholesky_inverse_into(A: NDArray[np.float64], inverse: NDArray[np.float64], 
             for k in range(j, i):
                 total -= work[i, k] * work[k, j]
             work[i, j] = total / work[i, i]
+    return True
+
+
+@kernel
+def cholesky_inverse_into(A: NDArray[np.float64], inverse: NDArray[np.float64], work: NDArray[np.float64]) -> bool:
+    """inverse = A⁻¹ for symmetric positive definite A (n, n) by Cholesky; False, and nothing useful, if A is not."""
+    if not inverse_root_into(A, work):
+        return False
+    n = A.shape[0]
     for i in range(n):
         for j in range(i + 1):
             total = 0.0

@@ -60,7 +60,7 @@ def between_keyframes(
     # An error on the right of T_place_query is one on the right of Z by the adjoint of the query's frame in its keyframe.
     back = se3.adjoint(se3.inverse(T_key_map[b]))
     information = np.swapaxes(back, 1, 2) @ loops.information @ back
-    is_told = _told(loops, time_ns, T_world_imu, keyframes, planes, seen, T_imu_lidar, information)
+    is_told = _told(loops, time_ns, T_world_imu, keyframes, keyframe[b], planes, seen, T_imu_lidar, information)
     return KeyframeLoops(keyframe[a], keyframe[b], RelativePose(Z, information=information), is_told)
 
 
@@ -69,6 +69,7 @@ def _told(
     time_ns: Ints,
     T_world_imu: Floats,
     keyframes: Keyframes,
+    query_keyframe: Ints,
     planes: PlaneMap,
     seen: KeyframeClusters,
     T_imu_lidar: Floats,
@@ -81,7 +82,6 @@ def _told(
     T_lidar = se3.compose(T_key, np.broadcast_to(T_imu_lidar, T_key.shape))[seen.keyframe]
     weight = seen.clusters[:, 3, 3]
     result = np.zeros(len(loops), dtype=np.bool_)
-    scan = np.clip(np.searchsorted(time_ns, loops.time_ns[loops.query]), 0, len(time_ns) - 1)
     for k, (place, query) in enumerate(zip(loops.place.tolist(), loops.query.tolist(), strict=True)):
         own, there = (
             np.bincount(seen.plane[stretch == number], weight[stretch == number], len(planes)) for number in (query, place)
@@ -92,7 +92,7 @@ def _told(
         # What the place knows of a plane, the query's clusters share as they have weight on it.
         plane = seen.plane[rows]
         share = np.minimum(1.0, there[plane] / own[plane])
-        T = T_key[keyframes.of_scan[scan[k]]]
+        T = T_key[query_keyframe[k]]
         H = _information(
             seen.clusters[rows] * share[:, None, None],
             se3.compose(se3.inverse(T), T_lidar[rows]),
