@@ -98,9 +98,9 @@ def _directions_into(
     scale[:3] = 1.0 / lever_arm
     # The position rows carry unit normals: their trace is the sum of the weights.
     floor = max(_LEAST_TILT * _LEAST_TILT * (S[3, 3] + S[4, 4] + S[5, 5]), _TINY)
-    noise, whitening = np.empty((6, 6)), np.zeros((6, 6))
+    noise, whitening = np.empty((6, 6)), np.empty((6, 6))  # their lower triangles
     for i in range(6):
-        for j in range(6):
+        for j in range(i + 1):
             noise[i, j] = N[i, j] * scale[i] * scale[j] + (floor if i == j else 0.0)
     if not inverse_root_into(noise, whitening):
         return False

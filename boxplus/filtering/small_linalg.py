@@ -14,28 +14,31 @@ _OFF = 1e-32  # squared, what is left off the diagonal against what is on it
 
 
 @kernel
-def inverse_root_into(A: NDArray[np.float64], work: NDArray[np.float64]) -> bool:
-    """work = L⁻¹ below its diagonal, A = L Lᵀ symmetric positive definite (n, n); False, and nothing useful, if A is not."""
+def inverse_root_into(A: NDArray[np.float64], root: NDArray[np.float64]) -> bool:
+    """The lower triangle of `root` is L⁻¹, A = L Lᵀ symmetric positive definite (n, n); False, and nothing useful, if A is not.
+
+    Neither the upper triangle of A is read nor that of `root` written.
+    """
     n = A.shape[0]
     for i in range(n):
         for j in range(i + 1):
             total = A[i, j]
             for k in range(j):
-                total -= work[i, k] * work[j, k]
+                total -= root[i, k] * root[j, k]
             if i == j:
                 if not total > 0.0:
                     return False
-                work[i, i] = math.sqrt(total)
+                root[i, i] = math.sqrt(total)
             else:
-                work[i, j] = total / work[j, j]
-    # work <- L⁻¹, in place, column by column.
+                root[i, j] = total / root[j, j]
+    # root <- L⁻¹, in place, column by column.
     for j in range(n):
-        work[j, j] = 1.0 / work[j, j]
+        root[j, j] = 1.0 / root[j, j]
         for i in range(j + 1, n):
             total = 0.0
             for k in range(j, i):
-                total -= work[i, k] * work[k, j]
-            work[i, j] = total / work[i, i]
+                total -= root[i, k] * root[k, j]
+            root[i, j] = total / root[i, i]
     return True
 
 

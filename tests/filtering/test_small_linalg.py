@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.filtering.small_linalg import cholesky_inverse_into, symmetric_eigen_into
+from boxplus.filtering.small_linalg import cholesky_inverse_into, inverse_root_into, symmetric_eigen_into
 from tests.filtering.random_states import random_covariance
 
 seeds = st.integers(0, 2**32 - 1)
@@ -23,11 +23,25 @@ def test_against_lapack(seed: int, size: int) -> None:
     assert np.allclose(inverse * np.outer(sigma, sigma), scaled * np.outer(sigma, sigma), rtol=1e-8, atol=1e-8)
 
 
+@given(seeds, st.sampled_from([1, 3, 6, 24]))
+def test_root_of_the_inverse_whitens(seed: int, size: int) -> None:
+    """From the lower triangle of A alone, into that of the root alone."""
+    A = random_covariance(np.random.default_rng(seed), size)
+    sigma = np.sqrt(A.diagonal())
+    A /= np.outer(sigma, sigma)
+    root = np.full_like(A, np.nan)
+    assert inverse_root_into(np.where(np.tri(size) > 0.0, A, np.nan), root)
+    assert np.isnan(root[np.triu_indices(size, 1)]).all()
+    lower = np.tril(np.nan_to_num(root))
+    assert np.allclose(lower @ A @ lower.T, np.eye(size), atol=1e-8)
+
+
 @pytest.mark.parametrize(
     "A", [np.zeros((3, 3)), np.diag([1.0, -1.0, 1.0]), np.ones((3, 3)) - 2.0 * np.eye(3), np.full((3, 3), np.nan)]
 )
 def test_what_is_not_positive_definite_is_refused(A: np.ndarray) -> None:
     assert not cholesky_inverse_into(A, np.zeros((3, 3)), np.zeros((3, 3)))
+    assert not inverse_root_into(A, np.zeros((3, 3)))
 
 
 @given(seeds, st.sampled_from([1, 2, 6, 12]), st.sampled_from([0, 1, 3]))
