@@ -158,15 +158,18 @@ def test_that_nothing_shows_the_speed_is_no_false_alarm_where_the_run_behaves_li
     said = summary_of(
         "the surroundings do not show whether the platform moves along (+1.00, +0.00, +0.00) (LiDAR axes): taken as"
     )
+    vague = summary_of(said.warnings[0].text, "by its own covariance the run knows its last position to 9.1 m (1 sigma) only")
     more = summary_of(said.warnings[0].text, "gyroscope x saturated")
     sure, wide, weak = estimate_of(simulation, 3.0), estimate_of(simulation, 3.0, 2.0), estimate_of(simulation, 3.0, weak=True)
     for place, summary, estimate, alarm in (
         (featureless, said, wide, ""),
         (featureless, said, weak, ""),
+        (featureless, vague, weak, ""),
         (featureless, said, estimate_of(simulation), ""),
         (featureless, said, sure, "flagged"),
         (featureless, more, wide, "flagged"),
         (draw, said, wide, "flagged"),
+        (draw, vague, wide, "flagged"),
     ):
         errors = judge.errors_of(estimate, simulation)
         assert judge.judge(judge.Outcome(0, None, summary, estimate), errors, place).false_alarm == alarm

@@ -66,7 +66,9 @@ _OPTION_CAUSES = {
 }
 _UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
 _WEAK = re.compile(r"scans are weak")
-_NOT_SHOWN = re.compile(r"^the surroundings do not show whether the platform moves along")
+_NOT_SHOWN = re.compile(
+    r"^the surroundings do not show whether the platform moves along|^by its own covariance the run knows its last"
+)
 _REFUSED_FOR_IT = re.compile(r"and the surroundings do not show how (fast )?the platform (moves|turns)")
 
 

@@ -306,6 +306,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 *(WarningFacts(text=text, count=1) for text in self._odometry.time_steps),
                 *lidar_warnings(lidars, self._recording.time_steps),
                 *statistics.status_warnings(),
+                *statistics.vague_warnings(self._mounting_sigma),
                 *statistics.warnings.facts(origin),
                 *(
                     WarningFacts(text=f"{e.key}: {e.text}", count=1)
@@ -327,6 +328,14 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         if not self._extrinsic.unknown or not isinstance(self._odometry, LidarInertialOdometry):
             return None
         return None if self._odometry.mounting_borne_out else self._extrinsic.unknown
+
+    @property
+    def _mounting_sigma(self) -> tuple[float, float] | None:
+        """Of T_imu_lidar at first, rotation [deg] and translation [m]; None where it is taken for exact or there is no IMU."""
+        odometry = self._config.odometry
+        if self._extrinsic.source == "none" or odometry.extrinsic_estimation == "off":
+            return None
+        return odometry.extrinsic_rotation_sigma_deg, odometry.extrinsic_translation_sigma
 
     def _timing(self) -> TimingFacts:
         return TimingFacts(

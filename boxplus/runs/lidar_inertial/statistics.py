@@ -7,10 +7,12 @@ from collections import Counter
 import numpy as np
 
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
-from boxplus.runs.run_facts import Gap
+from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+
+_VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 
 
 class RunStatistics(EstimateStatistics):
@@ -21,6 +23,7 @@ class RunStatistics(EstimateStatistics):
         self.scans_read = 0
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
+        self._position_sigma_m = 0.0
         self._scan_gaps = GapWatch()
 
     def add_event(self, event: Scan | ImuSamples) -> None:
@@ -39,10 +42,36 @@ class RunStatistics(EstimateStatistics):
         for text in estimate.warnings:
             self.warnings.add(text, estimate.time_ns)
         self.T_imu_lidar[:3, :3], self.T_imu_lidar[:3, 3] = estimate.state.R_imu_lidar, estimate.state.p_imu_lidar
+        self._position_sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.pose_covariance[3:, 3:])[-1], 0.0)))
+
+    def vague_warnings(self, mounting_sigma: tuple[float, float] | None) -> list[WarningFacts]:
+        """A warning where the run ends at a position that it does not claim to know, with what may be behind it.
+
+        Args:
+            mounting_sigma: how uncertain T_imu_lidar was at first, rotation [deg] and translation [m]; None where it is taken for
+                exact.
+        """
+        if self._position_sigma_m <= max(_VAGUE_M, _VAGUE_SHARE * self.path_length_m):
+            return []
+        open_scans, why = self.count - self.status["ok"], []
+        if mounting_sigma is not None:
+            turn, arm = mounting_sigma
+            why.append(f"T_imu_lidar was known to {turn:.2g} deg and {arm * 100:.2g} cm only (give --T-imu-lidar)")
+        if open_scans:
+            why.append(f"{open_scans} of {self.count} scans left directions open")
+        text = (
+            f"by its own covariance the run knows its last position to {_length(self._position_sigma_m)} (1 sigma) only, after a "
+            f"way of {_length(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
+        )
+        return [WarningFacts(text=text, count=1)]
 
     def scan_gaps(self) -> list[Gap]:
         """Intervals between the ends of scans more than three times the usual one."""
         return self._scan_gaps.gaps(self.first_time_ns or 0) if self.first_time_ns is not None else []
+
+
+def _length(metres: float) -> str:
+    return f"{metres * 100:.0f} cm" if metres < 1.0 else f"{metres:.1f} m"
 
 
 def _trouble(estimate: Estimate) -> str:

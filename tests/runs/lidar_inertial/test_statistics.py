@@ -1,0 +1,88 @@
+"""A run that does not claim to know where it ended says so, and no other one does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from boxplus.filtering.nav_state import TANGENT, NavState
+from boxplus.manifolds import so3
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.lidar_inertial.statistics import RunStatistics
+from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation.live_recording import as_recording
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status
+
+
+def estimate(scan: int, p: np.ndarray, P: np.ndarray, status: Status = "ok") -> Estimate:
+    x = NavState.identity().pack()
+    x[9:12] = p
+    state, nothing = NavState.unpack(x), np.zeros((0, 3), dtype=np.float32)
+    return Estimate(
+        time_ns=scan * 100_000_000,
+        state=state,
+        covariance=np.zeros((TANGENT, TANGENT)),
+        pose_covariance=P,
+        status=status,
+        weak_directions=(),
+        lidar_share=np.ones(6),
+        points_raw=0,
+        points_filtered=0,
+        points_used=0,
+        rejected={},
+        residual_rms=0.0,
+        iterations=1,
+        converged=True,
+        warnings=(),
+        timing_s={},
+        p_lidar=nothing,
+        intensity=None,
+    )
+
+
+def straight(way_m: float, sigma_m: float, axis: np.ndarray, statuses: tuple[Status, ...] = ("ok",) * 5) -> RunStatistics:
+    """A way of some length, whose last position is known to `sigma_m` along a direction (3,), a hundred times better across it."""
+    statistics = RunStatistics()
+    turn = so3.exp(np.cross([0.0, 0.0, 1.0], axis / np.linalg.norm(axis)))
+    P = np.zeros((6, 6))
+    P[3:, 3:] = turn @ np.diag(np.array([0.01, 0.01, 1.0]) * sigma_m) ** 2 @ turn.T
+    for scan, status in enumerate(statuses):
+        last = scan == len(statuses) - 1
+        statistics.add(estimate(scan, np.array([way_m * scan / (len(statuses) - 1), 0.0, 0.0]), P if last else 100.0 * P, status))
+    return statistics
+
+
+@given(st.floats(0.0, 500.0), st.floats(0.0, 20.0), st.integers(0, 1000))
+def test_a_warning_where_and_only_where_the_last_position_is_vague(way_m: float, sigma_m: float, seed: int) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    limit = max(0.05, 0.02 * way_m)
+    if not 0.999 < sigma_m / limit < 1.001:
+        assert bool(straight(way_m, sigma_m, axis).vague_warnings(None)) == (sigma_m > limit)
+
+
+def test_what_may_be_behind_it_is_said() -> None:
+    vague = straight(8.0, 0.31, np.ones(3), ("ok", "ok", "weak", "weak", "ok"))
+    (warning,) = vague.vague_warnings((1.75, 0.3))
+    assert warning.text == (
+        "by its own covariance the run knows its last position to 31 cm (1 sigma) only, after a way of 8.0 m: T_imu_lidar was "
+        "known to 1.8 deg and 30 cm only (give --T-imu-lidar), and 2 of 5 scans left directions open"
+    )
+    (warning,) = straight(8.0, 12.0, np.ones(3)).vague_warnings(None)
+    assert "to 12.0 m (1 sigma) only" in warning.text
+    assert warning.text.endswith("its start, its IMU and what it saw tell no more")
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_lever_arm_that_nobody_gave_is_told(tmp_path: Path, given: bool) -> None:
+    """A turn about one axis shows it only in part, and moves the path by as much."""
+    recording = as_recording(simulate("spin", duration_s=6.0, lidar=SpinningLidar(azimuth_steps=300)))
+    if not given:
+        recording.info.T_imu_lidar = None
+    summary = run_odometry(recording, tmp_path / "out")
+    told = [warning.text for warning in summary.warnings if "by its own covariance" in warning.text]
+    assert len(told) == (0 if given else 1)
+    assert all("T_imu_lidar was known to" in text for text in told)
