@@ -8,6 +8,7 @@ from pathlib import Path
 from boxplus.errors import RecordingError
 from boxplus.recordings.bags.container import READ_ERRORS, Container
 from boxplus.recordings.bags.indexed import IndexedContainer, rosbags_errors
+from boxplus.recordings.bags.parts import bag_files, is_described, recordings_among
 from boxplus.recordings.bags.sequential import open_sequential
 
 _LOG = logging.getLogger(__name__)
@@ -20,24 +21,16 @@ def open_container(path: Path) -> Container:
     """Open a bag, an MCAP file or a ROS 2 folder; one without a usable index is read from front to back.
 
     Raises:
-        RecordingError: not such a file, or nothing in it can be read.
+        RecordingError: not such a file, a folder with several recordings, or nothing in it can be read.
     """
-    files = [path]
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
-        if not files:
-            raise RecordingError(
-                "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
-                f"{path.name} with {', '.join(sorted(file.name for file in path.iterdir())[:5]) or 'nothing in it'}",
-                "give the folder that holds them; of ROS 1 bags give one file; folders of images are for open_camera_recording",
-            )
+    files = _parts(path) if path.is_dir() and not is_described(path) else [path]
     try:
         return IndexedContainer(path, files)
     except READ_ERRORS + rosbags_errors() as error:
         reason = str(error) or type(error).__name__
     _LOG.info("%s has no usable index (%s): reading it from front to back", path, reason)
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+        files = bag_files(path)
     container = open_sequential(files)
     if container is None:
         raise RecordingError(
@@ -48,3 +41,22 @@ def open_container(path: Path) -> Container:
     if container.damage or not any(benign in reason for benign in _HEALTHY_ALL_THE_SAME):
         container.damage.append(f"the index cannot be used ({reason}); the messages were collected from front to back")
     return container
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The files of a folder that its recorder has not described, in order."""
+    recordings = recordings_among(bag_files(folder))
+    if not recordings:
+        raise RecordingError(
+            "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
+            f"{folder.name} with {', '.join(sorted(file.name for file in folder.iterdir())[:5]) or 'nothing in it'}",
+            "give the folder that holds them; of ROS 1 bags give one file; folders of images are for open_camera_recording",
+        )
+    if len(recordings) > 1:
+        first, second = recordings[0][-1], recordings[1][0]
+        raise RecordingError(
+            "one recording: a folder with metadata.yaml, or with files NAME_0, NAME_1, … that follow each other without a gap",
+            f"{folder.name} with {len(recordings)} recordings: {second.name} does not go on where {first.name} ends",
+            "give one of the files; 'boxplus lio' and 'boxplus fleet run' take all of a folder, each as a recording of its own",
+        )
+    return recordings[0]

@@ -51,16 +51,20 @@ def open_sequential(files: list[Path]) -> SequentialContainer | None:
     return container if any(channel.count for channel in container.channels) else None
 
 
+def first_time_ns(file: Path) -> int | None:
+    """When the first message of a file was received; None where none can be read."""
+    return next((time_ns for _, time_ns, _ in _read([file], [])), None)
+
+
 class SequentialContainer:
     """Files read in order; the first pass, on opening, counts what is readable."""
 
     def __init__(self, files: list[Path]) -> None:
         self._files = files
-        self._errors = READ_ERRORS + foreign_errors()
         self.damage: list[str] = []
         self.start_ns, self.end_ns = 2**63 - 1, 0
         counts: dict[tuple[str, str, str], int] = {}
-        for connection, time_ns, _ in self._read(self.damage):
+        for connection, time_ns, _ in _read(self._files, self.damage):
             key = connection.topic, connection.type, connection.encoding
             counts[key] = counts.get(key, 0) + 1
             self.start_ns, self.end_ns = min(self.start_ns, time_ns), max(self.end_ns, time_ns + 1)
@@ -73,29 +77,32 @@ class SequentialContainer:
         self.format = kinds.get(files[0].suffix, "ROS 1 bag") if files else ""
 
     def messages(self, topics: frozenset[str], start_ns: int, stop_ns: int) -> Iterator[tuple[Channel, int, bytes]]:
-        for connection, time_ns, data in self._read(self.damage):
+        for connection, time_ns, data in _read(self._files, self.damage):
             if connection.topic in topics and start_ns <= time_ns < stop_ns:
                 yield self._channels[connection.topic, connection.type], time_ns, data
 
-    def _read(self, damage: list[str]) -> Iterator[tuple[_Connection, int, bytes]]:
-        for file in self._files:
-            connections: dict[int, _Connection] = {}
-            position = 0
-            try:
-                with file.open("rb") as stream:
-                    for record in _scanner(stream)(stream):
-                        position = stream.tell()
-                        if record is None:
-                            damage.append(f"{file.name}: a damaged block before byte {position} was skipped")
-                        elif isinstance(record, _Connection):
-                            connections[record.channel] = record
-                        elif record.channel in connections:
-                            yield connections[record.channel], record.time_ns, record.data
-            except self._errors as error:
-                damage.append(f"{file.name} is readable up to byte {position} only ({str(error) or type(error).__name__})")
-
     def close(self) -> None:
         """Nothing is held open between passes."""
+
+
+def _read(files: list[Path], damage: list[str]) -> Iterator[tuple[_Connection, int, bytes]]:
+    """Messages of all files, each as far as it can be read."""
+    errors = READ_ERRORS + foreign_errors()
+    for file in files:
+        connections: dict[int, _Connection] = {}
+        position = 0
+        try:
+            with file.open("rb") as stream:
+                for record in _scanner(stream)(stream):
+                    position = stream.tell()
+                    if record is None:
+                        damage.append(f"{file.name}: a damaged block before byte {position} was skipped")
+                    elif isinstance(record, _Connection):
+                        connections[record.channel] = record
+                    elif record.channel in connections:
+                        yield connections[record.channel], record.time_ns, record.data
+        except errors as error:
+            damage.append(f"{file.name} is readable up to byte {position} only ({str(error) or type(error).__name__})")
 
 
 def _scanner(stream: BinaryIO) -> _Scanner:

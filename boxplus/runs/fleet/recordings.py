@@ -6,24 +6,27 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from boxplus.errors import InputError
+from boxplus.recordings.bags.parts import SUFFIXES, bag_files, is_described, recordings_among
 
-_PARTS = (".mcap", ".db3")
-_SUFFIXES = (".bag", *_PARTS, ".pcap", ".pcapng")
+_SUFFIXES = (".bag", *SUFFIXES, ".pcap", ".pcapng")
 _LISTS = (".txt", ".list")
 
 
 def find_recordings(path: str | Path) -> dict[str, Path]:
     """Recordings by name, in order: those in a folder, or those that the lines of a text file name.
 
+    A folder with `metadata.yaml`, or with nothing but the parts of one recording, NAME_0, NAME_1, …, that follow each other
+    without a gap, is one recording, as it is to `open_recording`; any other one holds as many as it has files and folders of
+    recordings.
     Lines are paths, relative ones to the file; empty ones and those that begin with # are left out. Names are those of the files,
     with a number where two are alike.
 
     Raises:
-        InputError: no such folder or file, none in it, one that is not there, or a URL.
+        InputError: no such folder or file, none in it, one that is not there, parts of one beside others, or a URL.
     """
     base = Path(path)
     if base.is_dir():
-        found = sorted(entry for entry in base.iterdir() if _is_recording(entry))
+        found = _entries(base)
         advice = f"put bags, MCAP files, captures ({', '.join(_SUFFIXES)}) or folders of ROS 2 or KITTI into it, or give a list"
         if not found:
             raise InputError("a folder with recordings", f"none in {base}", advice)
@@ -47,11 +50,7 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
 def holds_recordings(path: str | Path) -> bool:
     """Whether it is a folder of recordings, and no recording itself to `open_recording`."""
     folder = Path(path)
-    if not folder.is_dir() or _is_recording(folder):
-        return False
-    # Parts of a ROS 2 bag without metadata.yaml are one recording to the readers, and stay one.
-    loose = {entry.suffix.lower() for entry in folder.iterdir() if entry.is_file() and _is_recording(entry)}
-    return any(map(_is_recording, folder.iterdir())) and not (loose and loose <= set(_PARTS))
+    return folder.is_dir() and not _is_recording(folder) and any(map(_is_recording, folder.iterdir()))
 
 
 def named(recordings: Iterable[Path]) -> dict[str, Path]:
@@ -68,6 +67,27 @@ def named(recordings: Iterable[Path]) -> dict[str, Path]:
 
 
 def _is_recording(entry: Path) -> bool:
-    if entry.is_dir():
-        return (entry / "metadata.yaml").is_file() or (entry / "velodyne_points").is_dir()
-    return entry.suffix.lower() in _SUFFIXES
+    if not entry.is_dir():
+        return entry.suffix.lower() in _SUFFIXES
+    return is_described(entry) or (entry / "velodyne_points").is_dir() or _is_undescribed(entry)
+
+
+def _is_undescribed(folder: Path) -> bool:
+    """Whether an interrupted recorder has left the parts of one recording there, and there is no other one beside them."""
+    parts = bag_files(folder)
+    others = (entry for entry in folder.iterdir() if entry not in parts and _is_recording(entry))
+    return bool(parts) and not any(others) and len(recordings_among(parts)) == 1
+
+
+def _entries(folder: Path) -> list[Path]:
+    """The recordings in a folder, or itself."""
+    if _is_recording(folder):
+        return [folder]
+    for parts in recordings_among(bag_files(folder)):
+        if len(parts) > 1:
+            raise InputError(
+                "recordings of one file each, or in a folder of their own",
+                f"{len(parts)} parts of one, {parts[0].name} to {parts[-1].name}, beside others in {folder}",
+                "put them into a folder of their own",
+            )
+    return sorted(entry for entry in folder.iterdir() if _is_recording(entry))

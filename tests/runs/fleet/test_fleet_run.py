@@ -228,8 +228,11 @@ def test_parts_of_a_bag_without_metadata_are_one_recording(tmp_path: Path) -> No
     for name in ("part_0.mcap", "part_1.mcap"):
         (parts / name).touch()
     assert not holds_recordings(parts)
+    assert list(find_recordings(parts)) == ["parts"]
     (parts / "other.bag").touch()
     assert holds_recordings(parts)
+    with pytest.raises(InputError, match=r"2 parts of one, part_0.mcap to part_1.mcap, .* a folder of their own"):
+        find_recordings(parts)
     ros2 = tmp_path / "days" / "monday"
     ros2.mkdir(parents=True)
     (ros2 / "metadata.yaml").touch()
