@@ -82,7 +82,7 @@ def _cubic(c: NDArray[np.float64], k: int, s: float) -> float:
     return value
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _move(
     points: NDArray[np.float32],
     time_ns: NDArray[np.int64],

@@ -32,7 +32,7 @@ def copy_rows(J: NDArray[np.float64], rows: NDArray[np.int64], first: int, packe
                 packed[n, i, np.uint64(first) + j] = J[row, i, j]
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def eliminate_columns(
     A: NDArray[np.float64],
     X: NDArray[np.float64],
@@ -100,8 +100,6 @@ def eliminate_columns(
     return np.int64(rank)
 
 
-# Inlined: of a helper's copies in several libraries a process runs the one it loads first, and the sums of its own one are in
-# another order, so that the process that compiled it would have other bits than all later ones.
 @kernel(fastmath=True, inline=True)
 def _reflect(
     A: NDArray[np.float64],
@@ -153,7 +151,7 @@ def _reflection(B: NDArray[np.float64], c: np.uint64, rows: np.uint64, triangle:
     return above - diagonal, -1.0 / (diagonal * (above - diagonal))
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def merge_batch(B: NDArray[np.float64], start: int, stop: int, used: int, triangle: NDArray[np.float64]) -> None:
     """triangle ← R of [triangle; rows of B], four reflections at a time; B is used up and left at zero.
 
@@ -199,7 +197,7 @@ def merge_batch(B: NDArray[np.float64], start: int, stop: int, used: int, triang
             B[j, i] = 0.0
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def _reflect_four(
     B: NDArray[np.float64],
     c: np.uint64,

@@ -66,7 +66,7 @@ def _sample(values: NDArray[np.float64], k: int, share: float, bias: NDArray[np.
     )
 
 
-@kernel(fastmath=True)
+@kernel(fastmath=True, inline=True)
 def integrate_interval(
     time_ns: NDArray[np.int64],
     gyro: NDArray[np.float64],

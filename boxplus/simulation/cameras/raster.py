@@ -245,7 +245,7 @@ def _sky(dz: float) -> float:
     return 0.75 + 0.2 * max(dz, 0.0)
 
 
-@kernel(borrow=True, fastmath=True)
+@kernel(borrow=True, fastmath=True, inline=True)
 def _radiance(
     solid: Floats, surface: Floats, pyramids: Pictures, offsets: Indices, pixels_per_m: float, t: float,
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float,

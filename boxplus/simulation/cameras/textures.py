@@ -145,7 +145,7 @@ def _bilinear(pyramids: Pictures, begin: np.uint32, level: int, x: float, y: flo
     return value
 
 
-@kernel(borrow=True, fastmath=True)
+@kernel(borrow=True, fastmath=True, inline=True)
 def read_round(pyramids: Pictures, offsets: NDArray[np.uint32], picture: np.uint32, width: float, x: float, y: float) -> float:
     """A picture at (x, y), in its pixels, seen through a round filter about `width` of its pixels wide."""
     begin = picture * offsets[LEVELS]
@@ -160,7 +160,7 @@ def read_round(pyramids: Pictures, offsets: NDArray[np.uint32], picture: np.uint
     return value
 
 
-@kernel(borrow=True, fastmath=True)
+@kernel(borrow=True, fastmath=True, inline=True)
 def read_filtered(
     pyramids: Pictures, offsets: NDArray[np.uint32], picture: np.uint32,
     x: float, y: float, xu: float, yu: float, xv: float, yv: float,
