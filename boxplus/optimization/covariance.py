@@ -19,6 +19,7 @@ from boxplus.optimization.observability.variable_names import variable_names
 from boxplus.optimization.terms.tangents import to_own_tangent
 from boxplus.optimization.terms.variables import VariableRows
 from boxplus.sparse.cholesky import NotPositiveDefinite
+from boxplus.sparse.inverse_blocks import split_blocks
 
 
 class Covariances:
@@ -32,7 +33,7 @@ class Covariances:
     def __init__(self, problem: LeastSquares, values: Values) -> None:
         self._problem, self._values = problem, values
         self._space: NullSpace | None = None
-        self._is_factorized = False
+        self._factorization = -1  # of the problem, when it was that of H here
 
     def blocks(self, first: VariableRows, second: VariableRows, is_determined: bool = False) -> NDArray[np.float64]:
         """Blocks (k, dof of first, dof of second) of H⁻¹ for pairs of variables; zero where one of them is fixed.
@@ -49,15 +50,19 @@ class Covariances:
         i, j = self._problem.layout.numbers(first), self._problem.layout.numbers(second)
         free = np.flatnonzero((i >= 0) & (j >= 0))
         self._prepare(np.concatenate([i[free], j[free]]), is_determined)
-        blocks = np.zeros((len(first), first.block.manifold.dof, second.block.manifold.dof))
-        for k, block in zip(free, self._problem.system.inverse_blocks(i[free], j[free]), strict=True):
-            blocks[k] = block
+        shape = (-1, first.block.manifold.dof, second.block.manifold.dof)
+        blocks = self._problem.system.inverse_values(i[free], j[free]).reshape(shape)
+        if len(free) < len(first):
+            known, blocks = blocks, np.zeros((len(first), *shape[1:]))
+            blocks[free] = known
         to_first, to_second = self._to_own(first), self._to_own(second)
         if to_first is not None:
             blocks = to_first @ blocks
         if to_second is not None:
             blocks = blocks @ np.swapaxes(to_second, 1, 2)
-        return blocks * self._moving(first)[:, :, None] * self._moving(second)[:, None, :]
+        if first.block.is_held is not None or second.block.is_held is not None:
+            blocks *= self._moving(first)[:, :, None] * self._moving(second)[:, None, :]
+        return blocks
 
     def _moving(self, rows: VariableRows) -> NDArray[np.float64]:
         """(k, dof) 0 for components that are held, which are known, else 1."""
@@ -116,7 +121,8 @@ class Covariances:
         self._prepare(number[free], is_determined)
         matrix = np.zeros((int(start[-1]), int(start[-1])))
         a, b = (free[k] for k in np.tril_indices(len(free)))
-        for p, q, block in zip(a, b, self._problem.system.inverse_blocks(number[a], number[b]), strict=True):
+        values = self._problem.system.inverse_values(number[a], number[b])
+        for p, q, block in zip(a, b, split_blocks(values, dof[a], dof[b]), strict=True):
             matrix[start[p] : start[p + 1], start[q] : start[q + 1]] = block
             matrix[start[q] : start[q + 1], start[p] : start[p + 1]] = block.T
         first = 0
@@ -134,33 +140,34 @@ class Covariances:
     def _prepare(self, wanted: NDArray[np.int64], is_determined: bool = False) -> None:
         """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""
         problem = self._problem
-        if is_determined and not self._is_factorized and self._is_where_it_was_solved():
+        if is_determined and self._space is None and self._is_where_it_was_solved():
+            if self._factorization == problem.factorization:
+                return
             try:
                 problem.factorize(None)
+                self._factorization = problem.factorization
                 return
             except NotPositiveDefinite:  # it is not: see why
                 pass
         if problem.values is not self._values:
             problem.start(self._values)
-            self._is_factorized = False
         if self._space is None:
             self._space = find_null_space(problem)
-            self._is_factorized = False
         moved = np.unique(wanted[self._space.moves[wanted]])
         if len(moved):
             raise SingularProblemError(
                 f"no covariance of {variable_names(problem.layout, moved)}: " + explain_singularity(problem, space=self._space)
             )
-        if self._is_factorized:
+        if self._factorization == problem.factorization:
             return
         held = np.zeros(problem.layout.dof)
         own = problem.system.diagonal[self._space.pivots]
         held[self._space.pivots] = np.where(own > 0.0, own, 1.0)
         try:
-            problem.system.factorize(held if len(self._space.pivots) else None)
+            problem.factorize(held if len(self._space.pivots) else None)
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(problem, error, self._space)) from error
-        self._is_factorized = True
+        self._factorization = problem.factorization
 
     def _is_where_it_was_solved(self) -> bool:
         """Whether nothing was linearised elsewhere since."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import BoxplusError, InputError
 from boxplus.sparse.block_matrix import BlockPattern
-from boxplus.sparse.inverse_blocks import SelectedInverse, locate_blocks
+from boxplus.sparse.inverse_blocks import SelectedInverse, locate_blocks, split_blocks
 from boxplus.sparse.numeric_factor import NumericFactor
 from boxplus.sparse.ordering import Method, order
 from boxplus.sparse.supernodes import Fronts, lay_out
@@ -209,30 +209,35 @@ class SparseCholesky:
         Raises:
             InputError: a variable out of range, arrays of different lengths, or nothing is factorised.
         """
-        self._require_factor()
         i, j = (np.atleast_1d(np.asarray(a, np.int64)) for a in (i, j))
+        values, sizes = self.inverse_values(i, j), self.pattern.sizes
+        return split_blocks(values, sizes[i], sizes[j])
+
+    def inverse_values(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+        """What `inverse_blocks` gives, as one array: block after block, each of them row-major."""
+        self._require_factor()
         n = len(self.pattern.sizes)
         if i.shape != j.shape or i.ndim != 1 or (len(i) and (min(i.min(), j.min()) < 0 or max(i.max(), j.max()) >= n)):
             raise InputError(f"pairs of variables from 0 to {n - 1}", f"{i} and {j}", "give two flat arrays of the same length")
-        blocks: list[NDArray[np.float64]] = [np.empty(0)] * len(i)
+        start, sizes = self.pattern.start, self.pattern.sizes
+        ends = np.cumsum(sizes[i] * sizes[j])
+        found = np.empty(int(ends[-1]) if len(ends) else 0)
         place = np.full(len(i), -1)
         if self._selected is not None or len(np.unique(j)) > SOLVED_VARIABLES:
             place = locate_blocks(self._fronts, i, j)
-        known = np.flatnonzero(place >= 0)
-        if len(known):
+        solved = np.flatnonzero(place < 0)
+        if len(solved) < len(i):
             if self._selected is None:
                 self._selected = SelectedInverse(self._fronts, self._factor.panels, self._factor.inverse, self._factor.stack)
-            for k, block in zip(known, self._selected.blocks(place[known], i[known], j[known]), strict=True):
-                blocks[k] = block
-        solved = np.flatnonzero(place < 0)
-        start, sizes = self.pattern.start, self.pattern.sizes
+            self._selected.read(place, i, j, found)
         for column in np.unique(j[solved]):
             unit = np.zeros((len(self._factor.pivots), sizes[column]))
             unit[start[column] : start[column + 1]] = np.eye(sizes[column])
             x = self.solve(unit)
             for k in solved[j[solved] == column]:
-                blocks[k] = x[start[i[k]] : start[i[k] + 1]].copy()
-        return blocks
+                block = x[start[i[k]] : start[i[k] + 1]]
+                found[ends[k] - block.size : ends[k]] = block.reshape(-1)
+        return found
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of H.

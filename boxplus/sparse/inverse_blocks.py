@@ -149,15 +149,19 @@ def _locate(first: Indices, second: Indices, scalar_of: Indices, front_of: Indic
 
 
 @kernel
-def _read(panels: Buffer, place: Indices, ld: Indices, rows: NDArray[np.int64], columns: NDArray[np.int64],
+def _read(panels: Buffer, place: NDArray[np.int64], ld: Indices, rows: NDArray[np.int64], columns: NDArray[np.int64],
           kind: NDArray[np.int64], found: Buffer) -> None:  # fmt: skip
-    """Blocks from the panels, row-major, one after another; `kind` as for the blocks of the matrix."""
+    """Blocks from the panels, row-major, one after another, those without a place left out; `kind` as of the matrix."""
     at = np.uint64(0)
     for k in range(np.uint64(len(place))):
+        if place[k] < 0:
+            at += np.uint64(rows[k] * columns[k])
+            continue
+        first = np.uint64(place[k])
         for i in range(np.uint64(rows[k])):
             for j in range(np.uint64(columns[k])):
                 low, high = (i, j) if kind[k] == TRANSPOSED or (kind[k] == DIAGONAL and j > i) else (j, i)
-                found[at] = panels[place[k] + high + low * ld[k]]
+                found[at] = panels[first + high + low * ld[k]]
                 at += _ONE
 
 
@@ -180,19 +184,24 @@ class SelectedInverse:
             np.empty(triangle), np.empty(triangle), np.empty(rectangle), np.empty(rectangle),
         )  # fmt: skip
 
-    def blocks(self, place: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """The blocks of the pairs of variables (i, j) at places that `locate_blocks` found."""
+    def read(self, place: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64], found: Buffer) -> None:
+        """Write the blocks of the pairs of variables (i, j) at places that `locate_blocks` found, row-major, one after another.
+
+        Args:
+            found: where; what belongs to pairs without a place, -1, stays as it is.
+        """
         fronts = self._fronts
-        rows, columns = fronts.sizes[i], fronts.sizes[j]
-        ends = np.cumsum(rows * columns)
-        found = np.empty(int(ends[-1]) if len(ends) else 0)
         lower = fronts.scalar_of[i] > fronts.scalar_of[j]
         ld = fronts.table["panel_ld"][fronts.front_of[np.where(lower, j, i)]]
         kind = np.where(i == j, DIAGONAL, np.where(lower, STORED, TRANSPOSED))
-        _read(self._panels, place.astype(np.uint64), ld, rows, columns, kind, found)
-        return [
-            found[e - r * c : e].reshape(r, c) for e, r, c in zip(ends.tolist(), rows.tolist(), columns.tolist(), strict=True)
-        ]
+        _read(self._panels, place, ld, fronts.sizes[i], fronts.sizes[j], kind, found)
+
+
+def split_blocks(values: Buffer, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """Blocks (rows[k], columns[k]) that lie one after another, row-major, as arrays of their own: views."""
+    ends = np.cumsum(rows * columns)
+    shapes = zip(ends.tolist(), rows.tolist(), columns.tolist(), strict=True)
+    return [values[e - r * c : e].reshape(r, c) for e, r, c in shapes]
 
 
 def locate_blocks(fronts: Fronts, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:

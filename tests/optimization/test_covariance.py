@@ -176,3 +176,20 @@ def test_wrong_requests_are_refused(scene):
         solution.covariance(scene.points[[0, 1]], scene.cameras[3])
     with pytest.raises(InputError, match="at least one selection"):
         solution.joint_covariance()
+
+
+def test_what_was_factorised_is_used_again_until_something_else_is():
+    ring = make_ring(count=30)
+    ring.problem.fix(ring.poses[0])
+    solution = ring.problem.solve(linear_solver="sparse")
+    slopes = [np.random.default_rng(0).standard_normal((30, 6))]
+    first = solution.covariance(ring.poses, is_determined=True)
+    model = solution._problem
+    count = model.factorization
+    (moved,) = solution.response(slopes, is_determined=True)
+    np.testing.assert_array_equal(solution.covariance(ring.poses, is_determined=True), first)
+    assert model.factorization == count
+    model.factorize(np.full(model.layout.dof, 1e3))  # as of a step that is rejected afterwards
+    np.testing.assert_array_equal(solution.response(slopes, is_determined=True)[0], moved)
+    np.testing.assert_array_equal(solution.covariance(ring.poses, is_determined=True), first)
+    assert model.factorization == count + 2

@@ -47,6 +47,7 @@ class LeastSquares:
     Attributes:
         values: of every block, at the accepted point.
         cost: at the accepted point.
+        factorization: another number for every factorisation and accepted point; what was factorised is there while it stays.
         timing_s: seconds spent by stage.
     """
 
@@ -57,6 +58,7 @@ class LeastSquares:
         self.values: Values = [block.values for block in layout.blocks]
         self.cost = GroupCost(0.0, 0.0, 0, 0)
         self.timing_s = {"residuals and Jacobians": 0.0, "normal equations": 0.0, "linear solve": 0.0}
+        self.factorization = 0
         self._threads = threads
         self._revisions = tuple(group.revision for group in self.groups)
         self._linearized: Values = ()
@@ -125,6 +127,7 @@ class LeastSquares:
         for group in self.groups:
             group.accept()
         self.values, self.cost = values, cost
+        self.factorization += 1
         self.system.assemble()
         if not (np.isfinite(self.system.gradient).all() and np.isfinite(self.system.diagonal).all()):
             self._explain_not_finite(values)
@@ -138,6 +141,7 @@ class LeastSquares:
         """
         if self.system.reads_jacobians and not self.is_linearized:
             self.linearize(self.values)  # after a rejected step
+        self.factorization += 1
         self.system.factorize(damping)
 
     def solve(self, damping: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -50,8 +50,11 @@ class LinearSystem(ABC):
         """x (dof,) with (H + diag(damping)) x = right, for the matrix factorised last."""
 
     @abstractmethod
-    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of free variables, after `factorize(None)`."""
+    def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of free variables, after `factorize(None)`.
+
+        One after another in one array, each of them row-major: a Python object a block would cost as much as the blocks.
+        """
 
 
 class DenseSystem(LinearSystem):
@@ -86,12 +89,15 @@ class DenseSystem(LinearSystem):
         solve_dense(self._factor, x)
         return x[:, 0]
 
-    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """See `LinearSystem.inverse_blocks`."""
+    def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `LinearSystem.inverse_values`."""
         inverse = np.eye(self._layout.dof)
         solve_dense(self._factor, inverse)
         start = self._layout.start
-        return [inverse[start[i] : start[i + 1], start[j] : start[j + 1]] for i, j in zip(first, second, strict=True)]
+        pairs = zip(first, second, strict=True)
+        return np.concatenate(
+            [np.zeros(0), *(inverse[start[i] : start[i + 1], start[j] : start[j + 1]].reshape(-1) for i, j in pairs)]
+        )
 
 
 class SparseSystem(LinearSystem):
@@ -119,6 +125,6 @@ class SparseSystem(LinearSystem):
         """See `LinearSystem.solve`."""
         return self._cholesky.solve(right)
 
-    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """See `LinearSystem.inverse_blocks`."""
-        return list(self._cholesky.inverse_blocks(first, second))
+    def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `LinearSystem.inverse_values`."""
+        return self._cholesky.inverse_values(first, second)

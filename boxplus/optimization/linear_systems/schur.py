@@ -6,6 +6,7 @@ block-diagonal. With C = L Lᵀ and Z = W L⁻ᵀ the reduced matrix is S = F �
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from boxplus._jit import run_chunks
 from boxplus.optimization.linear_systems.linear_system import LinearSystem
 from boxplus.optimization.linear_systems.normal_equations import Gather, NormalEquations, add_gradient, add_products, piece
-from boxplus.optimization.linear_systems.schur_inverse import inverse_blocks
+from boxplus.optimization.linear_systems.schur_inverse import inverse_values
 from boxplus.optimization.linear_systems.schur_kernels import (
     factorize_eliminated,
     reduce_entries,
@@ -167,20 +168,31 @@ class SchurSystem(LinearSystem):
         """Call `run(first, last, *arguments)` over pieces of `items` whose results do not depend on each other."""
         run_chunks(lambda _, first, last: run(first, last, *arguments), items, piece(items, self._threads), self._threads)
 
-    def inverse_blocks(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """See `LinearSystem.inverse_blocks`."""
+    def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `LinearSystem.inverse_values`."""
         end = self._first + len(self._C)
         if ((first < self._first) | (first >= end)).all() and ((second < self._first) | (second >= end)).all():
             return self._inverse_of_kept(first, second)
-        return inverse_blocks(
-            first, second, self._layout.sizes, self._first, self._L, self._entries, self._cholesky.inverse_blocks, self._threads
+        return inverse_values(
+            first, second, self._layout.sizes, self._first, self._L, self._entries, self._kept_inverse, self._threads
         )
 
-    def _inverse_of_kept(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    def _kept_inverse(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Sizes and values of the blocks of S⁻¹ for pairs of kept variables, by their numbers among these."""
+        sizes = self._rest.sizes
+        return sizes[i] * sizes[j], self._cholesky.inverse_values(i, j)
+
+    def _inverse_of_kept(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
         """Blocks of S⁻¹, which is the inverse of H between kept variables; symmetric on the diagonal."""
         i, j = (np.where(k < self._first, k, k - len(self._C)) for k in (first, second))
-        blocks = self._cholesky.inverse_blocks(i, j)
-        return [0.5 * block + 0.5 * block.T if a == b else block for block, a, b in zip(blocks, i, j, strict=True)]
+        sizes, values = self._kept_inverse(i, j)
+        own, begin = np.flatnonzero(i == j), np.cumsum(sizes) - sizes
+        for size in np.unique(sizes[own]):
+            dof = math.isqrt(size)
+            at = begin[own[sizes[own] == size], None] + np.arange(size)
+            blocks = values[at].reshape(-1, dof, dof)
+            values[at] = (0.5 * blocks + 0.5 * np.swapaxes(blocks, 1, 2)).reshape(-1, size)
+        return values
 
 
 def _gathers_of(

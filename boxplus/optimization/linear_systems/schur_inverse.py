@@ -193,22 +193,22 @@ def _add_own(L: Matrix, R: Matrix, found: Matrix, to: np.uint64) -> None:
             found[to + np.uint64(p * e + s)] += total
 
 
-def inverse_blocks(
+def inverse_values(
     first: Indices,
     second: Indices,
     sizes: Indices,
     begin: int,
     L: Matrix,
     entries: Sequence[Entries],
-    kept_inverse: Callable[[Indices, Indices], list[Matrix]],
+    kept_inverse: Callable[[Indices, Indices], tuple[Indices, Matrix]],
     threads: int,
-) -> list[Matrix]:
-    """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of variables.
+) -> Matrix:
+    """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of variables, one after another, row-major.
 
     Args:
         sizes: degrees of freedom of all variables.
         begin: number of the first eliminated variable; L (n, e, e): their factors.
-        kept_inverse: gives the blocks of S⁻¹ for pairs of kept variables.
+        kept_inverse: gives sizes and values of the blocks of S⁻¹ for pairs of kept variables, likewise.
     """
     numbers, place = np.unique(np.concatenate([first, second]), return_inverse=True)
     reached = Reached.of(numbers, sizes, begin, L, entries)
@@ -219,9 +219,8 @@ def inverse_blocks(
     keys = np.empty(int(start[-1]), dtype=np.int64)
     _list_keys(i, j, reached.begin, reached.kept, kept, keys)
     wanted, pair = unique_keys(keys, kept * kept)
-    blocks = kept_inverse(wanted // max(kept, 1), wanted % max(kept, 1))
-    inverse_at = np.concatenate([[0], np.cumsum([block.size for block in blocks], dtype=np.int64)])
-    inverse = np.concatenate([block.reshape(-1) for block in blocks]) if blocks else np.zeros(0)
+    lengths, inverse = kept_inverse(wanted // max(kept, 1), wanted % max(kept, 1))
+    inverse_at = np.cumsum(lengths) - lengths
     rows, columns = reached.dof[i], reached.dof[j]
     ends = np.cumsum(rows * columns)
     found, found_at = np.zeros(int(ends[-1]) if len(ends) else 0), ends - rows * columns
@@ -231,5 +230,4 @@ def inverse_blocks(
                     start, pair, inverse_at, inverse, L, found_at, found)  # fmt: skip
 
     run_chunks(work, len(i), piece(len(i), threads), threads)
-    shapes = zip(found_at.tolist(), ends.tolist(), rows.tolist(), columns.tolist(), strict=True)
-    return [found[a:b].reshape(r, c) for a, b, r, c in shapes]
+    return found

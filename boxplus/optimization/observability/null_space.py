@@ -199,7 +199,7 @@ def _shared_directions(
     tangent_label = np.repeat(components.label, layout.sizes)
     for shift in _SHIFTS:
         try:
-            problem.system.factorize(shift * scale * scale)
+            problem.factorize(shift * scale * scale)
             break
         except NotPositiveDefinite:
             continue

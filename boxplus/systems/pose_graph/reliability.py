@@ -25,6 +25,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.contradiction import Contradiction
 from boxplus.systems.pose_graph.doubts import Fit, edge_names
 from boxplus.systems.pose_graph.problem import odometry_order, residual_of
 
@@ -54,8 +55,8 @@ class Reliability:
         factors: (m, d, d) by which errors are whitened.
         jacobians: (m, d, d) whitened, by the first and by the second pose.
         predicted: (m, d, d) J P Jᵀ, the covariance of what the result says of an edge, in its standard deviations.
-        rounding: (m,) what is left of the share of an error that shows when nothing checks it.
         deviations: (n, d) standard deviations of the poses.
+        against: what all others say of each edge.
     """
 
     graph: PoseGraph
@@ -64,8 +65,8 @@ class Reliability:
     factors: Floats
     jacobians: tuple[Floats, Floats]
     predicted: Floats
-    rounding: Floats
     deviations: Floats
+    against: Contradiction
 
     @classmethod
     def of(cls, graph: PoseGraph, solution: Solution, variables: Variables) -> Reliability | None:
@@ -93,7 +94,10 @@ class Reliability:
         M = own[0] + own[1] + across + np.swapaxes(across, 1, 2)
         rounding = _ROUNDING * np.einsum("nii->n", own[0] + own[1])
         deviations = np.sqrt(np.maximum(np.einsum("nii->ni", P[3 * m :]), 0.0))
-        return cls(graph, x, e, W, (Ji, Jj), 0.5 * (M + np.swapaxes(M, 1, 2)), rounding, deviations)
+        predicted = 0.5 * (M + np.swapaxes(M, 1, 2))
+        # What is left of the share of an error that shows when nothing checks it.
+        least = np.maximum(_UNCHECKED, rounding)
+        return cls(graph, x, e, W, (Ji, Jj), predicted, deviations, Contradiction.of(e, predicted, least))
 
     @property
     def redundancy(self) -> Floats:
@@ -105,7 +109,7 @@ class Reliability:
     def sentence(self) -> str:
         """How large an error of an edge has to be for all others to contradict it."""
         d, m = self.errors.shape[1], len(self.errors)
-        directions = self.against()[1]
+        directions = self.against.directions
         alone = int(np.count_nonzero(directions == 0))
         if alone == m:
             return "no edge is checked by others"
@@ -113,18 +117,6 @@ class Reliability:
         shows = math.sqrt(chi_square_exceeded(_STRANGE / m, d) / float(np.median(share)))
         rest = f", and not at all in {alone}, which no other checks" if alone else ""
         return f"a wrong edge shows from {shows:.2g} of its standard deviations on in half of {m - alone} edges{rest}"
-
-    def against(self) -> tuple[Floats, NDArray[np.int64], Floats]:
-        """(m,) how far all others contradict each edge, squared; in how many directions they can; how far it bends the result.
-
-        The last one in the standard deviations that the result claims of the pose of one of its poses in the other.
-        """
-        share, U = np.linalg.eigh(np.eye(self.errors.shape[1]) - self.predicted)
-        is_checked = share > np.maximum(_UNCHECKED, self.rounding)[:, None]
-        own = np.einsum("nji,nj->ni", U, self.errors)
-        squared = np.where(is_checked, own * own / np.where(is_checked, share, 1.0), 0.0)
-        bent = np.where(is_checked, squared / np.where(is_checked, share, 1.0) * np.clip(1.0 - share, 0.0, 1.0), 0.0)
-        return squared.sum(axis=1), is_checked.sum(axis=1), np.sqrt(bent.sum(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +138,7 @@ def suspicions(known: Reliability, solution: Solution, variables: Variables, odo
     Args:
         odometry: (m,) edges that join successive poses.
     """
-    squared, directions, bent = known.against()
+    squared, directions, bent = known.against.squared, known.against.directions, known.against.bent
     checked = directions > 0
     if not checked.any():
         return []

@@ -57,7 +57,7 @@ def test_how_far_the_others_contradict_an_edge_is_what_the_cost_falls_by_without
     graph = simulate_pose_graph(dimension=dimension, poses=60, loops=40, block=2, seed=2, sigma_rotation=0.002).graph
     result = optimize_pose_graph(graph)
     known = Reliability.of(graph, result.solution, result.poses)
-    squared, directions, _ = known.against()
+    squared, directions = known.against.squared, known.against.directions
     full = PoseGraphConfig(start="file", examine=False)
     for edge in (0, 17, 41, 70, 90):
         rows = np.arange(len(graph.edges)) != edge
@@ -70,7 +70,7 @@ def test_how_far_the_others_contradict_an_edge_is_what_the_cost_falls_by_without
 def test_edges_that_no_circle_passes_are_checked_by_nothing():
     graph = row(60, ((0, 20), (1, 21), (5, 24)), 1)
     result = optimize_pose_graph(graph)
-    directions = Reliability.of(graph, result.solution, result.poses).against()[1]
+    directions = Reliability.of(graph, result.solution, result.poses).against.directions
     assert (directions[24:59] == 0).all() and (directions[:24] == 3).all()
     assert result.checks.endswith("and not at all in 35, which no other checks")
     tree = optimize_pose_graph(row(30, (), 1))
