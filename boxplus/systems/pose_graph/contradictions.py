@@ -21,6 +21,7 @@ _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as tha
 _WIDTHS = (1, 3, 10, 30)  # steps that a slip is spread over
 _ALONE = 0.1  # share of the poses that no kept loop closure checks, from which on that is told; of loop closures that are few
 _WITNESSES = 3  # loop closures that agree with each other by more than chance
+_NEARLY_ALL = 0.8  # share of the loop closures; where these mean something else than was read, a few fit as they happen to
 _OBJECTING = 2  # loop closures that may have been kept by chance, or bent; more of them confirm the odometry
 
 
@@ -31,10 +32,18 @@ def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]
         bridges: loop closures that were believed beforehand.
     """
     said = [bridge.sentence(graph) for bridge in bridges if bridge.is_contested]
-    if not verdict.is_kept[verdict.is_loop].any() and not bridges:
+    loops = np.count_nonzero(verdict.is_loop)
+    refused = np.count_nonzero(verdict.is_loop & ~verdict.is_kept)
+    if refused == loops and not bridges:
         said.append(
-            f"all {np.count_nonzero(verdict.is_loop)} loop closures were refused, and the result is odometry alone: all are "
-            "false, or the odometry claims more than it can"
+            f"all {loops} loop closures were refused, and the result is odometry alone: all are false, or the odometry claims "
+            "more than it can"
+        )
+    elif refused >= max(_NEARLY_ALL * loops, _WITNESSES):
+        said.append(
+            f"{refused} of {loops} loop closures were refused, and the result is nearly the odometry alone: so many are false, "
+            "or loop closures and odometry differ in unit, in direction or in what they claim, and those that were kept agree by "
+            "chance"
         )
     label, before = components(with_edges(graph, verdict.is_kept)), components(graph)
     if label.max(initial=0) > before.max(initial=0):

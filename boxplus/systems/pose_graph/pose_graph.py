@@ -52,6 +52,7 @@ from boxplus.systems.pose_graph.readings import misreading
 from boxplus.systems.pose_graph.reliability import Reliability, suspicions
 from boxplus.systems.pose_graph.start import held_poses
 from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
+from boxplus.systems.pose_graph.witnesses import held_against_each_other, lone_joints
 
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
 _DAMPING = 1e-9
@@ -219,18 +220,32 @@ def optimize_pose_graph(
         unsure, against = contradictions(graph, verdict, starts.bridges)
         notes += unsure
         reasons += _verdict_doubts(fit, verdict) + against
-    elif fit.is_poor:
+    else:
+        joints = lone_joints(graph)
+        reasons += [one.sentence for one in joints if one.is_grave]
+        notes += [one.sentence for one in joints if not one.is_grave]
+    if verdict is None and loss is not None and starts.verdict is not None:
+        unsure, against = contradictions(graph, starts.verdict, starts.bridges)
+        notes += unsure
+        reasons += against
+    if verdict is None and fit.is_poor:
         told = poor_fit_sentence(fit, minima, len(graph.fixed))
         bent = fit.is_contradiction and (disagree(minima) or standing_out(squared, graph.information.shape[1]).any())
         (reasons if bent else notes).append(told)
     examined = time.perf_counter()
-    reliability = None
-    if config.examine and loss is None and config.objective == "logarithm" and solution.status != "stopped":
-        kept = np.ones(len(graph.edges), dtype=np.bool_) if verdict is None else verdict.is_kept
-        reliability = Reliability.of(with_edges(graph, kept), solution, poses)
-    if reliability is not None:
-        for one in suspicions(reliability, solution, poses, consecutive_edges(graph)[kept]):
-            (reasons if one.is_grave else notes).append(one.sentence)
+    reliability, found = None, []
+    if config.examine and (solution.status != "stopped" or solution.iterations >= options.max_iterations):
+        if loss is not None or config.objective == "chordal":
+            found = held_against_each_other(
+                graph, poses_end, options, loss, None if starts.verdict is None else starts.verdict.is_kept
+            )
+        elif solution.status != "stopped":
+            kept = np.ones(len(graph.edges), dtype=np.bool_) if verdict is None else verdict.is_kept
+            reliability = Reliability.of(with_edges(graph, kept), solution, poses)
+            if reliability is not None:
+                found = suspicions(reliability, solution, poses, consecutive_edges(graph)[kept])
+    for one in found:
+        (reasons if one.is_grave else notes).append(one.sentence)
     examination = time.perf_counter() - examined
     if certificate is not None and not certificate.is_certified:
         reasons.append(certificate.sentence)

@@ -36,7 +36,7 @@ _SURE = 1e-6  # chance that anything else is
 _UNCHECKED = 1e-5  # share of an error that shows, below which nothing checks that direction
 _ROUNDING = 1e-15  # of the covariances that such a share is a small difference of
 _ALIKE = 9.2  # difference of squares by which one suspect is a hundred times likelier than another
-_BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
+BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
 _LEAST_STEPS = 10  # of odometry, for a scale or a drift of its own
 _LEAST_SPARE = 10.0  # redundancy from which on a group of edges is judged on its own
 _CLEARLY, _WRONG = 1.5, 4.0  # times what the information promises of a group's χ², to be told, and not to be trusted
@@ -183,7 +183,7 @@ def _slipped(known: Reliability, squared: Floats, bent: Floats, found: NDArray[n
     told += f"; kept as it is, it bends the result there by {bent[worst]:.2g} of its own standard deviations"
     if others > 0:
         told += f", and {others} more are contradicted"
-    return Suspicion(f"{told}: it slipped, joins the wrong poses, or claims too much", bool(bent[worst] > _BENT))
+    return Suspicion(f"{told}: it slipped, joins the wrong poses, or claims too much", bool(bent[worst] > BENT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +214,7 @@ class Common:
             f"{self.sentence} by {self.unit * self.size:.3g} ± {self.unit * math.sqrt(scale / self.spare):.2g}, as all edges "
             f"together have it and their information does not know; the result is bent by up to {self.bent:.2g} of its own "
             "standard deviations",
-            self.bent > _BENT,
+            self.bent > BENT,
         )
 
 

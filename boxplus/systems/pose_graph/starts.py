@@ -15,7 +15,7 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.bridges import Bridge, bridge_pieces
-from boxplus.systems.pose_graph.loops import judge_loops
+from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
 from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
 
@@ -41,6 +41,7 @@ class Starts:
         self.is_loop = ~consecutive_edges(graph)
         self._graph, self._wanted, self._options, self._callback = graph, wanted, options, callback
         self.bridges: list[Bridge] = []
+        self.verdict: LoopVerdict | None = None
         self._stopped = False
 
     def candidates(self, loss: Loss | None, *, is_robust: bool) -> dict[Start, NDArray[np.float64]]:
@@ -127,7 +128,8 @@ class Starts:
         return self._stopped
 
     def _graduated(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
-        return judge_loops(self._graph, self.is_loop, start, self._options, self._watch).solution.values[0]
+        self.verdict = judge_loops(self._graph, self.is_loop, start, self._options, self._watch)
+        return self.verdict.solution.values[0]
 
     def _dead_reckoning(self) -> NDArray[np.float64]:
         """Poses along the odometry, where it holds all together; else along a tree of all edges."""
