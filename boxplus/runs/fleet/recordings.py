@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -22,7 +23,8 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
     with a number where two are alike.
 
     Raises:
-        InputError: no such folder or file, none in it, one that is not there, parts of one beside others, or a URL.
+        InputError: no such folder or file, none in it, one that is not there or is named twice, parts of one beside others, or a
+            URL.
     """
     base = Path(path)
     if base.is_dir():
@@ -42,6 +44,8 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
             raise InputError(f"recordings that {base} names", f"nothing at {missing[0]}", "correct the list")
         if not found:
             raise InputError("a list of recordings, one a line", f"none in {base}", "write paths into it")
+        if again := [entry for entry, times in Counter(entry.resolve() for entry in found).items() if times > 1]:
+            raise InputError("every recording once", f"{again[0]} twice in {base}", "leave one out: it would count twice")
     else:
         raise InputError("a folder with recordings, or a list in a .txt file", f"{base}", "check the path")
     return named(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -11,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from boxplus.errors import BoxplusError, InputError
+from boxplus.errors import BoxplusError, InputError, printable
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings import open_recording
 from boxplus.runs.fleet.status import RecordingStatus
 from boxplus.runs.fleet.store import Store, open_store
+from boxplus.runs.lidar_inertial.earlier_run import refuse_other_recording
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import SlamFolder
@@ -60,7 +62,7 @@ def run_recording(store: str, name: str, recording: str, config: SlamRunConfig) 
     What the recording or its run has against it is in the status, not raised: another attempt would find the same.
     """
     began, place = time.perf_counter(), open_store(store)
-    if (done := _finished(place, name, config)) is not None:
+    if (done := _finished(place, name, recording, config)) is not None:
         return _status(name, recording, done, 0.0)
     with place.writing(run_of(name)) as folder:
         try:
@@ -115,8 +117,8 @@ def _run(folder: Path, recording: str, config: SlamRunConfig) -> SlamSummary:
             return run_slam(opened, own.path, config, overwrite=True).summary
 
 
-def _finished(place: Store, name: str, config: SlamRunConfig) -> SlamSummary | None:
-    """The facts of a run with these settings that came to its end."""
+def _finished(place: Store, name: str, recording: str, config: SlamRunConfig) -> SlamSummary | None:
+    """The facts of a run of this recording with these settings that came to its end."""
     facts, settings = (place.read(f"{run_of(name)}/{file}") for file in (SUMMARY, "config.yaml"))
     if facts is None or settings is None or settings.decode() != dump_slam_config(config):
         return None
@@ -124,7 +126,28 @@ def _finished(place: Store, name: str, config: SlamRunConfig) -> SlamSummary | N
         summary = SlamSummary.model_validate_json(facts)
     except ValidationError:
         return None
-    return summary if summary.state == "finished" else None
+    return summary if summary.state == "finished" and _is_of(place, name, Path(recording), summary, config) else None
+
+
+def _is_of(place: Store, name: str, recording: Path, summary: SlamSummary, config: SlamRunConfig) -> bool:
+    """Whether a run is of this recording: a name may have been given to another, and a file may have been replaced."""
+    if summary.recording == printable(str(recording.resolve())) and _changed_at(recording) < summary.started.timestamp():
+        return True
+    try:
+        with (
+            place.reading(run_of(name), (f"odometry/{SUMMARY}",)) as folder,
+            open_recording(recording, config.recording) as opened,
+        ):
+            refuse_other_recording(SlamFolder(folder).odometry, opened)
+    except BoxplusError:  # another one; or none that can be read, which the run says
+        return False
+    return True
+
+
+def _changed_at(recording: Path) -> float:
+    """When a file of a recording was last written [s since 1970]; infinity where there is none."""
+    files = [recording] if recording.is_file() else [file for file in recording.rglob("*") if file.is_file()]
+    return max((file.stat().st_mtime for file in files), default=math.inf)
 
 
 def _is_begun(folder: SlamFolder, config: SlamRunConfig) -> bool:

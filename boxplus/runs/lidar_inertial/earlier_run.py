@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from boxplus.errors import InputError
+from boxplus.errors import InputError, printable
 from boxplus.recordings.recording import Recording
 from boxplus.runs.checkpoint import refuse_other_settings
 from boxplus.runs.lidar_inertial.config import RunConfig, dump_run_config, redump_run_config
@@ -42,20 +42,30 @@ def finished_run(folder: RunFolder, recording: Recording, config: RunConfig, ext
     Raises:
         InputError: it is of another recording, or was made with other settings.
     """
+    summary = refuse_other_recording(folder, recording)
+    used = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
+    refuse_other_settings(folder, redump_run_config(folder.config), dump_run_config(used, recording.info))
+    return summary
+
+
+def refuse_other_recording(folder: RunFolder, recording: Recording) -> RunSummary:
+    """The facts of the run in a folder, which has to be of this recording, wherever that lies.
+
+    Raises:
+        InputError: it is of another recording.
+    """
     summary, info = read_summary(folder.summary), recording.info
     made = summary.recording
     before = (made.format, made.lidar_topic, made.imu_topic, made.messages, made.duration_s)
-    now = (info.format, info.lidar_topic, info.imu_topic, info.message_count, info.duration_s)
+    now = (info.format, printable(info.lidar_topic), printable(info.imu_topic), info.message_count, info.duration_s)
     if before != now:
         texts = (
             f"{form}, {count} messages in {duration:.9f} s, {lidar} and {imu}"
             for form, lidar, imu, count, duration in (before, now)
         )
         raise InputError(
-            f"the recording that the finished run in {folder.path} is of ({next(texts)})",
+            f"the recording that the run in {folder.path} is of ({next(texts)})",
             next(texts),
             "choose another folder with --output, or replace it with --overwrite",
         )
-    used = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
-    refuse_other_settings(folder, redump_run_config(folder.config), dump_run_config(used, info))
     return summary

@@ -15,6 +15,7 @@ from boxplus.errors import BoxplusError, InputError, OutputError, printable
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.recordings.recording import Recording
+from boxplus.runs.lidar_inertial.earlier_run import refuse_other_recording
 from boxplus.runs.lidar_inertial.extrinsic import Extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import View, run_odometry
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
@@ -110,6 +111,8 @@ class _Run:
         text = dump_slam_config(config)
         if resume:
             self._resumed = _checked_to_go_on(folder, text)
+            if folder.odometry_is_finished():  # else its checkpoint says of which recording it is
+                refuse_other_recording(folder.odometry, recording)
         with atomic_file(folder.config) as file:
             file.write(text.encode())
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,14 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.tiles.store import TileStore
+from boxplus.recordings.recording import Recording
 from boxplus.runs.fleet import fleet_run, tasks
 from boxplus.runs.fleet.executor import InProcess, RayExecutor, TaskEnd
 from boxplus.runs.fleet.fleet_run import run_fleet
 from boxplus.runs.fleet.recordings import find_recordings, holds_recordings
 from boxplus.runs.fleet.status import RecordingStatus
 from boxplus.runs.fleet.store import open_store
+from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.merge_run import merge_runs
 from boxplus.runs.sessions.summary import read_merge_summary
@@ -30,7 +33,9 @@ from boxplus.runs.settings_file import load_settings
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.summary import SlamSummary
+from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.drifting_drive import DriftConfig
+from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.sessions.candidates import candidate_pairs
 from boxplus.systems.sessions.config import SessionsConfig
@@ -207,18 +212,57 @@ def test_a_pair_is_looked_at_again_after_a_new_run(tmp_path: Path, monkeypatch: 
     assert len(calls) == 4
 
 
-def test_a_recording_that_is_finished_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = tmp_path / "fleet"
-    config, folder = SlamRunConfig(), SlamFolder(store / "runs" / "r")
-    folder.path.mkdir(parents=True)
-    now = datetime(2026, 1, 1, tzinfo=UTC)
-    SlamSummary(versions={}, state="finished", started=now, updated=now, recording="r", scans=7).write(folder.summary)
-    folder.config.write_text(dump_slam_config(config), encoding="utf-8")
-    status = tasks.run_recording(str(store), "r", str(tmp_path / "none.bag"), config)
+def test_a_recording_that_is_finished_is_not_run_again(tmp_path: Path) -> None:
+    store, bag, config = tmp_path / "fleet", tmp_path / "r.bag", SlamRunConfig()
+    bag.touch()
+    folder = finished(store, bag, config)
+    status = tasks.run_recording(str(store), "r", str(bag), config)
     assert (status.state, status.scans, status.seconds) == ("finished", 7, 0.0)
     folder.config.write_text("other settings", encoding="utf-8")
-    again = tasks.run_recording(str(store), "r", str(tmp_path / "none.bag"), config)
-    assert again.state == "failed" and "check the path" in str(again.error)
+    again = tasks.run_recording(str(store), "r", str(bag), config)
+    assert again.state == "failed" and "r.bag" in str(again.error)
+
+
+def test_a_run_is_of_its_recording_not_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names of a list move on when a line is put before others, and a file may be replaced."""
+    store, config = tmp_path / "fleet", SlamRunConfig()
+    first, moved, other = (tmp_path / day / "r.bag" for day in ("monday", "moved", "tuesday"))
+    seconds = {first: 2.0, moved: 2.0, other: 2.5}
+    for bag in seconds:
+        bag.parent.mkdir()
+        bag.touch()
+
+    def opened(path: Path | str, options: object) -> Recording:
+        del options
+        return as_recording(simulate("walk", duration_s=seconds[Path(path)], lidar=SpinningLidar(azimuth_steps=60)))
+
+    run_odometry(opened(first, None), finished(store, first, config).odometry.path)
+    begun = []
+
+    def begin(recording: Recording, *_: object, **__: object) -> None:
+        begun.append(recording.info.duration_s)
+        raise InputError("a run", "none", "this is a test")
+
+    monkeypatch.setattr(tasks, "open_recording", opened)
+    monkeypatch.setattr(tasks, "run_slam", begin)
+
+    def state_of(bag: Path) -> str:
+        return tasks.run_recording(str(store), "r", str(bag), config).state
+
+    assert state_of(first) == state_of(moved) == "finished" and not begun
+    assert state_of(other) == "failed" and begun
+    seconds[first] = 2.5  # replaced where it lies
+    os.utime(first, (4e9, 4e9))
+    assert state_of(first) == "failed"
+
+
+def finished(store: Path, bag: Path, config: SlamRunConfig) -> SlamFolder:
+    """Facts of a run of a recording that was written before it."""
+    folder, now = SlamFolder(store / "runs" / "r"), datetime.now(UTC) + timedelta(seconds=10.0)
+    folder.path.mkdir(parents=True)
+    SlamSummary(versions={}, state="finished", started=now, updated=now, recording=str(bag), scans=7).write(folder.summary)
+    folder.config.write_text(dump_slam_config(config), encoding="utf-8")
+    return folder
 
 
 def test_parts_of_a_bag_without_metadata_are_one_recording(tmp_path: Path) -> None:
@@ -246,9 +290,16 @@ def test_recordings_are_found_in_a_folder_or_a_list(tmp_path: Path) -> None:
     (tmp_path / "ros2" / "metadata.yaml").touch()
     assert list(find_recordings(tmp_path)) == ["a", "b", "ros2"]
     listed = tmp_path / "fleet.txt"
-    listed.write_text("# two of one name\nb.bag\n\nros2\nb.bag\n")
+    (tmp_path / "ros2" / "b.bag").touch()
+    listed.write_text("# two of one name\nb.bag\n\nros2\nros2/b.bag\n")
     assert list(find_recordings(listed)) == ["b", "ros2", "b_2"]
-    for text, message in (("c.bag", "nothing at"), ("s3://fleet/a.bag", "shared folder"), ("", "one a line")):
+    twice = "b.bag\nros2/../b.bag"
+    for text, message in (
+        ("c.bag", "nothing at"),
+        (twice, "b.bag twice in"),
+        ("s3://fleet/a.bag", "shared folder"),
+        ("", "one a line"),
+    ):
         listed.write_text(text)
         with pytest.raises(InputError, match=message):
             find_recordings(listed)

@@ -45,7 +45,7 @@ def estimate(scan: int, p: np.ndarray, P: np.ndarray, status: Status = "ok") -> 
 
 
 def straight(way_m: float, sigma_m: float, axis: np.ndarray, statuses: tuple[Status, ...] = ("ok",) * 5) -> RunStatistics:
-    """A way of some length, whose last position is known to `sigma_m` along a direction (3,), a hundred times better across it."""
+    """A way of some length, its last position known to `sigma_m` along a direction (3,), a hundred times better across it."""
     statistics = RunStatistics()
     turn = so3.exp(np.cross([0.0, 0.0, 1.0], axis / np.linalg.norm(axis)))
     P = np.zeros((6, 6))

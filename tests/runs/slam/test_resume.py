@@ -30,6 +30,7 @@ from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.slam.config import SlamConfig
 
 WALK = simulate("walk", duration_s=6.0, lidar=SpinningLidar(azimuth_steps=100))
+SHORT = simulate("walk", duration_s=3.0, lidar=SpinningLidar(azimuth_steps=100))
 CONFIG = load_slam_config(
     settings=[
         *("odometry.scan_voxel=0.5", "odometry.map_cell=0.5", "map.pcd=false", "map.voxel=0.3"),
@@ -99,6 +100,12 @@ def test_a_run_that_failed_after_its_odometry_goes_on_from_there(
         run_slam(walk(), out.path, CONFIG)
     assert read_slam_summary(out.summary).state == "failed" and not out.tiles.exists()
     assert load_report(out.path).summary.describe_state().startswith("stopped by an error")
+    before = out.summary.read_bytes()
+    with pytest.raises(
+        InputError, match=r"expected the recording that the run in .* is of \(.* in 6.0.* – got .* in 3.0.* --overwrite"
+    ):
+        run_slam(as_recording(SHORT), out.path, CONFIG, resume=True)
+    assert out.summary.read_bytes() == before
     run_slam(walk(), out.path, CONFIG, resume=True)
     assert_same(out, whole)
 
