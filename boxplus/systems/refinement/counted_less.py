@@ -17,7 +17,7 @@ Source: Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,15 +33,15 @@ Floats = NDArray[np.float64]
 _STEP = 0.1
 
 
-def covariance_of(
+def covariances_of(
     problem: Problem,
     solution: Solution,
-    x: Variables,
+    blocks: Sequence[Variables],
     counted: Mapping[Group, Floats],
     held: Mapping[Group, Floats],
     options: SolverOptions,
-) -> Floats:
-    """(n, dof, dof) of the variables of a block at a solution. The weights of the problem are others afterwards.
+) -> list[Floats]:
+    """(n, dof, dof) of the variables of each block at a solution.
 
     Args:
         counted: (N,) w of the residuals of groups that have been counted for less than they are worth; of others it is 1.
@@ -49,13 +49,14 @@ def covariance_of(
         options: that it was solved with.
     """
     if all(bool((w == 1.0).all()) for w in counted.values()):
-        return solution.covariance(x)
+        return [solution.covariance(x) for x in blocks]
     sides = []
     for step in (-_STEP, _STEP):
         for group in problem.groups:
             one = np.ones(group.residual.count)
             problem.set_weights(group, held.get(group, one) * (1.0 + step * counted.get(group, one)))
         there = problem.solve(options.model_copy(update={"max_iterations": 0}), start=solution)
-        sides.append(there.covariance(x))
-    found: Floats = (sides[0] - sides[1]) * ((1.0 - _STEP**2) / (2.0 * _STEP))
-    return found
+        sides.append([there.covariance(x) for x in blocks])
+    for group in problem.groups:  # the solution is asked again under the weights that it was found with
+        problem.set_weights(group, held.get(group))
+    return [(less - more) * ((1.0 - _STEP**2) / (2.0 * _STEP)) for less, more in zip(*sides, strict=True)]

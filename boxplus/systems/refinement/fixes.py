@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,11 +33,16 @@ class FixVariables:
     arm: Variables
     delay: Variables
 
-    def receiver(self, solution: Solution, *, with_sigma: bool) -> Receiver:
-        """What they came to."""
-        blocks = (self.world, self.arm, self.delay)
-        sigma = np.concatenate([solution.standard_deviations(x)[0] for x in blocks]) if with_sigma else np.full(10, np.nan)
-        return Receiver(solution[self.world][0], solution[self.arm][0], float(solution[self.delay][0, 0]), sigma)
+    @property
+    def blocks(self) -> tuple[Variables, Variables, Variables]:
+        """All of it."""
+        return self.world, self.arm, self.delay
+
+    def receiver(self, solution: Solution, sigma: Mapping[Variables, Floats]) -> Receiver:
+        """What they came to, with standard deviations where these are known."""
+        known = all(block in sigma for block in self.blocks)
+        deviations = np.concatenate([sigma[block] for block in self.blocks]) if known else np.full(10, np.nan)
+        return Receiver(solution[self.world][0], solution[self.arm][0], float(solution[self.delay][0, 0]), deviations)
 
 
 def add_fixes(

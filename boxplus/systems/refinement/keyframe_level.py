@@ -23,12 +23,13 @@ from boxplus.residuals.planes.plane_cluster import Plane, PlaneCluster
 from boxplus.residuals.prior import Prior
 from boxplus.systems.refinement.calibrated import Calibrated
 from boxplus.systems.refinement.config import RefinementConfig
-from boxplus.systems.refinement.counted_less import covariance_of
+from boxplus.systems.refinement.counted_less import covariances_of
 from boxplus.systems.refinement.finished_run import FinishedRun
-from boxplus.systems.refinement.fixes import FixVariables, add_fixes
+from boxplus.systems.refinement.fixes import add_fixes
 from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, preintegrated
 from boxplus.systems.refinement.keyframes import Keyframes
 from boxplus.systems.refinement.loops import KeyframeLoops, between_keyframes
+from boxplus.systems.refinement.outside import Receiver
 from boxplus.systems.refinement.sightings import KeyframeClusters
 from boxplus.systems.refinement.state import RefinedState
 from boxplus.systems.slam.correction import Correction
@@ -109,21 +110,26 @@ def move_keyframes(
         linear_solver="schur", max_iterations=config.max_iterations, cost_tolerance=1e-7, threads=config.threads, examine=False
     )
     solution = problem.solve(options)
-    covariance = np.zeros((len(run), 6, 6))
+    covariance, sigma = np.zeros((len(run), 6, 6)), dict[Variables, Floats]()
     if with_covariance:
-        covariance = _between(run, keyframes, covariance_of(problem, solution, x.poses, {on_planes: seen.counted}, held, options))
+        blocks = [x.poses, x.lidar, *(() if x.offset is None else (x.offset,)), *(() if fixes is None else fixes.blocks)]
+        own, *single = covariances_of(problem, solution, blocks, {on_planes: seen.counted}, held, options)
+        covariance = _between(run, keyframes, own)
+        sigma = {block: np.sqrt(np.diagonal(found[0])) for block, found in zip(blocks[1:], single, strict=True)}
+    elif x.offset is not None:
+        sigma = {x.offset: solution.standard_deviations(x.offset)[0]}
     all_planes = map_.planes.copy()
     all_planes[numbers] = solution[x.planes]
     is_held = np.zeros(len(map_), dtype=np.bool_)
     is_held[numbers] = True
     return MovedKeyframes(
-        state=_followed(run, state, keyframes, solution, x, fixes, with_covariance=with_covariance),
+        state=_followed(run, state, keyframes, solution, x, None if fixes is None else fixes.receiver(solution, sigma)),
         planes=replace(map_, planes=all_planes),
         is_held=is_held,
         cost=(solution.cost_initial, solution.cost),
         covariance=covariance,
-        mounting_sigma=solution.standard_deviations(x.lidar)[0] if with_covariance else np.zeros(6),
-        time_offset_sigma=0.0 if x.offset is None else float(solution.standard_deviations(x.offset)[0, 0]),
+        mounting_sigma=sigma.get(x.lidar, np.zeros(6)),
+        time_offset_sigma=0.0 if x.offset is None else float(sigma[x.offset][0]),
         loops=loops,
         loop_errors=np.zeros(0) if loops is None else _errors(loops, solution[x.poses]),
     )
@@ -168,9 +174,7 @@ def _followed(
     keyframes: Keyframes,
     solution: Solution,
     x: _Unknowns,
-    fixes: FixVariables | None,
-    *,
-    with_covariance: bool,
+    receiver: Receiver | None,
 ) -> RefinedState:
     """Every scan behind its keyframes, the correction interpolated on the way between."""
     T, at = state.T_world_imu, keyframes.scan
@@ -185,7 +189,7 @@ def _followed(
         gravity_direction=solution[x.down][0],
         T_imu_lidar=solution[x.lidar][0],
         time_offset_s=state.time_offset_s if x.offset is None else float(solution[x.offset][0, 0]),
-        receiver=None if fixes is None else fixes.receiver(solution, with_sigma=with_covariance),
+        receiver=receiver,
     )
 
 

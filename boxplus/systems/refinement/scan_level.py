@@ -15,7 +15,7 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.inertial.imu import ImuPreintegration
 from boxplus.residuals.planes.pose_quadratic import PoseQuadratic
 from boxplus.systems.refinement.config import RefinementConfig
-from boxplus.systems.refinement.counted_less import covariance_of
+from boxplus.systems.refinement.counted_less import covariances_of
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, imu_counted, preintegrated
 from boxplus.systems.refinement.sightings import scan_forms, weights_of_slices
@@ -51,5 +51,5 @@ def move_scans(
     if with_covariance:
         weights = weights_of_slices(run)
         counted = {on_planes: weights, by_imu: imu_counted(weights < 1.0)}
-        covariance = covariance_of(problem, solution, poses, counted, {}, options)
+        (covariance,) = covariances_of(problem, solution, [poses], counted, {}, options)
     return replace(state, T_world_imu=solution[poses], velocity_bias=solution[states]), covariance

@@ -9,7 +9,7 @@ from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.prior import Prior
-from boxplus.systems.refinement.counted_less import covariance_of
+from boxplus.systems.refinement.counted_less import covariances_of
 
 PLANE = Euclidean(2)
 
@@ -33,12 +33,20 @@ def test_it_is_the_product_of_three(seed: int) -> None:
     held = {off: np.zeros(1)}
     problem.set_weights(off, held[off])
     options = SolverOptions()
-    found = covariance_of(problem, problem.solve(options), x, {less: w}, held, options)[0]
+    y = problem.add_variables(PLANE, np.zeros(2), name="y")
+    problem.add_residuals(Prior(PLANE, random.normal(size=2), information=4.0 * np.eye(2)), y)
+    solution = problem.solve(options)
+    before = solution.covariance(x)
+    x_found, y_found = covariances_of(problem, solution, [x, y], {less: w}, held, options)
+    found = x_found[0]
     H = (w[:, None, None] * information).sum(axis=0) + 2.0 * np.eye(2)
     M = (w[:, None, None] ** 2 * information).sum(axis=0) + 2.0 * np.eye(2)
     expected = np.linalg.inv(H) @ M @ np.linalg.inv(H)
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02 * np.abs(expected).max())
     assert (np.linalg.eigvalsh(found) < np.linalg.eigvalsh(np.linalg.inv(H))).all()
+    np.testing.assert_allclose(y_found[0], 0.25 * np.eye(2), rtol=1e-9)
+    # The solution itself is what it was: it was asked under other weights afterwards, and claimed 1.1 times the information.
+    np.testing.assert_allclose(solution.covariance(x), before, rtol=1e-12)
     del full
 
 
@@ -48,5 +56,5 @@ def test_what_counts_in_full_has_the_inverse() -> None:
     group = problem.add_residuals(Prior(PLANE, np.ones(2), sigma=[0.5, 2.0]), x)
     options = SolverOptions()
     solution = problem.solve(options)
-    found = covariance_of(problem, solution, x, {group: np.ones(1)}, {}, options)
+    (found,) = covariances_of(problem, solution, [x], {group: np.ones(1)}, {}, options)
     np.testing.assert_array_equal(found, solution.covariance(x))
