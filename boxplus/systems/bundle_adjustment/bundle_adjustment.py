@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
@@ -19,10 +20,11 @@ from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
-from boxplus.systems.bundle_adjustment.lens import lens_notes
+from boxplus.systems.bundle_adjustment.lens import lens_finding
 from boxplus.systems.bundle_adjustment.plausibility import (
+    coarse_doubt,
     input_notes,
-    mirror_notes,
+    mirror_doubt,
     misfit_notes,
     outlier_notes,
     point_notes,
@@ -34,6 +36,7 @@ from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconst
 from boxplus.systems.bundle_adjustment.strays import stray_notes, stray_points
 
 _ROUNDS = 3  # of looking for points that have a lower minimum elsewhere
+_FOCAL = 7  # column of a camera of BAL as a variable: rotation, translation, f, k1, k2
 _MOST = 0.5  # share of the observations that a robust loss may silence
 _BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
@@ -124,6 +127,7 @@ def adjust_bundle(
     camera_of, point_of = (
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
     )
+    _refuse_turned_lenses(reconstruction, solution.values[cameras.number])
     strayed: list[NDArray[np.int64]] = []
     astray = np.zeros(0, dtype=np.int64)
     while True:
@@ -143,6 +147,7 @@ def adjust_bundle(
         again = _continued(problem, solution, config, values, left, callback) if len(numbers) else solution
         if not again.cost < solution.cost:
             break
+        _refuse_turned_lenses(reconstruction, again.values[cameras.number])
         solution = again
         strayed.append(numbers)
     cheirality = count_behind(sound, adjusted)
@@ -155,9 +160,15 @@ def adjust_bundle(
     notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
     notes += misfit_notes(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     seen = np.unique(point_of)
-    notes += mirror_notes(reconstruction.points[seen], adjusted.points[seen])
-    notes += lens_notes(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
-    contradicted = sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given)
+    lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
+    if lens is not None and not lens.is_grave:
+        notes.append(lens.sentence)
+    said = [
+        sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
+        coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),
+        mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
+        None if lens is None or not lens.is_grave else lens.sentence,
+    ]
     return BundleAdjustmentResult(
         reconstruction=adjusted,
         errors_start=errors_start,
@@ -167,11 +178,28 @@ def adjust_bundle(
         cheirality=cheirality,
         depth=depth,
         notes=(*notes, *structure_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth, solution, left, contradicted),
+        doubt=_doubt(cheirality, depth, solution, left, [text for text in said if text]),
         solution=solution,
         cameras=cameras,
         points=points,
         time_s=time.perf_counter() - begin,
+    )
+
+
+def _refuse_turned_lenses(reconstruction: Reconstruction, cameras: NDArray[np.float64]) -> None:
+    """BAL's focal lengths are variables, and nothing but the images keeps them positive."""
+    if not isinstance(reconstruction, BalProblem):
+        return
+    bad = np.flatnonzero(~(cameras[:, _FOCAL] > 0.0))
+    if not len(bad):
+        return
+    few = 2 * len(bad) < len(cameras)
+    raise InputError(
+        "images that keep the focal lengths positive",
+        f"{len(bad)} of {len(cameras)} that came out negative, that of camera {bad[0]} as {cameras[bad[0], _FOCAL]:.4g} px",
+        "too few observations or wrong matches there: leave such cameras out, or use a robust loss"
+        if few
+        else "are the pixels turned by half a turn (BAL counts x to the right and y upwards), or is the start wrong?",
     )
 
 
@@ -206,11 +234,9 @@ def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]
     return 2 * len(point_of) + 7 - others - 3 * len(np.unique(point_of))
 
 
-def _doubt(
-    cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, contradicted: str | None
-) -> str | None:
-    """Why the result is not to be trusted."""
-    reasons = [contradicted] if contradicted else []
+def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, said: list[str]) -> str | None:
+    """Why the result is not to be trusted, beside what was `said` of it."""
+    reasons = list(said)
     if left <= 0:
         reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:

@@ -7,12 +7,16 @@ does; only where it does others follow, to where it falls.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_exceeded
 from boxplus.errors import BoxplusError
+from boxplus.formats.reconstructions.between_formats import colmap_of
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
@@ -25,10 +29,25 @@ _STEPS, _SETTLED, _LEAST_S = 25, 1e-3, 1.0  # the valley to other intrinsics is 
 _CHANCE = 1e-6  # of noise to lower the cost by as much
 _HINT = 0.3  # of the fall of the cost that counts, which the first step that is taken has to show
 _CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
+_MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
+_BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def lens_notes(
+@dataclass(frozen=True, slots=True)
+class LensFinding:
+    """Another lens than the one that was held.
+
+    Attributes:
+        sentence: which.
+        is_grave: whether it moves its pixels so far that the scene is bent beyond what its standard deviations claim.
+    """
+
+    sentence: str
+    is_grave: bool
+
+
+def lens_finding(
     adjusted: Reconstruction,
     used: NDArray[np.bool_],
     dropped: NDArray[np.int64],
@@ -36,21 +55,26 @@ def lens_notes(
     loss: Loss | None,
     solved: Solution,
     left: int,
-) -> list[str]:
-    """A sentence where another lens than the one that was held explains the images clearly better.
+) -> LensFinding | None:
+    """Whether another lens than the one that was held explains the images clearly better.
 
     Args:
-        adjusted: where bundle adjustment ended, as `solved` tells; only a minimum is examined.
+        adjusted: where bundle adjustment ended, as `solved` tells; at a minimum, or after the steps that were allowed.
         used: (k,) observations that were adjusted. dropped: points that were not.
         left: measurements less unknowns.
     """
     cost, time_s = solved.cost, solved.history[-1].time_s
+    told_by = "--refine-intrinsics"
+    if isinstance(adjusted, GbpProblem):
+        used, adjusted = used[np.argsort(adjusted.camera_of, kind="stable")], _with_any_lens(adjusted)
+        told_by = "correct the second line of the file"
     if not isinstance(adjusted, ColmapModel) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
-        return []
+        return None
+    is_out = solved.reason.startswith("iteration limit")
     # Who stopped the adjustment does not wait for more of it, and an examination takes no longer than what is examined.
     limit_s = max(time_s, _LEAST_S) if config.solver.time_limit_s is None else config.solver.time_limit_s - time_s
-    if solved.status != "converged" or not limit_s > 0.0:
-        return []
+    if not (solved.status == "converged" or is_out) or not limit_s > 0.0:
+        return None
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
@@ -58,6 +82,8 @@ def lens_notes(
     numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
     # As in an F-test; the noise as the errors have it, not as sigma says.
     share = 0.5 * chi_square_exceeded(_CHANCE, max(numbers, 1)) / left
+    if is_out:  # more steps would lower the cost without another lens, too
+        share = max(share, _MORE_STEPS)
 
     def is_settled(step: Iteration) -> bool:
         return step.number > 0 and step.accepted and not cost - step.cost > _HINT * share * step.cost
@@ -66,27 +92,34 @@ def lens_notes(
         limits = {"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": limit_s}
         solution = problem.solve(config.solver.model_copy(update=limits), callback=is_settled)
     except BoxplusError:
-        return []
+        return None
     if not cost - solution.cost > share * solution.cost:
-        return []
+        return None
     none = np.zeros(0)
     other = adjusted_reconstruction(adjusted, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-    changes = _changes(adjusted, other) if isinstance(other, ColmapModel) else []
+    changes, most = _changes(adjusted, other) if isinstance(other, ColmapModel) else ([], 0.0)
     if not changes:
-        return []
+        return None
     told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
-    return [
+    return LensFinding(
         f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
-        f"{solution.cost:.6g} and below, and the scene is bent by what they are wrong (--refine-intrinsics)"
-    ]
+        f"{solution.cost:.6g} and below, and the scene is bent by what they are wrong ({told_by})",
+        most > _BENT and solution.cost < _FALLS * cost,
+    )
 
 
-def _changes(before: ColmapModel, after: ColmapModel) -> list[str]:
-    """What became of each lens that moves its pixels by more than calibrations differ."""
+def _with_any_lens(gbp: GbpProblem) -> ColmapModel:
+    """The same with a camera that may have distortion, of which the format has none."""
+    model = colmap_of(gbp)
+    return replace(model, camera_models=("OPENCV",), camera_params=(np.append(gbp.intrinsics, np.zeros(4)),))
+
+
+def _changes(before: ColmapModel, after: ColmapModel) -> tuple[list[str], float]:
+    """What became of each lens that moves its pixels by more than calibrations differ, and the largest such share."""
     seen = Sightings.of(after)
     rays, found = seen.bearings(np.arange(len(seen.pixels)))
     lens_of = seen.lens_of[seen.camera_of]
-    changes = []
+    changes, most = [], 0.0
     for number, name in enumerate(before.camera_ids):
         own = np.flatnonzero((lens_of == number) & found)
         if not len(own):
@@ -97,10 +130,11 @@ def _changes(before: ColmapModel, after: ColmapModel) -> list[str]:
         size, radius = (float(np.sqrt(np.nanmean((x * x).sum(axis=1)))) for x in (moved, pixels - old[2:4]))
         if not size > _CHANGED * radius:
             continue
+        most = max(most, size / radius)
         differ = [k for k in range(len(old)) if abs(new[k] - old[k]) > 1e-3 * max(abs(old[k]), 1e-3)]
         names = list(_NAMES)
         if new[0] == new[1] and old[0] == old[1]:  # one focal length
             names[0], differ = "f", [k for k in differ if k != 1]
         told = ", ".join(f"{names[k]} = {new[k]:.5g} instead of {old[k]:.5g}" for k in differ)
         changes.append(f"for camera {name} {told}, which moves its pixels by {size:.2g} px")
-    return changes
+    return changes, most

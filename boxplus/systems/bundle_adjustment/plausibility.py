@@ -18,6 +18,8 @@ _LEAST_PIXEL = 1e-3  # [px] errors below are rounding
 _NARROW = 0.02  # spread of a camera's pixels, as a share of the others' or of the focal length, that asks for their unit
 _FEW = 10  # observations from which on a spread means something
 _OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says: one that was assumed, and one that was given
+_FAR_OFF = 3.0  # the same, of a given sigma, from which on nothing is to be trusted; few wrong matches hardly move a median
+_COARSE = 0.01  # of the focal length, by which half of the observations are off in no image
 _CONTRADICTED, _MISFIT = 25.0, 2.0  # times what a given sigma promises of χ², for a doubt and for a sentence
 _SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from
 _FAR = 4.0  # times the median distance from the middle
@@ -68,7 +70,7 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
     return said
 
 
-def mirror_notes(before: NDArray[np.float64], after: NDArray[np.float64]) -> list[str]:
+def mirror_doubt(before: NDArray[np.float64], after: NDArray[np.float64]) -> str | None:
     """A sentence where the adjusted points (n, 3) are a mirror image of those of the input (n, 3), but for place, turn and size.
 
     A mirrored scene explains pixels with one axis flipped as well as the true one explains the true pixels.
@@ -77,7 +79,7 @@ def mirror_notes(before: NDArray[np.float64], after: NDArray[np.float64]) -> lis
     # Far points would decide alone.
     near = np.all([np.isfinite(d) & (d <= _FAR * np.nanmedian(d)) for d in apart], axis=0)
     if np.count_nonzero(near) < _FEW:
-        return []
+        return None
     x, y = (p[near] - p[near].mean(axis=0) for p in (before, after))
     x, y = (p / max(float(np.sqrt((p * p).mean())), 1e-300) for p in (x, y))
     U, d, Vt = np.linalg.svd(y.T @ x)
@@ -85,11 +87,11 @@ def mirror_notes(before: NDArray[np.float64], after: NDArray[np.float64]) -> lis
     total = float((x * x).sum())
     rotated, mirrored = (max(1.0 - (float(d[:2].sum()) + s * float(d[2])) / total, 0.0) for s in (sign, -sign))
     if not mirrored < _CLEARLY * rotated:
-        return []
-    return [
-        "the result is a mirror image of the input: is one axis of the pixels flipped (BAL counts y upwards, all others "
-        "downwards), or were the points?"
-    ]
+        return None
+    return (
+        "the result is a mirror image of the input: is one axis of the pixels flipped, or are the two swapped (BAL counts y "
+        "upwards, all others downwards), or were the points?"
+    )
 
 
 def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_given: bool) -> list[str]:
@@ -99,17 +101,42 @@ def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_g
         left: measurements less unknowns.
         is_given: whether somebody meant sigma, or it is the default.
     """
-    known = errors[np.isfinite(errors)]
-    if left <= 0 or not len(known):
-        return []
-    noise = float(np.median(known)) / _RAYLEIGH * np.sqrt(2.0 * len(known) / left)
+    noise = _noise(errors, left)
     off = _OFF_GIVEN if is_given else _OFF
-    if sigma_px / off <= noise <= off * sigma_px:
+    if noise is None or sigma_px / off <= noise <= off * sigma_px:
         return []
     return [
         f"the errors are those of sigma = {noise:.2g} px, {sigma_px:g} px was given: standard deviations are too small by a "
         f"factor of {noise / sigma_px:.2g}, and a robust loss is scaled wrongly"
     ]
+
+
+def coarse_doubt(
+    errors: NDArray[np.float64], left: int, reconstruction: Reconstruction, sigma_px: float, *, is_given: bool
+) -> str | None:
+    """Where the typical error is none of a camera, or of the sigma that somebody meant, with or without a robust loss."""
+    noise, focal = _noise(errors, left), Sightings.of(reconstruction).focal_length
+    if noise is None:
+        return None
+    if noise > max(_COARSE * focal, sigma_px):
+        return (
+            f"half of the errors are larger than {noise * _RAYLEIGH:.3g} px, {noise * _RAYLEIGH / focal:.1%} of the focal "
+            "length: no image is measured so coarsely; wrong matches, a wrong start or lens, or pixels with other axes"
+        )
+    if is_given and noise > _FAR_OFF * sigma_px:
+        return (
+            f"the errors are those of sigma = {noise:.2g} px, {noise / sigma_px:.2g} times the {sigma_px:g} px that were given: "
+            "a wrong start or lens, wrong matches, or a sigma too small"
+        )
+    return None
+
+
+def _noise(errors: NDArray[np.float64], left: int) -> float | None:
+    """Standard deviation of a pixel as the median of the errors has it [px]; None where nothing is left over to tell."""
+    known = errors[np.isfinite(errors)]
+    if left <= 0 or not len(known):
+        return None
+    return float(np.median(known)) / _RAYLEIGH * float(np.sqrt(2.0 * len(known) / left))
 
 
 def outlier_notes(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
