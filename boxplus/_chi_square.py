@@ -24,18 +24,24 @@ def chi_square_sf(x: float, dof: float) -> float:
     return _incomplete_gamma(0.5 * dof, 0.5 * x)[1]
 
 
-@functools.lru_cache(maxsize=256)  # graphs ask for the same few, once a pair of closures
 def chi_square_quantile(probability: float, dof: float) -> float:
     """What χ² of `dof` degrees of freedom stays below with this probability."""
     if probability > 0.5:  # where the share above has more digits
         return chi_square_exceeded(1.0 - probability, dof)
-    return _first(lambda x: chi_square_cdf(x, dof) >= probability, dof)
+    return _crossing(probability, dof, False)
 
 
-@functools.lru_cache(maxsize=256)
 def chi_square_exceeded(probability: float, dof: float) -> float:
     """What it exceeds with this probability, be it small."""
-    return _first(lambda x: chi_square_sf(x, dof) <= probability, dof)
+    return _crossing(probability, dof, True)
+
+
+@functools.lru_cache(maxsize=512)  # graphs ask for the same few, once a pair of closures
+def _crossing(probability: float, dof: float, is_above: bool) -> float:
+    """Where the probability of χ² above x, or below, comes to this."""
+    if is_above:
+        return _first(lambda x: chi_square_sf(x, dof) <= probability, dof)
+    return _first(lambda x: chi_square_cdf(x, dof) >= probability, dof)
 
 
 def _first(is_beyond: Callable[[float], bool], dof: float) -> float:
