@@ -30,7 +30,7 @@ from boxplus.manifolds.quaternion import (
 from boxplus.manifolds.se2 import wrapped_angle
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.manifolds.so3 import hat, log_quaternion, right_jacobian_into, right_jacobian_inverse_into
-from boxplus.manifolds.tangent_change import tangent_change
+from boxplus.manifolds.tangents.change import tangent_change
 
 _NO_MOMENT = 1e-12  # ‖m‖ below this share of ‖d‖ has no direction of its own: the line goes through the origin
 

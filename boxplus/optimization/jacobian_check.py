@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_change import tangent_change
+from boxplus.manifolds.tangents.change import tangent_change
 from boxplus.residuals.residual import Residual
 
 TOLERANCE = 1e-7  # of max(1, largest entry of the Jacobian)

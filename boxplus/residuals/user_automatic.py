@@ -15,7 +15,7 @@ from boxplus.differentiation.dual import partials_into, seeded, zeros
 from boxplus.differentiation.dual_snapshot import dual_snapshot
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_basis import BasisPart, basis_parts, tangent_basis_into
+from boxplus.manifolds.tangents.basis import BasisPart, basis_parts, tangent_basis_into
 
 # Directions that one run of the function carries along. More in one run do the elementary functions fewer times; beyond this, the
 # derivatives of intermediate results no longer fit into the registers.

@@ -29,7 +29,7 @@ from boxplus._user_loops import (
     row_type,
 )
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_step import copy_into, step_into, tangent_steps
+from boxplus.manifolds.tangents.step import copy_into, step_into, tangent_steps
 from boxplus.residuals.user_automatic import NotDifferentiableError, automatic_loop
 
 Derivative = Literal["analytic", "automatic", "numeric"]

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 import boxplus as bp
 from boxplus.manifolds import quaternion, sim3, so3
-from boxplus.manifolds.tangent_step import step_into, tangent_steps
+from boxplus.manifolds.tangents.step import step_into, tangent_steps
 
 ANGLES = [0.0, 1e-9, 1e-4, 0.5, 2.0, 3.0, np.pi - 1e-6]
 GROWTHS = [0.0, 1e-9, -1e-4, 0.3, -2.0, 5.99, 6.01, -14.0]

@@ -15,7 +15,7 @@ from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import multiply_scalars, rotate
 from boxplus.manifolds.sphere import basis_scalars
-from boxplus.manifolds.tangent_step import (
+from boxplus.manifolds.tangents.step import (
     ADD,
     GROW,
     MOVE_LOCAL,

@@ -21,7 +21,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
 from boxplus.manifolds.sphere import S2, tangent_basis
-from boxplus.manifolds.tangent_change import POSES
+from boxplus.manifolds.tangents.change import POSES
 
 DOF = 7
 """Numbers of a motion: rotation, translation, scale."""

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from boxplus.errors import InputError
-from boxplus.manifolds.tangent_change import POSES
+from boxplus.manifolds.tangents.change import POSES
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.variables import VariableRows
 from boxplus.residuals.residual import Residual

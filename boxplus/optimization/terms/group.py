@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import run_chunks
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_change import TangentChange, tangent_change
+from boxplus.manifolds.tangents.change import TangentChange, tangent_change
 from boxplus.optimization.losses import SQUARED, Loss, Squared
 from boxplus.optimization.terms.variables import VariableRows
 from boxplus.optimization.terms.weighting import (

@@ -3,7 +3,7 @@
 A pose T_camera_world that turns about the origin of the world, while everything measured lies a million metres from there, moves
 what it measures by a million metres times the angle, which its translation has to take back: H loses the digits of the square of
 that. The same pose turned about itself has no such trouble. All updates of a pose are related by matrices of determinant one
-(`manifolds.tangent_change`), so that by Hadamard's inequality, det H ≤ Π Hᵢᵢ, the tangent with the smallest product of the
+(`manifolds.tangents.change`), so that by Hadamard's inequality, det H ≤ Π Hᵢᵢ, the tangent with the smallest product of the
 diagonal is the best conditioned. The one that the variables were given stays, unless another is better by far; what the user sees
 (values, covariances) does not depend on it.
 """
@@ -21,7 +21,7 @@ from boxplus.manifolds.body_pose import BodyPose
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.se3 import SE3, SE3Left
-from boxplus.manifolds.tangent_change import POSES, tangent_change
+from boxplus.manifolds.tangents.change import POSES, tangent_change
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout
 

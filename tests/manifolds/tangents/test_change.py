@@ -14,7 +14,7 @@ from boxplus.manifolds.quaternion import UnitQuaternion
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3, SE3Left
 from boxplus.manifolds.so3 import SO3
-from boxplus.manifolds.tangent_change import tangent_change
+from boxplus.manifolds.tangents.change import tangent_change
 
 POSES = [SE3, SE3Left, Product(UnitQuaternion, Euclidean(3)), CameraPose]
 

@@ -7,7 +7,7 @@ import pytest
 
 import boxplus as bp
 from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.tangent_change import POSES
+from boxplus.manifolds.tangents.change import POSES
 
 CAMERA = bp.Pinhole(500.0, 500.0, 320.0, 240.0)
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])

@@ -16,7 +16,7 @@ from boxplus.manifolds import quaternion
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.product import Product
 from boxplus.manifolds.quaternion import UnitQuaternion
-from boxplus.manifolds.tangent_change import POSES
+from boxplus.manifolds.tangents.change import POSES
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables

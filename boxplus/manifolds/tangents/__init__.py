@@ -1,0 +1,1 @@
+"""How points move with a tangent: from one ⊞ to another, by a small step, and what automatic differentiation begins with."""
