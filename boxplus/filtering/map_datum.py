@@ -86,6 +86,11 @@ class MapDatum:
         self._local_points = 0.0
         self._new_share = 0.0
 
+    @property
+    def new_share(self) -> float:
+        """Of the local map, what the last scan has brought to it; 0 to 1."""
+        return self._new_share
+
     def follow(
         self,
         x: NDArray[np.float64],

@@ -6,7 +6,8 @@ So every few seconds the newest scan is registered to a map of a few scans only,
 estimate; both sets of scans are placed as the filter has placed them. How far the registration moves is the error that
 has come up in between, but for
 
-    C = S + D        S: covariance of this registration,   D: of the newest pose against the one a baseline ago
+    C = S + D        S: covariance of this registration,   D: of the newest pose against the one a baseline ago,
+                     with what an uncertain mounting adds to it (`mounting_drift`)
 
 What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
 four standard deviations. Directions of the new scan that the old ones do not determine stay where the estimate has them.
@@ -30,6 +31,7 @@ from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.systems.lidar_inertial_agreement.registration import align
+from boxplus.systems.lidar_inertial_odometry.mounting_drift import MountingDrift
 
 _BASELINE_NS = 1_250_000_000
 _MAP_SCANS = 5
@@ -76,6 +78,7 @@ class LongBaseline:
         p_lidar: NDArray[np.float32],
         p_world: NDArray[np.float64],
         datum: MapDatum,
+        mounting: MountingDrift | None = None,
     ) -> Drift | None:
         """Take a scan that the filter has placed; what came out where a baseline has passed.
 
@@ -85,6 +88,7 @@ class LongBaseline:
             p_lidar: (n, 3) the points it was measured with, LiDAR frame at `time_ns`.
             p_world: (m, 3) the points it brings to the map.
             datum: at this state; it is widened by what comes out, and marked by the scans that the next ones are compared with.
+            mounting: what its uncertainty adds, marked likewise; None where it is taken for exact.
         """
         self._recent.append(p_world)
         if time_ns - self._old_ns < _BASELINE_NS and self._old:
@@ -92,7 +96,11 @@ class LongBaseline:
         if len(self._recent) < _MAP_SCANS:
             return None
         seconds = (time_ns - self._old_ns) * 1e-9
-        drift = self._compare(x, datum.covariance_since_mark(x), p_lidar, seconds) if self._old else None
+        between = datum.covariance_since_mark(x)
+        if mounting is not None:
+            between += mounting.covariance_since_mark(x)
+            mounting.mark()
+        drift = self._compare(x, between, p_lidar, seconds) if self._old else None
         if drift is not None:
             datum.widen(drift.excess, x)
         self._old, self._old_ns = list(self._recent), time_ns

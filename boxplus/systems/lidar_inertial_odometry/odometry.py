@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.iterated_update import Posterior, iterated_update
 from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
@@ -31,6 +30,8 @@ from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_m
 from boxplus.systems.lidar_inertial_odometry.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
+from boxplus.systems.lidar_inertial_odometry.mounted_update import mounted_update
+from boxplus.systems.lidar_inertial_odometry.mounting_drift import MountingDrift
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
 from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
@@ -39,13 +40,7 @@ from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
-    HeldMounting,
-    UnknownMounting,
-    mounting_known,
-    moved_sensitivity,
-    with_mounting,
-)
+from boxplus.systems.lidar_inertial_odometry.unknown_mounting import MOUNTING, UnknownMounting, mounting_known
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 
@@ -97,6 +92,7 @@ class LidarInertialOdometry(Snapshots):
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._datum = MapDatum(NavState.identity().pack(), self._cov, _SHARED_ERRORS)
         self._mounting, self._noise = UnknownMounting(NavState.identity().pack(), self.config), ObservedNoise(self.config)
+        self._mounting_drift: MountingDrift | None = None
         self._gap: str | None = None
 
     @property
@@ -198,6 +194,7 @@ class LidarInertialOdometry(Snapshots):
         known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]
         self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), _SHARED_ERRORS)
         self._mounting = UnknownMounting(self._x, self.config)
+        self._mounting_drift = None if self.config.extrinsic_estimation == "off" else MountingDrift(self._x)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
         self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
         if found.kind == "static":
@@ -228,21 +225,27 @@ class LidarInertialOdometry(Snapshots):
         clock.lap("voxel filter")
         measurement = self._measurement(frame, points)
         x_prior = self._x.copy()
-        posterior, cov_prior, cov_known = self._updated(measurement)
+        turns = self._excitation.sufficient
+        update = mounted_update(self._x, self._cov, measurement, self.config, self._unshown, turns=turns)
+        posterior, cov_prior = update.posterior, update.cov_prior
         on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-        correction = Correction.of(cov_known, posterior.A, posterior.last.directions) if taken else None
-        self._datum.follow(self._x, cov_prior, cov_known if taken else cov_prior, correction)
+        correction = Correction.of(update.cov, posterior.A, posterior.last.directions) if taken else None
+        self._datum.follow(self._x, cov_prior, update.cov if taken else cov_prior, correction)
+        if self._mounting_drift is not None:
+            after = self._x, update.B if taken else update.B_prior
+            self._mounting_drift.follow((x_prior, update.B_prior), after, self._cov[MOUNTING, MOUNTING], correction)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
         state = NavState.unpack(self._x)
         map_points_world = state.to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
-            drift = self._long_baseline.follow(self._time_ns, self._x, points, map_points_world, self._datum)
+            placed, shared = (self._x, points, map_points_world), (self._datum, self._mounting_drift)
+            drift = self._long_baseline.follow(self._time_ns, *placed, *shared)
             self._warnings += drift.warnings if drift is not None else []
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
@@ -250,24 +253,7 @@ class LidarInertialOdometry(Snapshots):
             self._insert(map_points_world)
         clock.lap("map insertion")
         status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
-        return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, cov_known, status), clock.laps)
-
-    def _updated(self, measurement: PlaneMeasurement) -> tuple[Posterior, NDArray[np.float64], NDArray[np.float64]]:
-        """The posterior, and the covariances before and after it with the mounting known."""
-        limits = {"max_iterations": self.config.max_iterations, "min_used": self.config.min_points}
-        if self.config.extrinsic_estimation == "off":
-            posterior = self._unshown.mark(iterated_update(self._x, self._cov, measurement, **limits))
-            return posterior, self._cov.copy(), posterior.cov
-        known, B = mounting_known(self._cov)
-        if self.config.extrinsic_estimation == "on" or self._excitation.sufficient:
-            posterior = self._unshown.mark(iterated_update(self._x, self._cov, measurement, **limits))
-            return posterior, known, mounting_known(posterior.cov)[0]
-        held = HeldMounting(measurement)
-        posterior = self._unshown.mark(iterated_update(self._x, known, held, **limits))
-        after = posterior.cov
-        if posterior.valid:
-            B = moved_sensitivity(B, after, replace(held.last, directions=posterior.last.directions))
-        return replace(posterior, cov=with_mounting(after, B)), known, after
+        return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, update.cov, status), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
@@ -356,6 +342,8 @@ class LidarInertialOdometry(Snapshots):
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
         self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
+        if self._mounting_drift is not None:
+            self._mounting_drift.insert(self._datum.new_share)
 
     def _estimate(
         self,

@@ -27,7 +27,8 @@ from boxplus.filtering.nav_state import PL, RL, T_G, T_P, T_THETA, T_THETA_L, TA
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
-_REST, _MOUNTING = slice(0, T_THETA_L), slice(T_THETA_L, TANGENT)
+MOUNTING = slice(T_THETA_L, TANGENT)
+_REST = slice(0, T_THETA_L)
 _POSE = slice(0, 6)
 
 
@@ -122,18 +123,18 @@ def first_sensitivity(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def with_mounting(cov: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
     """P (24, 24) of a covariance with the mounting known, and how the rest of the state moves with it, B (18, 6)."""
     whole = cov.copy()
-    shared = B @ cov[_MOUNTING, _MOUNTING]
+    shared = B @ cov[MOUNTING, MOUNTING]
     whole[_REST, _REST] += shared @ B.T
-    whole[_REST, _MOUNTING], whole[_MOUNTING, _REST] = shared, shared.T
+    whole[_REST, MOUNTING], whole[MOUNTING, _REST] = shared, shared.T
     return whole
 
 
 def mounting_known(cov: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The same backwards: P (24, 24) with the mounting known, its own variances beside, and B (18, 6)."""
-    B = np.linalg.solve(cov[_MOUNTING, _MOUNTING], cov[_MOUNTING, _REST]).T.astype(np.float64)
+    B = np.linalg.solve(cov[MOUNTING, MOUNTING], cov[MOUNTING, _REST]).T.astype(np.float64)
     known = cov.copy()
-    known[_REST, _REST] -= B @ cov[_MOUNTING, _REST]
-    known[_REST, _MOUNTING], known[_MOUNTING, _REST] = 0.0, 0.0
+    known[_REST, _REST] -= B @ cov[MOUNTING, _REST]
+    known[_REST, MOUNTING], known[MOUNTING, _REST] = 0.0, 0.0
     return known, B
 
 

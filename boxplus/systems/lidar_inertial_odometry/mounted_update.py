@@ -1,0 +1,72 @@
+"""The update by one scan where the mounting is known, where the scan is asked about it, and where it is held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+    HeldMounting,
+    mounting_known,
+    moved_sensitivity,
+    with_mounting,
+)
+from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
+
+_KNOWN = np.zeros((18, 6))
+
+
+@dataclass(frozen=True, slots=True)
+class MountedUpdate:
+    """What a scan has made of the state.
+
+    Attributes:
+        posterior: state and covariance, that of the mounting included.
+        cov_prior, cov: (24, 24) before and after the scan, with the mounting known.
+        B_prior, B: (18, 6) how the rest of the state moves with the mounting, before and after; zero where it is taken for exact.
+    """
+
+    posterior: Posterior
+    cov_prior: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    B_prior: NDArray[np.float64]
+    B: NDArray[np.float64]
+
+
+def mounted_update(
+    x: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    measurement: Measurement,
+    config: LioConfig,
+    unshown: UnshownMotion,
+    *,
+    turns: bool,
+) -> MountedUpdate:
+    """Update a prediction by a scan.
+
+    Args:
+        x, cov: (36,) and (24, 24), predicted.
+        measurement: the scan against the map.
+        config: of the odometry.
+        unshown: marks directions that nothing has shown.
+        turns: whether the platform turns so that a scan says something of the mounting.
+    """
+    limits = {"max_iterations": config.max_iterations, "min_used": config.min_points}
+    if config.extrinsic_estimation == "off":
+        posterior = unshown.mark(iterated_update(x, cov, measurement, **limits))
+        return MountedUpdate(posterior, cov.copy(), posterior.cov, _KNOWN, _KNOWN)
+    known, B = mounting_known(cov)
+    if config.extrinsic_estimation == "on" or turns:
+        posterior = unshown.mark(iterated_update(x, cov, measurement, **limits))
+        after, moved = mounting_known(posterior.cov)
+        return MountedUpdate(posterior, known, after, B, moved)
+    held = HeldMounting(measurement)
+    posterior = unshown.mark(iterated_update(x, known, held, **limits))
+    after, moved = posterior.cov, B
+    if posterior.valid:
+        moved = moved_sensitivity(B, after, replace(held.last, directions=posterior.last.directions))
+    return MountedUpdate(replace(posterior, cov=with_mounting(after, moved)), known, after, B, moved)
