@@ -49,11 +49,12 @@ def kernel(
         "fastmath": flags,
         "_nrt": not borrow,
         "boundscheck": checked,
+        "no_cfunc_wrapper": True,  # of functions that are passed as values, which none of ours is; 5 % of compiling
     }
     if inline:
         options["forceinline"] = True
     if internal:
-        options["no_cpython_wrapper"] = options["no_cfunc_wrapper"] = True
+        options["no_cpython_wrapper"] = True
     dispatcher = numba.njit(**options)(function)
     if cached and not numba_config.DISABLE_JIT:  # type: ignore[attr-defined]
         dispatcher._cache = KernelCache(dispatcher.py_func, cached if isinstance(cached, str) else None)
