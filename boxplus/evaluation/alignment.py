@@ -16,6 +16,8 @@ PositionAlignment = Literal["none", "yaw", "se3", "sim3"]
 AlignmentKind = Literal["none", "yaw", "se3", "sim3", "origin"]
 
 _COINCIDENT_M = 1e-6
+_CLEARLY = 0.25  # of the squared error of a rotation, that of a mirror image
+_ROUNDING = 1e-9  # of the mean squared size of a path, below which its errors are none
 _COLLINEAR = 1e-3  # second against first principal standard deviation
 
 
@@ -96,8 +98,16 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignm
     U, d, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
     sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
     R = (U * sign) @ Vt
-    scale = float((d * sign).sum() / ((x - mean_x) ** 2).sum(axis=1).mean()) if kind == "sim3" else 1.0
-    mirrored = bool(sign[2] < 0 and d[2] > 0.1 * d[1])
+    sizes = [float(((p - mean) ** 2).sum(axis=1).mean()) for p, mean in ((x, mean_x), (y, mean_y))]
+    scale = float((d * sign).sum()) / sizes[0] if kind == "sim3" else 1.0
+
+    def left(fit: float) -> float:
+        """Mean squared error with Σ ȳᵀ R x̄ = fit, R a rotation or a mirror image."""
+        return sizes[1] - fit * fit / sizes[0] if kind == "sim3" else sizes[0] + sizes[1] - 2.0 * fit
+
+    rigid = left(float((d * sign).sum()))
+    clearly = rigid > _ROUNDING * sizes[1] and left(float(d.sum())) < _CLEARLY * rigid
+    mirrored = bool(sign[2] < 0 and (d[2] > 0.1 * d[1] or clearly))
     return Alignment(kind, R, mean_y - scale * R @ mean_x, scale, spread, mirrored)
 
 

@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
-from boxplus.evaluation.alignment import Alignment, align
+from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.association import Association
 from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
 
+_MIRROR = "a mirror image would fit better than any rotation: does one of the files have a flipped axis, or two that are swapped?"
 _W_LAST = [1, 2, 3, 0]  # takes for (w, x, y, z) what was read as (x, y, z, w)
 _FAR_DEG = 10.0  # scatter of the orientations' differences that no estimate of these positions has
 _CLEARLY = 0.2  # times the error as read, that of another reading has to reach
 _AS_GOOD = 1.5  # times the error of the better one of two readings, up to which either may be meant
 _SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from 1, from which on a scale is told
+_LEAST, _ROUNDS, _TURNS = 50, 10, 0.05  # poses; repetitions; turning in rad, about every axis, for another point to show
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
 
@@ -49,10 +51,11 @@ def alignment_doubts(
             "is mostly noise"
         )
     if alignment.mirrored:
-        doubts.append("a mirror image would fit better than any rotation: does one of the files have a flipped axis?")
-    mean = rotation.mean(axis=0)
+        doubts.append(_MIRROR)
+    R = so3.exp(rotation)
+    mean = so3.log(_mean_rotation(R)[None])[0]
     constant = float(np.degrees(np.linalg.norm(mean)))
-    scatter = float(np.degrees(np.sqrt(np.mean(np.sum((rotation - mean) ** 2, axis=1)))))
+    scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     if constant > 2.0 and scatter < min(0.5 * constant, _FAR_DEG) and not (undetermined or about_line):
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
@@ -64,12 +67,14 @@ def alignment_doubts(
 
 
 def reading_doubts(association: Association, alignment: Alignment, translation: NDArray[np.float64]) -> list[str]:
-    """Whether files agree far better read in another way: order of the quaternion, inverted poses, another scale."""
+    """Whether files agree far better read in another way: quaternion's order, inverse, scale, point of the body."""
     estimate, truth, rmse = association.estimate, association.ground_truth, rms(translation)
     return [
         *_orientation_doubts(estimate, truth, alignment, rmse),
         *_inversion_doubts(estimate, truth, alignment, rmse),
         *_scale_doubts(estimate, truth, alignment),
+        *_lever_doubts(estimate, truth, alignment),
+        *_world_doubts(estimate, truth, alignment, rmse),
     ]
 
 
@@ -147,12 +152,62 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
         )
 
 
+def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Iterator[str]:
+    """Whether the ground truth is that of another point of the body: p_truth = s R (p + R_estimate l) + t, with l sought."""
+    if alignment.kind not in ("se3", "sim3") or len(estimate) < _LEAST:
+        return
+    kind: PositionAlignment = "sim3" if alignment.kind == "sim3" else "se3"
+    found = align(estimate.p, truth.p, kind)
+    rmse = rms(np.linalg.norm(found.apply(estimate).p - truth.p, axis=1))
+    turned = (estimate.R - estimate.R.mean(axis=0)).reshape(-1, 3)
+    if np.linalg.svd(turned, compute_uv=False)[-1] < _TURNS * np.sqrt(len(estimate)):
+        return
+    for _ in range(_ROUNDS):  # the lever given the alignment, and the other way round: they hardly depend on each other
+        rest = (truth.p - found.apply(estimate).p) @ found.R_world_estimate / found.scale
+        lever = np.linalg.lstsq(turned, (rest - rest.mean(axis=0)).reshape(-1), rcond=None)[0]
+        moved = replace(estimate, p=estimate.p + estimate.R @ lever, covariance=None, lines=None)
+        found = align(moved.p, truth.p, kind)
+    error = rms(np.linalg.norm(found.apply(moved).p - truth.p, axis=1))
+    if error < min(_SCALED * rmse, _FITS * found.spread_m[0]) and np.linalg.norm(lever) > error:
+        x, y, z = lever
+        yield (
+            f"the ground truth seems to be that of another point of the body, at ({x:.3f}, {y:.3f}, {z:.3f}) m in the frame of "
+            f"the estimate's: of that point the ATE is {error:.4g} m instead of {rmse:.4g} m (where the axes of both bodies are "
+            f"parallel, --transform-right 'xyz: {-x:.3f} {-y:.3f} {-z:.3f}')"
+        )
+
+
+def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
+    """Whether an alignment that leaves the world as it is, or its vertical, hides that the worlds have other axes."""
+    if alignment.kind in ("se3", "sim3"):
+        return
+    try:
+        found = align(estimate.p, truth.p)
+    except InputError:
+        return
+    if found.mirrored:
+        yield _MIRROR
+    error = rms(np.linalg.norm(found.apply(estimate).p - truth.p, axis=1))
+    if not error < min(_CLEARLY * rmse, _FITS * found.spread_m[0]):
+        return
+    angle = float(np.degrees(np.linalg.norm(so3.log(found.R_world_estimate[None])[0])))
+    yield (
+        f"with a rotation by {angle:.1f}° and a translation by {np.linalg.norm(found.p_world_estimate):.4g} m the ATE is "
+        f"{error:.4g} m instead of {rmse:.4g} m: the worlds of the two files are not the same, or differ in axes (ENU, NED): "
+        "--align se3"
+    )
+
+
 def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> float:
     """Root mean square of how far relative rotations are from their mean [degrees]."""
     between = np.swapaxes(R_other, 1, 2) @ R_one
-    U, _, Vt = np.linalg.svd(between.mean(axis=0))
-    mean = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
-    return float(np.degrees(rms(np.linalg.norm(so3.log(mean.T @ between), axis=1))))
+    return float(np.degrees(rms(np.linalg.norm(so3.log(_mean_rotation(between).T @ between), axis=1))))
+
+
+def _mean_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation (3, 3) nearest to all of (M, 3, 3); that of half turns, too, whose rotation vectors cancel."""
+    U, _, Vt = np.linalg.svd(R.mean(axis=0))
+    return np.asarray((U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt)
 
 
 def _turned_deg(trajectory: Trajectory) -> float:

@@ -11,8 +11,7 @@ from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
 _LEAST_OVERLAP_S = 5.0
-_LARGEST_OFFSET_S = 2.0
-_LEAST_CORRELATION = 0.8
+_NEAR, _FAR = (2.0, 0.8), (60.0, 0.9)  # largest offset [s] and the correlation it takes; far ones have more to choose from
 _MOST_SAMPLES = 60_000
 
 
@@ -34,7 +33,7 @@ class TimeOffset:
 def estimate_time_offset(
     t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
 ) -> TimeOffset | None:
-    """Correlate the speeds of both trajectories within ±2 s.
+    """Correlate the speeds of both trajectories within ±2 s, and where nothing fits there, within ±60 s.
 
     Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation
     not on their scale. The better of the two signals counts.
@@ -44,7 +43,8 @@ def estimate_time_offset(
         estimate, ground_truth: the trajectories.
 
     Returns:
-        None where the trajectories overlap for less than 5 s, or no offset gives a correlation of 0.8 inside the range.
+        None where the trajectories overlap for less than 5 s, or no offset gives a correlation of 0.8 (beyond 2 s
+        0.9) inside the range; that is a quarter of the overlap at most.
     """
     begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
     if float(end - begin) * 1e-9 < _LEAST_OVERLAP_S or min(len(estimate), len(ground_truth)) < 20:
@@ -53,19 +53,29 @@ def estimate_time_offset(
         float(np.median(np.diff(t_ground_truth))), 0.2 * float(np.median(np.diff(t_estimate))), float(end - begin) / _MOST_SAMPLES
     )
     grid = np.arange(0.0, float(end - begin), step)
-    lags = min(int(_LARGEST_OFFSET_S * 1e9 / step), len(grid) // 4)
-    if lags < 2:
-        return None
     # Both speeds over the same window: that of the estimate's own rate, or 0.1 s.
     window = max(float(np.median(np.diff(t_estimate))), 1e8, 2.0 * step)
-    found = []
-    for signal, difference in (("rotation", _rotation_speed), ("translation", _translation_speed)):
-        a = difference(t_estimate - begin, estimate, grid, window)
-        b = difference(t_ground_truth - begin, ground_truth, grid, window)
-        lag, correlation = _best_lag(a, b, lags)
-        if correlation >= _LEAST_CORRELATION and abs(lag) < lags:
-            found.append(TimeOffset(lag * step * 1e-9, correlation, signal))
-    return max(found, key=lambda offset: offset.correlation, default=None)
+    speeds = [
+        (
+            signal,
+            difference(t_estimate - begin, estimate, grid, window),
+            difference(t_ground_truth - begin, ground_truth, grid, window),
+        )
+        for signal, difference in (("rotation", _rotation_speed), ("translation", _translation_speed))
+    ]
+    for largest_s, least in (_NEAR, _FAR):
+        lags = min(int(largest_s * 1e9 / step), len(grid) // 4)
+        if lags < 2:
+            return None
+        tried = [(signal, *_best_lag(a, b, lags)) for signal, a, b in speeds]
+        found = [
+            TimeOffset(lag * step * 1e-9, correlation, signal)
+            for signal, lag, correlation in tried
+            if correlation >= least and abs(lag) < lags
+        ]
+        if found:
+            return max(found, key=lambda offset: offset.correlation)
+    return None
 
 
 def _translation_speed(

@@ -1,0 +1,79 @@
+"""Files that mean something else than a comparison takes them for, and large errors that are none of the estimate's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from boxplus.evaluation.evaluation import evaluate
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
+
+ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FLU_FRD = np.diag([1.0, -1.0, -1.0])
+
+
+def path(seed: int = 0, noise_m: float = 0.0) -> Trajectory:
+    """A minute along a path that is flatter than wide and turns about every axis, with noise or without."""
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(600)
+    p = np.stack([10 * np.cos(0.1 * t) + 3 * np.sin(0.23 * t), 10 * np.sin(0.13 * t) + 2 * np.cos(0.31 * t), np.sin(0.2 * t)], 1)
+    yaw = 0.13 * t + np.sin(0.2 * t)
+    R = so3.exp(np.stack([0.0 * t, 0.0 * t, yaw], 1)) @ so3.exp(
+        np.stack([0.15 * np.cos(0.3 * t), 0.2 * np.sin(0.4 * t), 0.0 * t], 1)
+    )
+    R = R @ so3.exp(0.1 * noise_m * rng.standard_normal((600, 3)))
+    stamps = (1_700_000_000_000_000_000 + np.round(1e9 * t)).astype(np.int64)
+    return Trajectory(stamps, p + noise_m * rng.standard_normal(p.shape), quaternion.from_matrix(R))
+
+
+def moved(trajectory: Trajectory, p: np.ndarray, R: np.ndarray | None = None) -> Trajectory:
+    return replace(trajectory, p=p, q_wxyz=trajectory.q_wxyz if R is None else quaternion.from_matrix(np.ascontiguousarray(R)))
+
+
+def told(estimate: Trajectory, **settings) -> str:
+    return " // ".join(evaluate(estimate, path(), **settings).warnings)
+
+
+@pytest.mark.parametrize("alignment", ["none", "origin", "yaw", "se3", "sim3"])
+def test_a_sound_estimate_is_not_doubted(alignment):
+    assert told(path(1, 0.03), alignment=alignment) == ""
+
+
+@pytest.mark.parametrize("alignment", ["none", "yaw", "se3", "sim3"])
+@pytest.mark.parametrize("change", [lambda p: p * [1, -1, 1], lambda p: p * [1, 1, -1], lambda p: p[:, [1, 0, 2]]])
+def test_a_mirrored_path_is_told(change, alignment):
+    estimate = path(1, 0.03)
+    assert "a mirror image would fit better" in told(moved(estimate, change(estimate.p)), alignment=alignment)
+
+
+def test_body_frames_half_a_turn_apart_are_told():
+    estimate = path(1, 0.03)
+    assert "the orientations differ by a constant 180.0" in told(moved(estimate, estimate.p, estimate.R @ FLU_FRD))
+
+
+@pytest.mark.parametrize("alignment", ["none", "origin", "yaw"])
+def test_north_east_down_against_east_north_up_is_told(alignment):
+    estimate = path(1, 0.03)
+    ned = moved(estimate, estimate.p @ ENU_NED.T, ENU_NED @ estimate.R @ FLU_FRD)
+    assert "differ in axes (ENU, NED)" in told(ned, alignment=alignment)
+
+
+@pytest.mark.parametrize("offset_s", [-3.0, 3.0, 9.0])
+def test_clocks_seconds_apart_are_told(offset_s):
+    estimate = path(1, 0.003)
+    later = replace(estimate, time_ns=estimate.time_ns + int(1e9 * offset_s))
+    advised = float(told(later).split("with --offset ")[1].split()[0])
+    assert advised == pytest.approx(-offset_s, abs=0.01)  # a tenth of the time between poses
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+def test_another_point_of_the_body_is_told(alignment):
+    estimate = path(1, 0.01)
+    point = np.array([0.5, 0.0, 0.3])
+    result = evaluate(moved(estimate, estimate.p + estimate.R @ point), path(), alignment=alignment)
+    (text,) = (text for text in result.warnings if "another point of the body" in text)
+    numbers = np.array(text.split("(")[1].split(")")[0].split(","), dtype=float)
+    np.testing.assert_allclose(numbers, -point, atol=0.05)
