@@ -27,7 +27,7 @@ _COMMANDS = {
     ),
     "refine": (
         "boxplus.cli.lidar.refine:refine_command",
-        "Refine a finished run of lio: all poses, planes and IMU samples at once.",
+        "Refine a finished run of lio or slam: all poses, planes and IMU samples at once.",
     ),
     "localize": ("boxplus.cli.lidar.localize:localize", "Find where a recording is in a saved map, and follow it there."),
     "vio": ("boxplus.cli.cameras.vio:vio", "Turn a recording of cameras and an IMU into a trajectory, landmarks and a report."),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -92,3 +93,12 @@ def test_a_shell_is_told_commands_and_options() -> None:
 
     assert completions("boxplus lo").split() == ["localize"] or "localize" in completions("boxplus lo")
     assert "--threads" in completions("boxplus lio --thr").split()
+
+
+def test_the_page_of_the_command_line_has_a_row_for_every_command() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "command_line.md").read_text(encoding="utf-8")
+    table = page.partition("### Exit codes")[0]
+    assert [path for path in ALL if not re.search(rf"`(boxplus )?{path}[` ]", table)] == []
+    (told,) = re.findall(r"^(.*) take `--json` and `--quiet`", page, re.MULTILINE)
+    both = {path for path, command in ALL.items() if {"--json", "--quiet"} <= {name for p in command.params for name in p.opts}}
+    assert set(re.findall(r"`([^`]+)`", told)) == {"calibrate" if path.startswith("calibrate") else path for path in both}
