@@ -59,6 +59,7 @@ class PlaneMap:
         thickness: (P,) standard deviation of the points across each [m].
         cell: edge of the smallest voxels [m].
         keys, plane_of: table of these voxels, and the plane of each, −1 for none.
+        is_one_sided: normals point to where a plane is seen from, and nothing is on it that was seen from behind.
     """
 
     planes: NDArray[np.float64]
@@ -67,26 +68,42 @@ class PlaneMap:
     cell: float
     keys: NDArray[np.int64]
     plane_of: NDArray[np.int32]
+    is_one_sided: bool = False
 
     def __len__(self) -> int:
         return len(self.planes)
 
-    def refitted(self, clusters: NDArray[np.float64]) -> PlaneMap:
-        """With planes through all the points that lie on them: Σ [x; 1][x; 1]ᵀ (P, 4, 4) in the world, from their centres."""
+    def seen_from(self, p: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(k,) 1 where p (3,) lies before planes `numbers` (k,), 0 where it lies behind them, by their normals."""
+        height = np.einsum("ki,ki->k", self.planes[numbers, :3], p - self.centres[numbers]) + self.planes[numbers, 3]
+        side: NDArray[np.int64] = (height > 0.0).astype(np.int64)
+        return side
+
+    def refitted(self, clusters: NDArray[np.float64], side: NDArray[np.int64]) -> PlaneMap:
+        """With planes through the points that lie on them and were seen from one side.
+
+        Args:
+            clusters: (P, 4, 4) Σ [x; 1][x; 1]ᵀ of these points in the world, from the planes' centres.
+            side: (P,) 1 where they were seen from before it, 0 where from behind.
+        """
         count = np.maximum(clusters[:, 3, 3], 1.0)
         mean = clusters[:, :3, 3] / count[:, None]
         values, vectors = np.linalg.eigh(clusters[:, :3, :3] / count[:, None, None] - mean[:, :, None] * mean[:, None, :])
-        planes, centres, thickness = self.planes.copy(), self.centres.copy(), self.thickness.copy()
+        planes, centres, thickness = self.planes * (2.0 * side - 1.0)[:, None], self.centres.copy(), self.thickness.copy()
         seen = clusters[:, 3, 3] >= _FEWEST
-        planes[seen, :3], planes[seen, 3] = vectors[seen, :, 0], 0.0
+        turned = np.where(np.einsum("pi,pi->p", vectors[:, :, 0], planes[:, :3]) < 0.0, -1.0, 1.0)[:, None]
+        planes[seen, :3], planes[seen, 3] = (turned * vectors[:, :, 0])[seen], 0.0
         centres[seen] += mean[seen]
         thickness[seen] = np.sqrt(np.maximum(values[seen, 0], 0.0))
-        return replace(self, planes=planes, centres=centres, thickness=thickness)
+        return replace(self, planes=planes, centres=centres, thickness=thickness, is_one_sided=True)
 
     def clusters_of(
         self, points: NDArray[np.float32], R: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The planes that points (n, 3), placed by R and p, lie on, and Σ [x; 1][x; 1]ᵀ (k, 4, 4) of those on each, as given."""
+        """The planes that points (n, 3), placed by R and p, lie on, and Σ [x; 1][x; 1]ᵀ (k, 4, 4) of those on each, as given.
+
+        p is where they were seen from, too.
+        """
         # A plane that was found by half of its points, beside a face of its voxel, is thinner than it will be.
         usual = float(np.median(self.thickness)) if len(self) else 0.0
         gate = _GATE * np.maximum(self.thickness, max(usual, _NEGLIGIBLE_M))
@@ -94,6 +111,8 @@ class PlaneMap:
         touched = np.empty(len(self), dtype=np.int64)
         count = _on_planes(points, R, p, self.cell, self.keys, self.plane_of, self.planes, self.centres, gate, sums, touched)
         found = np.sort(touched[:count])
+        if self.is_one_sided:
+            found = found[self.seen_from(p, found) == 1]
         return found, clusters(sums[found])
 
 

@@ -61,18 +61,22 @@ def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: R
     for k, R, p, points in _placed(run, T_lidar, judging=False):
         voxels.add(points, R, p, int(keyframes.of_scan[k]))
     planes = find_planes(voxels, config)
-    world = np.zeros((len(planes), 4, 4))
-    facing = np.zeros(len(planes))  # sum over points of the squared cosine of the angle at which the plane is seen
-    latest, seen_by = np.full(len(planes), -1), np.zeros(len(planes))
+    world = np.zeros((2, len(planes), 4, 4))  # seen from behind, and from before
+    facing = np.zeros((2, len(planes)))  # sum over points of the squared cosine of the angle at which the plane is seen
+    latest, seen_by = np.full((2, len(planes)), -1), np.zeros((2, len(planes)))
     for k, R, p, points in _placed(run, T_lidar, judging=False):
         found, own = planes.clusters_of(points, R, p)
-        world[found] += _moved(own, R, p - planes.centres[found])
-        seen_by[found] += latest[found] != keyframes.of_scan[k]
-        latest[found] = keyframes.of_scan[k]
+        at = planes.seen_from(p, found), found
+        world[at] += _moved(own, R, p - planes.centres[found])
+        seen_by[at] += latest[at] != keyframes.of_scan[k]
+        latest[at] = keyframes.of_scan[k]
         mean = own[:, :3, 3] / own[:, 3:, 3]
         along = np.einsum("ki,ki->k", planes.planes[found, :3] @ R, mean) / np.linalg.norm(mean, axis=1)
-        facing[found] += own[:, 3, 3] * along**2
-    planes = planes.refitted(world)
+        facing[at] += own[:, 3, 3] * along**2
+    side = np.argmax(world[:, :, 3, 3], axis=0)
+    own_side = side, np.arange(len(planes))
+    world, facing, seen_by = world[own_side], facing[own_side], seen_by[own_side]
+    planes = planes.refitted(world, side)
     count = world[:, 3, 3]
     facing = np.maximum(facing / np.maximum(count, 1.0), _LEAST_FACING)
     usual = np.maximum(facing * _usual(planes.thickness**2 / facing, count), _SMOOTH**2)

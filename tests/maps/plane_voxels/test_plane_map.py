@@ -83,12 +83,27 @@ def test_a_wall_in_a_face_between_voxels_is_taken_whole() -> None:
         T = np.tile(np.eye(4), (len(numbers), 1, 1))
         T[:, :3, 3] = -found.centres[numbers]
         world[numbers] += T @ own @ np.swapaxes(T, 1, 2)
-    fitted = found.refitted(world)
+    fitted = found.refitted(world, np.ones(len(found), dtype=np.int64))
     is_wall = (np.abs(found.planes[:, 0]) > 0.9) & (np.abs(found.centres[:, 0] - 4.0) < 0.1)
     seen = np.flatnonzero(is_wall & (world[:, 3, 3] > 0.0))
     assert world[seen, 3, 3].sum() > 0.8 * 12_000
     np.testing.assert_allclose(fitted.centres[seen, 0], 4.0, atol=0.004)
     np.testing.assert_allclose(fitted.thickness[seen], SIGMA, rtol=0.1)
+
+
+def test_what_was_seen_from_behind_is_on_another_plane() -> None:
+    """The ceiling below a floor is as flat as the floor, and with a drift of a hand's breadth lies in the same place."""
+    rng = np.random.default_rng(7)
+    points = wall(2.2, rng)
+    found = planes_of(points, wall(2.2, rng))
+    there = np.hstack([points - found.centres[0], np.ones((len(points), 1))])
+    sides = (np.zeros(3), np.array([4.0, 0.0, 0.0]))
+    for number, seen_from in enumerate(sides):
+        fitted = found.refitted(np.einsum("ni,nj->ij", there, there)[None], found.seen_from(seen_from, np.arange(1)))
+        assert fitted.planes[0, :3] @ (seen_from - fitted.centres[0]) > 0.0
+        for other, p in enumerate(sides):
+            own = fitted.clusters_of((points - p).astype(np.float32), np.eye(3), p)[0]
+            assert len(own) == (other == number)
 
 
 def test_points_near_two_planes_belong_to_neither() -> None:
