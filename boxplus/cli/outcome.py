@@ -45,7 +45,7 @@ class Outcome(BaseModel):
     def end(self, run: BaseModel | None, state: str = "finished", *, untrusted: bool = False) -> None:
         """It came to an end: with this state of `run.json`, and with results that are to be trusted or not."""
         self.run = run
-        if state == "interrupted":
+        if state == "interrupted" or self.exit_code == EXIT_INTERRUPTED:
             self.outcome, self.exit_code = "interrupted", EXIT_INTERRUPTED
         elif untrusted:
             self.outcome, self.exit_code = "not to be trusted", EXIT_UNTRUSTED
@@ -59,10 +59,16 @@ class Outcome(BaseModel):
 
     @contextmanager
     def drawing(self, terminal: Terminal) -> Iterator[None]:
-        """The report is drawn in this block; where that fails the run is as good without it, and the exit code says so."""
+        """The report is drawn in this block; where that fails the run is as good without it, and the exit code says so.
+
+        Ctrl-C leaves the report out, not the results.
+        """
         try:
             with terminal.status("drawing the report"):
                 yield
+        except KeyboardInterrupt:
+            self.exit_code = EXIT_INTERRUPTED
+            self._also("interrupted: the report was not drawn, all other results are there")
         except Exception as error:  # noqa: BLE001 - results that took an hour are not to be lost for their pictures
             if not isinstance(error, BoxplusError):
                 traceback.print_exc()

@@ -93,6 +93,19 @@ def test_a_report_that_cannot_be_drawn_hides_no_run(
     assert ("Traceback" in printed.err) == (not isinstance(error, OutputError))
 
 
+@pytest.mark.parametrize("untrusted", [False, True])
+def test_an_interrupt_leaves_the_report_out_and_not_the_results(untrusted: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as end, reported("walk.bag", "out", as_json=True) as told:
+        with told.drawing(Terminal(quiet=True, as_json=True)):
+            raise KeyboardInterrupt
+        told.end(Facts(), "finished", untrusted=untrusted)
+    printed = capsys.readouterr()
+    found = Outcome.model_validate_json(printed.out)
+    assert end.value.exit_code == found.exit_code == 130 and found.outcome == "interrupted" and found.run is not None
+    assert found.error == "interrupted: the report was not drawn, all other results are there"
+    assert "Traceback" not in printed.err
+
+
 def test_pgo_writes_its_results_where_the_report_cannot_be_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from boxplus.formats.graphs.g2o import write_g2o
     from boxplus.report.optimization import graph_report

@@ -128,9 +128,9 @@ def cameras(
             with atomic_file(folder / "camchain.yaml") as file:
                 file.write(camchain_text(found, summary, noise).encode())
         if not no_report:
-            from boxplus.report.cameras.calibration_report import write_calibration_report
-
             with outcome.drawing(terminal):
+                from boxplus.report.cameras.calibration_report import write_calibration_report
+
                 write_calibration_report(folder / "report.html", summary, found)
         summary.write(folder / "run.json")
         terminal.say(f"{folder}: {', '.join(name for name in FILES if (folder / name).exists())}")

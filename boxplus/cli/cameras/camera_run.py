@@ -81,9 +81,9 @@ def run_cameras(
             comparison = compare_with(truth, folder.trajectory, folder.evaluation, alignment(summary))
             shown.append(comparison.row)
         if report and frames:
-            from boxplus.report import write_report
-
             with outcome.drawing(terminal):
+                from boxplus.report import write_report
+
                 write_report(folder.path)
     terminal.print_results(summary, shown, folder.path, FILES)
     outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)

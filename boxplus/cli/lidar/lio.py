@@ -200,9 +200,9 @@ def run(
                     should_stop=asked,
                 )
             if report and summary.scans:
-                from boxplus.report import write_report
-
                 with outcome.drawing(terminal):
+                    from boxplus.report import write_report
+
                     write_report(folder)
         comparison, rows = None, _rows(summary)
         if ground_truth is not None and summary.scans:

@@ -84,9 +84,9 @@ def localize(
             with terminal.progress() as progress:
                 result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
             if not no_report:
-                from boxplus.report.localization_page import write_localization_report
-
                 with outcome.drawing(terminal):
+                    from boxplus.report.localization_page import write_localization_report
+
                     write_localization_report(folder, result)
         summary, files = result.summary, ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
         doubt = summary.contradiction

@@ -99,9 +99,9 @@ def refine_command(
                 summary, comparison = _compared(result, truth)
                 summary.write(claimed.summary)
             if not no_report and summary.state == "finished":
-                from boxplus.report.refinement_page import write_refinement_report
-
                 with outcome.drawing(terminal):
+                    from boxplus.report.refinement_page import write_refinement_report
+
                     write_refinement_report(folder, summary, result)
         _print(terminal, summary, comparison, folder)
         outcome.end(summary, summary.state)

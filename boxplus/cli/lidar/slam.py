@@ -130,9 +130,9 @@ def slam(
                     should_stop=should_stop,
                 )
             if not no_report:
-                from boxplus.report import write_report
-
                 with outcome.drawing(terminal):
+                    from boxplus.report import write_report
+
                     write_report(result)
         summary, rows, comparison = result.summary, _rows(result), None
         if truth is not None and summary.scans:

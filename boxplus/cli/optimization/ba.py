@@ -158,9 +158,9 @@ def ba(
         write_reconstruction(folder / name, result.reconstruction)
         _write_scene(folder / "scene.ply", result.reconstruction)
         if not no_report:
-            from boxplus.report.optimization.bundle_report import write_bundle_report
-
             with outcome.drawing(terminal):
+                from boxplus.report.optimization.bundle_report import write_bundle_report
+
                 write_bundle_report(folder, summary, start, result)
         terminal.conclude(summary, "px", folder, ["report.html", name, "scene.ply"], outcome)
 

@@ -54,9 +54,9 @@ def adjust_line_set(
         write_vgg_lines(folder / _ADJUSTED, result.data)
         _write_scene(folder / "scene.ply", result)
         if not no_report:
-            from boxplus.report.optimization.line_report import write_line_report
-
             with outcome.drawing(terminal):
+                from boxplus.report.optimization.line_report import write_line_report
+
                 write_line_report(folder, summary, start, result)
         terminal.conclude(summary, "px", folder, ["report.html", _ADJUSTED, "scene.ply"], outcome)
 

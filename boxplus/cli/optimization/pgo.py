@@ -173,9 +173,9 @@ def pgo(
         write_pose_graph(folder / name, result.graph, kind, rotation_error=rotation_error.value)
         _write_graph_ply(folder / "graph.ply", result.graph)
         if not no_report:
-            from boxplus.report.optimization.graph_report import write_graph_report
-
             with outcome.drawing(terminal):
+                from boxplus.report.optimization.graph_report import write_graph_report
+
                 write_graph_report(folder, summary, graph, result)
         if result.loops is not None or robust is not None:
             _write_edges(folder / "edges.csv", graph, result)
