@@ -96,6 +96,12 @@ class Solution:
         values = self.values[rows.block.number]
         return values if isinstance(selected, Variables) else values[self._problem.layout.rows(rows)]
 
+    def is_of(self, blocks: Sequence[Variables]) -> bool:
+        """Whether it solved the problem of these blocks, to which others may have been added since."""
+        return len(self._problem.layout.blocks) <= len(blocks) and all(
+            one is other for one, other in zip(self._problem.layout.blocks, blocks, strict=False)
+        )
+
     def values_of(self, blocks: Sequence[Variables]) -> list[NDArray[np.float64]]:
         """Values (n, size) of the variables that are in `blocks` now; those that were added since have their own."""
         layout = self._problem.layout

@@ -85,6 +85,10 @@ def marginalize(
     chosen = [leaving] if isinstance(leaving, (VariableRows, Variables)) else list(leaving)
     if not any(len(part) for part in chosen):
         raise InputError("variables to marginalise", "none", "select rows of a block, such as poses[[0]]")
+    if isinstance(at, Solution) and not at.is_of(problem.blocks):
+        raise InputError(
+            "a solution of this problem", "that of another one, where its values mean something else", "solve this one"
+        )
     if at is not None:
         problem.set_values(at)
     gone, touched = problem.reach_of(chosen)

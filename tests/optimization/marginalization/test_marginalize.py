@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from boxplus import SE2, SE3, Euclidean, InputError, Line3D, Problem, SE3Left, check_jacobian, losses, marginalize
 from boxplus.manifolds import se3
-from boxplus.residuals import Prior, RelativePose, UserResidual
+from boxplus.residuals import Prior, RelativePose, RelativePose2D, UserResidual
 from boxplus.residuals.marginal_prior import MarginalPrior
 from tests.optimization.conftest import dense_normal_equations, make_scene
 
@@ -263,3 +263,22 @@ def test_wrong_use_is_refused():
         MarginalPrior([PLANE], [], np.zeros((2, 2)), np.zeros(2))
     with pytest.raises(InputError, match="NaN"):
         MarginalPrior([PLANE], [[0.0, 0.0]], np.full((2, 2), np.nan), np.zeros(2))
+
+
+def test_a_solution_of_another_problem_is_refused_though_its_shapes_fit():
+    """Its values would be taken for those of this problem, and everything linearised at the wrong place."""
+
+    def chain(first):
+        problem = Problem()
+        poses = problem.add_variables(SE2, [[0.0, first, 0.0], [0.0, first + 1.0, 0.0]], name="poses")
+        problem.add_residuals(Prior(SE2, [0.0, first, 0.0], sigma=0.1), poses[0])
+        problem.add_residuals(RelativePose2D([0.0, 1.0, 0.0], sigma=0.1), poses[0], poses[1])
+        return problem, poses
+
+    (problem, poses), (other, _) = chain(0.0), chain(50.0)
+    with pytest.raises(InputError, match="expected a solution of this problem – got that of another one"):
+        marginalize(problem, poses[0], at=other.solve())
+    own = problem.solve()
+    added = problem.add_variables(Euclidean(1), [0.0])  # since then; the solution is one of this problem all the same
+    problem.add_residuals(Prior(Euclidean(1), [0.0], sigma=1.0), added)
+    assert marginalize(problem, poses[0], at=own).prior is not None
