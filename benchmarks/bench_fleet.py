@@ -42,7 +42,7 @@ from boxplus.runs.settings_file import load_settings
 from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.worlds.worlds import city
-from boxplus.systems.sessions.candidates import candidate_pairs
+from boxplus.systems.sessions.candidates import Looks
 
 ROOT = str(Path(__file__).resolve().parents[1])
 STEP_M, WAY_M, BLOCKS = 14.0, 40.0, 40
@@ -170,9 +170,9 @@ def _next(number: int) -> int:
 def index(count: int) -> tuple[float, float, float]:
     """CPU time [ms] and pairs of a recording, and the share of true pairs that is among them."""
     recordings = described(count)
-    candidate_pairs(recordings[:20], per_session=PER_SESSION)  # loads the kernels
+    Looks(recordings[:20]).pairs(PER_SESSION)  # loads the kernels
     began = time.process_time()
-    pairs = candidate_pairs(recordings, per_session=PER_SESSION)
+    pairs = Looks(recordings).pairs(PER_SESSION)
     ms = 1e3 * (time.process_time() - began) / count
     true = {(min(k, _next(k)), max(k, _next(k))) for k in range(count)}
     share = len(true & set(pairs)) / len(true)

@@ -2,14 +2,17 @@
 
 Locality-sensitive hashing: each table keys a descriptor by some of its bits, so that descriptors that differ little meet in a
 bucket of one table or another, and a query looks at a few hundred thousandths of all. The number of key bits grows with the
-number of features, which keeps buckets short. A place gets a vote for every query feature that has a match in it; the places with
-most votes are matched feature by feature and aligned by a rigid motion of the ground.
+number of features, which keeps buckets short. A place gets a vote for every query feature that has a match in it. What is seen in
+many places tells little of where one is: a vote weighs the less, the more places a feature votes for. The places of most weight
+are matched feature by feature and aligned by a rigid motion of the ground.
 
-Source: Indyk and Motwani, Approximate Nearest Neighbors, STOC 1998 (bit sampling for the Hamming distance).
+Sources: Indyk and Motwani, Approximate Nearest Neighbors, STOC 1998 (bit sampling for the Hamming distance); Sparck Jones, A
+Statistical Interpretation of Term Specificity and its Application in Retrieval, Journal of Documentation 28(1), 1972 (weights).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +50,26 @@ class Candidate:
     seen_at: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Votes:
+    """Places that have features of a query.
+
+    Attributes:
+        places: (n,) int32 their numbers, ascending.
+        count: (n,) int32 features of the query that have a match there.
+        weight: (n,) sum of what each of these tells: log(1 + N/m) of one that has a match in m of N places.
+    """
+
+    places: NDArray[np.int32]
+    count: NDArray[np.int32]
+    weight: NDArray[np.float64]
+
+    def of_at_least(self, count: int) -> Votes:
+        """Those places that have so many features of the query."""
+        many = self.count >= count
+        return Votes(self.places[many], self.count[many], self.weight[many])
+
+
 class PlaceIndex:
     """Features of places, numbered 0, 1, … as they are added.
 
@@ -69,7 +92,8 @@ class PlaceIndex:
         self._place_of = np.zeros(_FIRST, dtype=np.int32)
         # Scratch of a query, which leaves it as it was: a query looks at few places, however many there are.
         self._voted, self._votes = np.full(_FIRST, _END, dtype=np.int32), np.zeros(_FIRST, dtype=np.int32)
-        self._touched = np.zeros(_FIRST, dtype=np.int32)
+        self._weights = np.zeros(_FIRST)
+        self._touched, self._here = np.zeros(_FIRST, dtype=np.int32), np.zeros(_FIRST, dtype=np.int32)
         # Bits that key a table, fixed once: as many as a key may ever have.
         random = np.random.Generator(np.random.PCG64(20240514))
         self._sampled = np.stack([random.permutation(64 * WORDS)[:_MOST_BITS] for _ in range(_TABLES)]).astype(np.uint64)
@@ -96,21 +120,23 @@ class PlaceIndex:
         if len(self._places) > len(self._voted):
             size = 2 * len(self._voted)
             self._voted, self._votes = np.full(size, _END, dtype=np.int32), np.zeros(size, dtype=np.int32)
-            self._touched = np.zeros(size, dtype=np.int32)
+            self._weights = np.zeros(size)
+            self._touched, self._here = np.zeros(size, dtype=np.int32), np.zeros(size, dtype=np.int32)
 
-    def votes(self, query: Features, before: int | None = None) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Places (n,) in which features of the query have a match, ascending, and of how many (n,); none from `before` on."""
+    def votes(self, query: Features, before: int | None = None) -> Votes:
+        """What the features of a query say of where it is; nothing of places from `before` on."""
         last = len(self._places) if before is None else min(before, len(self._places))
         if last <= 0 or not len(query.bits):
-            return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+            return Votes(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(0))
         count = _vote(
             query.bits, self._bits, self._place_of, self._sampled, self._key_bits, self._head, self._next,
-            np.uint64(self.config.max_distance), np.int32(last), self._voted, self._votes, self._touched,
+            np.uint64(self.config.max_distance), np.int32(last),
+            self._voted, self._votes, self._weights, self._touched, self._here,
         )  # fmt: skip
         places = np.sort(self._touched[:count])
-        votes = self._votes[places]
-        self._voted[places], self._votes[places] = _END, 0
-        return places, votes
+        found = Votes(places, self._votes[places], self._weights[places])
+        self._voted[places], self._votes[places], self._weights[places] = _END, 0, 0.0
+        return found
 
     def candidates(self, query: Features, *, before: int | None = None, seed: int = 0) -> list[Candidate]:
         """Places that look like the query, the most inliers first.
@@ -120,10 +146,10 @@ class PlaceIndex:
             before: only places of smaller numbers.
             seed: of the sampling of matches.
         """
-        places, votes = self.votes(query, before)
-        best = np.argsort(-votes, kind="stable")[: self.config.candidates]
+        votes = self.votes(query, before).of_at_least(_LEAST_VOTES)
+        best = np.argsort(-votes.weight, kind="stable")[: self.config.candidates]
         found = []
-        for place in places[best[votes[best] >= _LEAST_VOTES]].tolist():
+        for place in votes.places[best].tolist():
             candidate = self.align(query, place, seed)
             if candidate is not None:
                 found.append(candidate)
@@ -193,14 +219,18 @@ def _vote(
     last: np.int32,
     voted: NDArray[np.int32],
     votes: NDArray[np.int32],
+    weights: NDArray[np.float64],
     touched: NDArray[np.int32],
+    here: NDArray[np.int32],
 ) -> np.int64:
     """One vote of every query feature for every place below `last` with a feature near it; returns how many places have one.
 
-    These are written to `touched`; `voted`, filled with −1, and `votes`, with zeros, are left as they are for no other place.
+    These are written to `touched`; `voted`, filled with −1, `votes` and `weights`, with zeros, are left as they are for no other
+    place. `here` is room for the places that one feature votes for.
     """
     count = np.uint64(0)
     for i in range(np.uint64(len(query))):
+        matched = np.uint64(0)
         for table in range(np.uint64(len(head))):
             found = head[table, _key(query, i, sampled, table, key_bits)]
             for _ in range(_WALK):
@@ -212,6 +242,11 @@ def _vote(
                         touched[count] = place
                         count += np.uint64(1)
                     voted[place] = np.int32(i)
-                    votes[place] += np.int32(1)
+                    here[matched] = place
+                    matched += np.uint64(1)
                 found = following[table, found]
+        weight = math.log(1.0 + last / max(matched, np.uint64(1)))
+        for k in range(matched):
+            votes[here[k]] += np.int32(1)
+            weights[here[k]] += weight
     return np.int64(count)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ from boxplus.runs.sessions.merge_run import merge_runs
 from boxplus.runs.sessions.tables import write_encounters
 from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.storage.output_folder import SUMMARY
-from boxplus.systems.sessions.candidates import candidate_pairs
+from boxplus.systems.sessions.candidates import Looks, Pair
 from boxplus.systems.sessions.encounter import Meeting
-from boxplus.systems.sessions.sessions import SessionAlignment, place_sessions
+from boxplus.systems.sessions.sessions import SessionAlignment, place_sessions, worlds_of
 from boxplus.systems.slam.slam import Slam
 
 Report = Callable[[FleetStatus, RecordingStatus | None], None]
@@ -103,10 +104,8 @@ class _Fleet:
         if len(self._sound()) > 1:
             self._note(stage="pairs")
             outlines = self._outlines(self._sound())
-            names = list(outlines)
-            pairs = self._pairs(list(outlines.values()))
-            meetings = self._meet(names, pairs)
-            self._note(stage="map", pairs_looked_at=len(pairs))
+            meetings = self._meetings(outlines)
+            self._note(stage="map", pairs_looked_at=len(meetings))
             sessions = [outline.session for outline in outlines.values()]
             if len(sessions) > 1:
                 alignment = place_sessions(sessions, meetings, self._merging.sessions)
@@ -161,14 +160,26 @@ class _Fleet:
                 self._note_recording(numbers[names[end.number]], state="failed", error=f"its local maps: {end.error}")
         return {name: found[name] for name in names if name in found}
 
-    def _pairs(self, outlines: Sequence[RunOutline]) -> list[tuple[int, int]]:
-        """Sessions that look alike; all pairs where there are few, or where nothing is described."""
-        count, config = len(outlines), self._merging.sessions.slam
-        if count <= self._neighbours + 1 or config.appearance != "density":
-            return [(a, b) for a in range(count) for b in range(a + 1, count)]
-        return candidate_pairs([own.features for own in outlines], config.descriptor, per_session=self._neighbours)
+    def _meetings(self, outlines: Mapping[str, RunOutline]) -> list[Meeting]:
+        """Of sessions that look alike; of all pairs where there are few, or where nothing is described.
 
-    def _meet(self, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> list[Meeting]:
+        Sessions that met leave worlds. As long as a round of pairs joins some of these, another one is looked at.
+        """
+        names, config = list(outlines), self._merging.sessions.slam
+        if len(names) <= self._neighbours + 1 or config.appearance != "density":
+            return self._meet(names, list(combinations(range(len(names)), 2)))
+        looks = Looks([own.features for own in outlines.values()], config.descriptor)
+        found: dict[Pair, Meeting] = {}
+        pairs, count = looks.pairs(self._neighbours), len(names)
+        while pairs:
+            found.update(zip(pairs, self._meet(names, pairs), strict=True))
+            worlds = worlds_of(len(names), found.values())
+            if not 1 < len(worlds) < count:
+                break
+            pairs, count = looks.pairs_between(worlds, found, self._neighbours), len(worlds)
+        return [found[pair] for pair in sorted(found)]
+
+    def _meet(self, names: Sequence[str], pairs: Sequence[Pair]) -> list[Meeting]:
         arguments = [(self._store.text, (names[a], names[b]), (a, b), self._merging.sessions) for a, b in pairs]
         found: dict[int, Meeting] = {}
         for end in self._executor.run(meet_runs, arguments):

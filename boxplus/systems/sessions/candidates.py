@@ -1,30 +1,37 @@
 """Which of many sessions may have met: by one index over the descriptors of all local maps, before any two are compared.
 
-Every session keeps the few others that its local maps look most like, so that the number of pairs grows with the number of
-sessions and not with its square.
+1. *Votes*: the local maps of a session vote for local maps of others, by one index over the features of all.
+2. *Alignment*: those that most votes are for are aligned with it, local map by local map. What looks alike everywhere, the
+   windows of a street, gets votes; that many features lie alike as well is rare where it is not the same place.
+
+Every session keeps the few others of which most features lie alike, so that the number of pairs grows with the number of
+sessions and not with its square, and so does the time. Where those that met leave several worlds, each session outside the
+largest one may look at as many again, in other worlds than its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.maps.descriptors.config import DescriptorConfig
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.descriptors.place_index import PlaceIndex
 
+Pair = tuple[int, int]
+
 _LEAST_VOTES = 4  # features of a local map that one of another session shares
+_ALIGNED = 10  # sessions that are aligned for each one that is kept
 
 
-def candidate_pairs(
-    descriptions: Sequence[Sequence[Features]], config: DescriptorConfig | None = None, *, per_session: int = 6
-) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of sessions to look at, in order.
+class Looks:
+    """What the local maps of all sessions look like.
 
     Args:
         descriptions: of the local maps of each session.
-        per_session: others that each session keeps, the most alike first; sessions without any likeness have none.
+        config: settings; each has a default.
 
     Example:
         >>> import numpy as np
@@ -32,31 +39,76 @@ def candidate_pairs(
         >>> random = np.random.default_rng(0)
         >>> seen = Features(random.uniform(-40, 40, (50, 2)), random.integers(0, 2**63, (50, 4)).astype(np.uint64))
         >>> other = Features(seen.xy, ~seen.bits)
-        >>> candidate_pairs([[seen], [other], [other, seen]])
+        >>> Looks([[seen], [other], [other, seen]]).pairs()
         [(0, 2), (1, 2)]
     """
-    index = PlaceIndex(config)
-    owner = np.repeat(np.arange(len(descriptions)), [len(own) for own in descriptions])
-    score = np.zeros(len(descriptions), dtype=np.int64)  # of the session at hand; few entries are touched
-    for own in descriptions:
-        for features in own:
-            index.add(features)
-    found: set[tuple[int, int]] = set()
-    for number, own in enumerate(descriptions):
-        alike = []
-        for features in own:
-            places, votes = index.votes(features)
-            many = votes >= _LEAST_VOTES
-            others, first = np.unique(owner[places[many]], return_index=True)  # places of a session follow each other
-            if len(others):
-                score[others] += np.maximum.reduceat(votes[many], first)
-                alike.append(others)
-        if not alike:
-            continue
-        score[number] = 0
-        others = np.unique(np.concatenate(alike))
-        for other in others[np.argsort(-score[others], kind="stable")[:per_session]].tolist():
-            if score[other] > 0:
-                found.add((min(number, other), max(number, other)))
-        score[others] = 0
-    return sorted(found)
+
+    def __init__(self, descriptions: Sequence[Sequence[Features]], config: DescriptorConfig | None = None) -> None:
+        self._descriptions, self._index = descriptions, PlaceIndex(config)
+        self._owner = np.repeat(np.arange(len(descriptions)), [len(own) for own in descriptions])
+        self._score = np.zeros(len(descriptions))  # of the session at hand; few entries are touched
+        for own in descriptions:
+            for features in own:
+                self._index.add(features)
+
+    def pairs(self, per_session: int = 6) -> list[Pair]:
+        """Pairs (a, b), a < b, of sessions to look at, in order.
+
+        Args:
+            per_session: others that each session keeps, the most alike first; sessions without any likeness have none.
+        """
+        return self._pairs(per_session, range(len(self._descriptions)), np.arange(len(self._descriptions)), ())
+
+    def pairs_between(self, worlds: Sequence[Sequence[int]], known: Container[Pair], per_session: int = 6) -> list[Pair]:
+        """More pairs, of sessions in different worlds, to find out whether these are one.
+
+        Args:
+            worlds: numbers of the sessions of each, all of them; known: pairs that were looked at.
+            per_session: others that each session of all worlds but the largest keeps.
+        """
+        world = np.empty(len(self._descriptions), dtype=np.int64)
+        for number, members in enumerate(worlds):
+            world[list(members)] = number
+        largest = max(range(len(worlds)), key=lambda number: len(worlds[number]))
+        return self._pairs(per_session, np.flatnonzero(world != largest).tolist(), world, known)
+
+    def _pairs(self, count: int, sessions: Iterable[int], world: NDArray[np.int64], known: Container[Pair]) -> list[Pair]:
+        return sorted({pair for number in sessions for pair in self._of_one(number, count, world, known)})
+
+    def _of_one(self, number: int, count: int, world: NDArray[np.int64], known: Container[Pair]) -> list[Pair]:
+        """With the sessions of other worlds that one looks most like, so many at most."""
+        voted = self._voted(number, _ALIGNED * count, world, known)
+        inliers = {other: self._inliers(number, matched) for other, matched in voted.items()}
+        alike = sorted(voted, key=lambda other: -inliers[other])[:count]  # stable: of as many inliers, by votes
+        return [_pair(number, other) for other in alike]
+
+    def _voted(
+        self, number: int, count: int, world: NDArray[np.int64], known: Container[Pair]
+    ) -> dict[int, list[tuple[int, int]]]:
+        """Sessions that most votes are for, the most first, and which local map of this one is for which place of theirs."""
+        best: list[tuple[NDArray[np.int64], NDArray[np.int32]]] = []
+        for features in self._descriptions[number]:
+            votes = self._index.votes(features).of_at_least(_LEAST_VOTES)
+            by_weight = np.lexsort((-votes.weight, self._owner[votes.places]))
+            others, first = np.unique(self._owner[votes.places[by_weight]], return_index=True)
+            self._score[others] += votes.weight[by_weight[first]]
+            best.append((others, votes.places[by_weight[first]]))
+        known_to = np.unique(np.concatenate([others for others, _ in best])) if best else np.zeros(0, dtype=np.int64)
+        free = [k for k in known_to[world[known_to] != world[number]].tolist() if _pair(number, k) not in known]
+        free.sort(key=lambda other: -self._score[other])
+        self._score[known_to] = 0.0
+        found: dict[int, list[tuple[int, int]]] = {other: [] for other in free[:count]}
+        for own, (others, places) in enumerate(best):
+            for other, place in zip(others.tolist(), places.tolist(), strict=True):
+                if other in found:
+                    found[other].append((own, place))
+        return found
+
+    def _inliers(self, number: int, matched: Sequence[tuple[int, int]]) -> int:
+        """Features of a session that lie alike in places of another one."""
+        aligned = [self._index.align(self._descriptions[number][own], place, seed=own) for own, place in matched]
+        return sum(candidate.inliers for candidate in aligned if candidate is not None)
+
+
+def _pair(a: int, b: int) -> Pair:
+    return (a, b) if a < b else (b, a)

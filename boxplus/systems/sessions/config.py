@@ -33,6 +33,9 @@ class SessionsConfig(BaseModel):
         8.0, gt=0, description="local maps of two sessions that should lie this near are laid over each other [m]"
     )
     least_confirmed: float = Field(0.7, ge=0, le=1, description="share of these that have to fit")
+    least_standing: float = Field(
+        0.7, ge=0, le=1, description="share of what stands upright in one session that stands at the same place in the other"
+    )
     rival_share: float = Field(
         0.5, gt=0, le=1, description="another alignment with this share of the encounters makes the first one ambiguous"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,8 @@ class Meeting:
         T_place_query: (7,) the query session's frame in the place session's, and `covariance` (6, 6) on its right, of the
             two sessions alone; None where they are not joined.
         predicted, confirmed: local maps that should overlap if the alignment is right, and those of them that do.
+        standing: share of what stands upright in overlapping local maps of one and stands at the same place in the other; NaN
+            where the meeting was refused before that was asked.
         refusal: why the two are not joined, in a sentence; None where they are.
     """
 
@@ -42,6 +45,7 @@ class Meeting:
     covariance: Floats | None = None
     predicted: int = 0
     confirmed: int = 0
+    standing: float = math.nan
     refusal: str | None = None
 
     @property

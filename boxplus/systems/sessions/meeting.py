@@ -9,11 +9,13 @@
 4. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
    look like one of the other: refused.
 5. *Support*: enough encounters, of different local maps, along a way.
-6. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
+6. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well.
+7. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +31,7 @@ from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.proposals import Proposal
 from boxplus.systems.slam.registration import fitting_share, register
 from boxplus.systems.slam.rivals import turned_rivals
+from boxplus.systems.slam.structure import standing_in_common
 from boxplus.systems.slam.verification import verify
 
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -90,18 +93,40 @@ class _Meeting:
         kept = {id(loop) for loop, is_kept in zip(chosen, joined.is_kept, strict=True) if is_kept}
         if refusal := self._too_little([loop for loop in chosen if id(loop) in kept], predicted, confirmed):
             return self._refused(refusal, predicted, confirmed)
+        return self._as_wholes(joined, kept, predicted, confirmed)
+
+    def _as_wholes(self, joined: JoinedGraph, kept: set[int], predicted: int, confirmed: int) -> Meeting:
+        """Steps 6 and 7, of encounters whose alignment nothing else speaks against."""
+        share, least = (
+            self._standing_share([loop for loop in self.loops.values() if id(loop) in kept]),
+            self.config.least_standing,
+        )
+        if share < least:
+            why = f"{100.0 * share:.0f} % of what stands upright in one stands at the same place in the other"
+            return self._refused(f"{why}, {100.0 * least:.0f} % are asked for", predicted, confirmed, share)
         if otherwise := fits_otherwise(self.place, self.query, joined.T_world_session[1], self.config):
-            return self._refused(otherwise, predicted, confirmed)
+            return self._refused(otherwise, predicted, confirmed, share)
         against = "contradicts the encounters that agree with each other"
         final = [
             loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)
             for loop in self.loops.values()
         ]
         final = [replace(loop, weight=float(loop.refusal is None)) for loop in final]
-        return Meeting(*self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed)
+        return Meeting(*self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share)
 
-    def _refused(self, why: str, predicted: int = 0, confirmed: int = 0) -> Meeting:
-        return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, why)
+    def _refused(self, why: str, predicted: int = 0, confirmed: int = 0, standing: float = math.nan) -> Meeting:
+        return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)
+
+    def _standing_share(self, loops: list[Loop]) -> float:
+        """Step 6, over encounters together; none where nothing stands."""
+        found = [
+            standing_in_common(
+                self.query.surface(loop.query), self.place.surface(loop.place), loop.T_place_query, self.config.slam.registration
+            )
+            for loop in loops
+        ]
+        asked = sum(of for _, of in found)
+        return sum(shared for shared, _ in found) / max(asked, 1)
 
     def _nothing_found(self) -> str:
         if not self.loops:

@@ -16,6 +16,7 @@ import numpy as np
 from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
+from boxplus.sparse.components import connected_components
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
@@ -102,6 +103,19 @@ def align_sessions(
         if progress is not None:
             progress(meetings[-1])
     return place_sessions(sessions, meetings, config)
+
+
+def worlds_of(count: int, meetings: Iterable[Meeting]) -> list[list[int]]:
+    """Numbers of so many sessions by the worlds that meetings leave, the largest first, before these are held against each other.
+
+    Example:
+        >>> worlds_of(2, [])
+        [[0], [1]]
+    """
+    met = [(m.place_session, m.query_session) for m in meetings if m.refusal is None]
+    number, world = connected_components(count, *np.array(met, dtype=np.int64).reshape(-1, 2).T)
+    members = [np.flatnonzero(world == k).tolist() for k in range(number)]
+    return sorted(members, key=lambda own: (-len(own), own))
 
 
 def place_sessions(sessions: Sequence[Session], meetings: Sequence[Meeting], config: SessionsConfig) -> SessionAlignment:

@@ -193,6 +193,12 @@ def fitting_share(
     return 0.0 if found is None else float(np.count_nonzero(np.abs(found.e) <= tolerance)) / len(points)
 
 
+def plane_normals(points: NDArray[np.float32], surface: Surface, config: LocalMapRegistrationConfig) -> Floats:
+    """(N, 3) unit normals of the planes through a surface's points next to each of these; NaN where there is none."""
+    planes, valid = _planes(points, surface, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _STAGES[-1][0], config)
+    return np.where(valid[:, None], planes[:, :3], np.nan)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matched:
     """Points on planes, linearised about their middle: ξ' = [lever · w, v'] moves them there."""
@@ -216,19 +222,7 @@ class _Matched:
         config: LocalMapRegistrationConfig,
         least_scale: float = _LEAST_SCALE,
     ) -> _Matched | None:
-        count = len(points)
-        planes, valid = np.empty((count, 5)), np.zeros(count, dtype=np.bool_)
-        view, origin = target.tree.view(), target.tree.origin
-
-        def work(_: int, begin: int, end: int) -> None:
-            sq = np.empty(_NEIGHBOURS, dtype=np.float32)
-            near = np.empty((_NEIGHBOURS, 3), dtype=np.float32)
-            stack = np.empty(STACK_DEPTH + _NEIGHBOURS, dtype=STACK)
-            _match_planes(
-                view, origin, T, points, begin, end, distance * distance, config.thickness, planes, valid, sq, near, stack
-            )
-
-        run_chunks(work, count, _CHUNK, config.threads)
+        planes, valid = _planes(points, target, T, distance, config)
         if np.count_nonzero(valid) < _FEWEST:
             return None
         p, plane = points[valid].astype(np.float64), planes[valid]
@@ -284,6 +278,24 @@ class _Matched:
 def _spread(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     """About `count` of the points, one in so many."""
     return np.ascontiguousarray(points[:: max(len(points) // count, 1)])
+
+
+def _planes(
+    points: NDArray[np.float32], target: Surface, T: Floats, distance: float, config: LocalMapRegistrationConfig
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """(N, 5) planes of a target next to points, as `_match_planes` has them, and where there is one."""
+    count = len(points)
+    planes, valid = np.empty((count, 5)), np.zeros(count, dtype=np.bool_)
+    view, origin = target.tree.view(), target.tree.origin
+
+    def work(_: int, begin: int, end: int) -> None:
+        sq = np.empty(_NEIGHBOURS, dtype=np.float32)
+        near = np.empty((_NEIGHBOURS, 3), dtype=np.float32)
+        stack = np.empty(STACK_DEPTH + _NEIGHBOURS, dtype=STACK)
+        _match_planes(view, origin, T, points, begin, end, distance * distance, config.thickness, planes, valid, sq, near, stack)
+
+    run_chunks(work, count, _CHUNK, config.threads)
+    return planes, valid
 
 
 def _share_near(points: NDArray[np.float32], target: Surface, T: Floats, distance: float) -> float:

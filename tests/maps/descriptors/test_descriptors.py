@@ -129,16 +129,34 @@ def test_votes_are_brute_force_where_bits_agree(random_seed: int = 5) -> None:
     for k, place in enumerate(places):
         differing = np.array([[np.bitwise_count(p ^ q).sum() for q in place.bits] for p in query.bits[::10]])
         near[k] = np.count_nonzero((differing <= config.max_distance).any(axis=1))
-    assert [values.tolist() for values in found] == [[3, 70], [90, 40]]
+    assert found.places.tolist() == [3, 70] and found.count.tolist() == [90, 40]
+    np.testing.assert_allclose(found.weight, np.array([90, 40]) * np.log(121.0), rtol=1e-12)  # each in one of 120 places
+    assert found.of_at_least(41).places.tolist() == [3] and found.of_at_least(41).weight == found.weight[:1]
     assert (near[np.setdiff1d(np.arange(120), [3, 70])] == 0).all() and near[3] and near[70]
-    assert [values.tolist() for values in index.votes(query)] == [[3, 70], [90, 40]]  # a query leaves no trace
-    assert [values.tolist() for values in index.votes(places[70])] == [[70], [90]]
-    assert [values.tolist() for values in index.votes(query, before=70)] == [[3], [90]]
+    again = index.votes(query)  # a query leaves no trace
+    assert again.count.tolist() == [90, 40] and again.weight.tolist() == found.weight.tolist()
+    assert (index.votes(places[70]).places.tolist(), index.votes(places[70]).count.tolist()) == ([70], [90])
+    earlier = index.votes(query, before=70)
+    assert (earlier.places.tolist(), earlier.count.tolist()) == ([3], [90])
+    np.testing.assert_allclose(earlier.weight, [90 * np.log(71.0)], rtol=1e-12)  # of 70 places
     assert [c.place for c in index.candidates(query)] == [3, 70]
     assert [c.place for c in index.candidates(query, before=70)] == [3]
     assert index.candidates(query, before=0) == []
     with pytest.raises(InputError, match="a place from 0 to 119"):
         index.align(query, 120)
+
+
+def test_a_feature_of_many_places_weighs_less() -> None:
+    """20 features that a place shares with nine others count less than 12 that it alone has."""
+    random = np.random.default_rng(6)
+    index, xy = PlaceIndex(), random.uniform(-40.0, 40.0, (32, 2))
+    common, own = bits_of(random, 20), [bits_of(random, 12) for _ in range(10)]
+    for k in range(10):
+        index.add(Features(xy[12:] if k else xy, common if k else np.concatenate([own[0], common])))
+    index.add(Features(xy[:12], own[1]))
+    votes = index.votes(Features(np.concatenate([xy[12:], xy[:12]]), np.concatenate([common, own[1]])))
+    np.testing.assert_array_equal(votes.count, [20] * 10 + [12])
+    np.testing.assert_allclose(votes.weight, [20 * np.log1p(1.1)] * 10 + [12 * np.log(12.0)], rtol=1e-12)
 
 
 @settings(deadline=None, max_examples=20)

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.maps.descriptors.features import Features
 from boxplus.maps.tiles.store import TileStore
 from boxplus.recordings.recording import Recording
 from boxplus.runs.fleet import fleet_run, tasks
@@ -37,7 +36,6 @@ from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.worlds.worlds import city
-from boxplus.systems.sessions.candidates import candidate_pairs
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.meeting import meet
@@ -309,23 +307,6 @@ def test_recordings_are_found_in_a_folder_or_a_list(tmp_path: Path) -> None:
             find_recordings(path)
     with pytest.raises(InputError, match="a recording at least"):
         run_fleet({}, tmp_path / "out", InProcess())
-
-
-def test_pairs_grow_with_the_number_of_sessions_not_its_square() -> None:
-    """Sessions along a road, each of which shares a place with the next one."""
-    random = np.random.default_rng(1)
-
-    def road(count: int) -> list[list[Features]]:
-        places = [
-            Features(random.uniform(-40, 40, (60, 2)), random.integers(0, 2**63, (60, 4)).astype(np.uint64))
-            for _ in range(count + 1)
-        ]
-        return [[places[k], places[k + 1]] for k in range(count)]
-
-    for count in (5, 40):
-        assert candidate_pairs(road(count), per_session=3) == [(k, k + 1) for k in range(count - 1)]
-    same = [road(1)[0]] * 12
-    assert len(candidate_pairs(same, per_session=2)) <= 24
 
 
 def test_a_task_that_fails_ends_alone() -> None:

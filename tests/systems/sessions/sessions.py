@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.worlds.world import World
@@ -16,9 +17,11 @@ from boxplus.systems.slam.loop import Loop
 from tests.systems.slam.drives import MappedDrive, mapped_drive
 
 
-def driven(name: str, world: World, route: ArrayLike, config: DriftConfig, seed: int) -> tuple[Session, MappedDrive]:
+def driven(
+    name: str, world: World, route: ArrayLike, config: DriftConfig, seed: int, maps: LocalMapConfig | None = None
+) -> tuple[Session, MappedDrive]:
     """A session, and the drive with the truth."""
-    drive = mapped_drive(world, route, config, seed)
+    drive = mapped_drive(world, route, config, seed, maps)
     start = se3.inverse(drive.drive.T_world_body[0])
     return Session.of(name, [replace(m, T_odo_map=se3.compose(start, m.T_odo_map)) for m in drive.maps]), drive
 

@@ -8,8 +8,11 @@ from scipy.stats import chi2
 
 from boxplus.manifolds import se3
 from boxplus.maps.descriptors.config import DescriptorConfig
+from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.simulation.drifting_drive import DriftConfig
+from boxplus.simulation.worlds import raycast
 from boxplus.simulation.worlds.alike import parallel_corridors
+from boxplus.simulation.worlds.world import World
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.session import Session
@@ -75,3 +78,20 @@ def test_two_corridors_that_are_the_same_are_not_joined() -> None:
     alignment = align_sessions([first, second], QUICK)
     assert [world.members for world in alignment.worlds] == [(0,), (1,)]
     assert alignment.meetings[0].T_place_query is None
+
+
+def test_two_stretches_of_one_street_are_not_one() -> None:
+    """182 m apart: ground and fronts lie over each other, 60 to 72 % of all points, and seven local maps agree where."""
+    solids, few_rays = city(40, 2, seed=5).solids, DriftConfig(channels=16, azimuth_steps=180, step_m=2.0, max_range=45.0)
+    sessions = []
+    for k in (86, 99):
+        first, last = 14.0 * k, 14.0 * k + 40.0
+        is_ground = solids[:, raycast.ENCLOSING] > 200.0
+        in_sight = (solids[:, raycast.CENTRE] > first - 120.0) & (solids[:, raycast.CENTRE] < last + 120.0)
+        world = World(list(solids[is_ground | in_sight]))
+        sessions.append(driven(f"drive_{k}", world, [[first, 0.0], [last, 0.0]], few_rays, k, LocalMapConfig(length=6.0))[0])
+    found = align_sessions(sessions, QUICK)
+    (meeting,) = found.meetings
+    assert len(found.worlds) == 2
+    assert meeting.refusal is not None and "of what stands upright in one stands at the same place" in meeting.refusal
+    assert meeting.confirmed == 7 and meeting.standing < 0.65  # nothing else speaks against it

@@ -1,0 +1,58 @@
+"""How much of what stands upright in two local maps stands at the same place.
+
+Ground is level everywhere: half of the points of any street lie on any other one, and the fronts of two streets of one width do
+as well. What tells them apart is the rest: corners, doorways, poles, trees, cars. What is not above the lowest points around, or
+lies on a level plane, is left out, and so is what stands where the other map sees little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
+
+from boxplus.manifolds import se3
+from boxplus.systems.slam.config import LocalMapRegistrationConfig
+from boxplus.systems.slam.registration import Surface, plane_normals
+
+Floats = NDArray[np.float64]
+
+_POINTS = 6000  # of a map, looked at
+_CELL, _STANDING = 2.0, 0.5  # m: what is so much higher than the lowest point in a cell and those around it is not the ground
+_LEVEL = 0.8  # |z| of the normal of a plane that is level; maps are aligned with gravity
+_SEEN = 0.75  # of a map's points lie within the distance from its middle that counts as seen
+
+
+def standing_in_common(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
+    """Points of two maps that do not lie on level planes, where the other map sees: of how many there is one near, and how many.
+
+    Args:
+        T_there_own: (7,) the maps laid over each other.
+    """
+    found = [_one_way(own, there, T_there_own, config), _one_way(there, own, se3.inverse(T_there_own), config)]
+    return min(found, key=lambda shared: shared[0] / max(shared[1], 1))
+
+
+def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
+    points = own.points[:: max(len(own.points) // _POINTS, 1)]
+    points = points[_above_ground(points)]
+    is_level = np.abs(plane_normals(points, own, config)[:, 2]) > _LEVEL
+    q = se3.act(T_there_own, points[~is_level].astype(np.float64)).reshape(-1, 3)
+    q = q[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)]
+    near = there.tree.nearest(q, 1, max_distance=config.near).counts > 0
+    return int(near.sum()), len(near)
+
+
+def _sight(surface: Surface) -> float:
+    """The distance within which a map has most of its points [m]."""
+    return float(np.quantile(np.linalg.norm(surface.points[:, :2].astype(np.float64), axis=1), _SEEN))
+
+
+def _above_ground(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points are higher than the lowest one near by."""
+    cell = np.floor(points[:, :2].astype(np.float64) / _CELL).astype(np.int64)
+    cell -= cell.min(axis=0) - 1
+    lowest = np.full(cell.max(axis=0) + 2, np.inf)
+    np.minimum.at(lowest, (cell[:, 0], cell[:, 1]), points[:, 2])
+    around = minimum_filter(lowest, 3, mode="constant", cval=np.inf)
+    return np.asarray(points[:, 2] > around[cell[:, 0], cell[:, 1]] + _STANDING)
