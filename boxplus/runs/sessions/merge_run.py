@@ -20,7 +20,7 @@ from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
 from boxplus.runs.sessions.joined import merge_facts, write_session_trajectory
-from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
+from boxplus.runs.sessions.session_run import SessionRun, open_session_run, refuse_repeated, session_names
 from boxplus.runs.sessions.summary import MergeSummary
 from boxplus.runs.sessions.tables import write_changes, write_encounters
 from boxplus.systems.sessions.encounter import Meeting
@@ -63,7 +63,8 @@ def merge_runs(
         align: says where the sessions are; `align_sessions` over all pairs where it is left out.
 
     Raises:
-        InputError: fewer than two runs, or one that is none; a folder that holds something else; OpenCV is not installed.
+        InputError: fewer than two runs, one that is none, or two of one recording; a folder that holds something else; OpenCV is
+            not installed.
         OutputError: the disk is full or the folder cannot be written; what was there before stays whole.
     """
     began = time.perf_counter()
@@ -72,8 +73,9 @@ def merge_runs(
     if len({path.resolve() for path in paths}) < max(len(paths), 2):
         raise InputError("two runs at least, each given once", f"{[str(path) for path in paths]}", "name their output folders")
     runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
+    sessions = [run.session for run in runs]
+    refuse_repeated(sessions)
     with replaced_merge(output, overwrite=overwrite) as own:
-        sessions = [run.session for run in runs]
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
         world = alignment.worlds[0]
         places, doubts = [printable(str(run.folder.path.resolve())) for run in runs], [run.doubt for run in runs]

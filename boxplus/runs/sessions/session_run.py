@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -119,6 +120,27 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
     session = Session.of(name, maps, placed.T_map, loops)
     return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3])
+
+
+def refuse_repeated(sessions: Sequence[Session]) -> None:
+    """Runs of one recording agree wherever they are looked at, and count as if it had been made twice.
+
+    Raises:
+        InputError: two sessions with a local map of the same points: a copy of a folder, or the recording run again.
+    """
+    owner: dict[bytes, str] = {}
+    for session in sessions:
+        for local_map in session.maps:
+            if not len(local_map.points):
+                continue
+            key = hashlib.sha256(np.ascontiguousarray(local_map.points).tobytes()).digest()
+            other = owner.setdefault(key, session.name)
+            if other != session.name:
+                raise InputError(
+                    "runs of different recordings",
+                    f"{other} and {session.name}, whose local maps hold the same points: one recording twice, or a copied folder",
+                    "leave one of them out",
+                )
 
 
 def session_names(folders: Sequence[Path]) -> list[str]:

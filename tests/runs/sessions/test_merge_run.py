@@ -147,6 +147,18 @@ def test_what_cannot_be_merged_is_refused(
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
+def test_one_recording_twice_is_refused(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], tmp_path: Path
+) -> None:
+    """It meets itself everywhere, and every standard deviation would come out too small."""
+    shutil.copytree(runs[0][0], tmp_path / "copy")
+    with pytest.raises(InputError, match="expected runs of different recordings – got monday and copy"):
+        merge_runs([runs[0][0], runs[0][1], tmp_path / "copy"], tmp_path / "out")
+    with pytest.raises(InputError, match="one recording twice, or a copied folder"):
+        update_map(merged[0], [tmp_path / "copy"])
+    assert not (tmp_path / "out").exists()
+
+
 @contextmanager
 def without(path: Path) -> Iterator[None]:
     moved = path.with_name(path.name + ".away")
