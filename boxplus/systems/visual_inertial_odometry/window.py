@@ -366,7 +366,7 @@ class Window:
             del self.frames[k]
         # A start may bring more keyframes than the window holds; the first to go are linearised where they are known best.
         for _ in range(_LEAVING if self.frames[-1].is_keyframe else 0):
-            if sum(f.is_keyframe for f in self.frames) > self._config.keyframes:
+            if sum(f.is_keyframe for f in self.frames) > self._config.keyframes_of(len(self._rig.cameras)):
                 self._let_go()
 
     def _let_go(self) -> None:

@@ -89,12 +89,17 @@ def test_yaw_and_position_are_never_known_better_than_at_first(flown) -> None:
     assert vio.window.leak is not None and vio.window.leak.is_anchored  # by the first pose, which is known by definition
 
 
+def test_one_camera_has_a_longer_window_unless_told_otherwise() -> None:
+    assert CONFIG.keyframes_of(1) > CONFIG.keyframes_of(2)
+    assert VioConfig(keyframes=5).keyframes_of(1) == VioConfig(keyframes=5).keyframes_of(2) == 5
+
+
 def test_the_same_run_has_the_same_bits_and_the_window_stays_small(flown) -> None:
     flight, vio, estimates = flown
     _, again = run(flight, rig(), CONFIG)
     assert all(np.array_equal(a.T_world_imu, b.T_world_imu, equal_nan=True) for a, b in zip(estimates, again, strict=True))
     window = vio.window
-    assert len(window.frames) <= CONFIG.keyframes + CONFIG.recent_frames + 1
+    assert len(window.frames) <= CONFIG.keyframes_of(2) + CONFIG.recent_frames + 1
     assert len(window.bodies) == len(window.states) == len(window.frames)
     assert len(vio._imu) < 200 * 10 and len(window._free_from) <= 400
 
