@@ -11,7 +11,7 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import SUMMARY, output_folder, refuse_both
+from boxplus.runs.storage.output_folder import SUMMARY, output_folder, program_of, refuse_both
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -77,13 +77,20 @@ class OdometryFolder:
         """The folder as it is, locked while the block runs, for a run that goes on.
 
         Raises:
-            InputError: no run to resume; another process is writing there.
+            InputError: no run to resume, or one of another command; another process is writing there.
         """
         if not self.checkpoint.is_file():
             raise InputError(
                 "the folder of a run that did not come to its end, with a checkpoint",
                 f"none in {self.path}",
                 "start the run without --resume; a checkpoint is written every few seconds",
+            )
+        other = program_of(self.summary) if self.summary.is_file() else None  # a run that was killed has none
+        if other not in (None, program):
+            raise InputError(
+                f"a run of '{program}' to go on with",
+                f"one of '{other}' in {self.path}",
+                "go on with it by that command, or choose another folder with --output",
             )
         with locked_folder(self.path, program) as lock:
             lock.keep_file = False

@@ -170,8 +170,12 @@ def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:
     (out / "trajectory.tum").write_text("")
     with pytest.raises(InputError, match=r"expected the \d+ rows of the checkpoint in trajectory and scans.csv – got 0"):
         run_odometry(walk(), out, resume=True)
-    (out / "checkpoint.npz").write_bytes((out / "checkpoint.npz").read_bytes()[:-100])
-    with pytest.raises(InputError, match="expected the checkpoint of a run, of this version of boxplus"):
+    for damaged in ((out / "checkpoint.npz").read_bytes()[:-100], b"not an archive"):
+        (out / "checkpoint.npz").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"of this version of boxplus – got a damaged one .* – start the run anew$"):
+            run_odometry(walk(), out, resume=True)
+    (out / "run.json").write_text('{"program": "boxplus vio"}')
+    with pytest.raises(InputError, match="expected a run of 'boxplus lio' to go on with – got one of 'boxplus vio' in"):
         run_odometry(walk(), out, resume=True)
 
 

@@ -69,7 +69,7 @@ def read_state(path: Path) -> dict[str, Any]:
     except Exception as error:
         raise InputError(
             "the checkpoint of a run, of this version of boxplus",
-            f"{path}: {error or type(error).__name__}",
+            f"a damaged one ({path}: {type(error).__name__})",  # NumPy's own words advise to run what is in it
             "start the run anew",
         ) from error
     if not isinstance(found, dict):
