@@ -5,7 +5,7 @@ Source: adaptive voxelisation of Liu and Zhang, BALM, RA-L 2021, section III-C.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,17 @@ class PlaneMap:
     keys: NDArray[np.int64]
     plane_of: NDArray[np.int32]
     is_one_sided: bool = False
+    # Of all planes, and worked out once: a long recording has a hundred thousand, of which a scan sees a few hundred.
+    _gate: NDArray[np.float64] = field(init=False, repr=False)
+    _widest_gate: float = field(init=False, repr=False)
+    _sums: NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # A plane that was found by half of its points, beside a face of its voxel, is thinner than it will be.
+        usual = float(np.median(self.thickness)) if len(self.thickness) else 0.0
+        object.__setattr__(self, "_gate", _GATE * np.maximum(self.thickness, max(usual, _NEGLIGIBLE_M)))
+        object.__setattr__(self, "_widest_gate", float(self._gate.max(initial=0.0)))
+        object.__setattr__(self, "_sums", np.zeros((len(self), SUMS)))
 
     def __len__(self) -> int:
         return len(self.planes)
@@ -104,16 +115,18 @@ class PlaneMap:
 
         p is where they were seen from, too.
         """
-        # A plane that was found by half of its points, beside a face of its voxel, is thinner than it will be.
-        usual = float(np.median(self.thickness)) if len(self) else 0.0
-        gate = _GATE * np.maximum(self.thickness, max(usual, _NEGLIGIBLE_M))
-        sums = np.zeros((len(self), SUMS))
-        touched = np.empty(len(self), dtype=np.int64)
-        count = _on_planes(points, R, p, self.cell, self.keys, self.plane_of, self.planes, self.centres, gate, sums, touched)
+        touched = np.empty(min(len(points), len(self)), dtype=np.int64)
+        count = _on_planes(
+            points, R, p, self.cell, self.keys, self.plane_of, self.planes, self.centres,
+            self._gate, self._widest_gate, self._sums, touched,
+        )  # fmt: skip
         found = np.sort(touched[:count])
+        sums = self._sums[found]
+        self._sums[found] = 0.0
         if self.is_one_sided:
-            found = found[self.seen_from(p, found) == 1]
-        return found, clusters(sums[found])
+            before = self.seen_from(p, found) == 1
+            found, sums = found[before], sums[before]
+        return found, clusters(sums)
 
 
 def find_planes(voxels: VoxelSums, config: PlaneVoxelConfig) -> PlaneMap:
@@ -282,10 +295,11 @@ def _on_planes(
     planes: NDArray[np.float64],
     centres: NDArray[np.float64],
     gate: NDArray[np.float64],
+    widest: float,
     sums: NDArray[np.float64],
     touched: NDArray[np.int64],
 ) -> int:
-    count, widest = 0, gate.max() if gate.shape[0] else 0.0
+    count = 0
     for n in range(points.shape[0]):
         a, b, c = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]

@@ -116,9 +116,11 @@ def keyframe_clusters(
     clusters: list[Floats] = []
     counted: list[Floats] = []
     squares = np.zeros(len(planes))  # Σ w² of the points
+    touched: list[Ints] = []  # planes of the keyframe that is gone through
 
     def close(number: int) -> None:
-        seen = np.flatnonzero(total[:, 3, 3])
+        seen = np.unique(np.concatenate(touched)) if touched else np.zeros(0, dtype=np.int64)
+        touched.clear()
         keyframe.append(np.full(len(seen), number))
         plane.append(seen)
         clusters.append(total[seen] * information[seen, None, None])
@@ -133,6 +135,7 @@ def keyframe_clusters(
         found, own = planes.clusters_of(points, R, p)
         total[found] += weights[k] * _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
         squares[found] += weights[k] ** 2 * own[:, 3, 3]
+        touched.append(found)
     close(current)
     all_planes = np.concatenate(plane)
     often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)

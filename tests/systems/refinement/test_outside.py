@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +32,7 @@ def _poses(random: np.random.Generator, count: int, metres: float = 5.0) -> Floa
 def _planes(normals: Floats) -> PlaneMap:
     count = len(normals)
     none = np.zeros(0)
-    fields = dict.fromkeys(PlaneMap.__dataclass_fields__, none)
+    fields = dict.fromkeys((field.name for field in dataclasses.fields(PlaneMap) if field.init), none)
     return PlaneMap(**fields | {"planes": np.hstack([normals, np.zeros((count, 1))]), "centres": np.zeros((count, 3))})
 
 
