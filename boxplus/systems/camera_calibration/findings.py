@@ -71,7 +71,8 @@ def judge(found: CameraCalibration) -> list[Finding]:
     """All there is to say, the worst first."""
     findings: list[Finding] = []
     for camera in range(len(found.singles)):
-        findings += _lens_determined(found, camera) + _views(found, camera) + _pattern(found, camera)
+        findings += _lens_determined(found, camera) + _side(found, camera)
+        findings += _views(found, camera) + _pattern(found, camera)
     findings += _target(found) + _left_out(found) + _together(found) + _inertial(found)
     order = {"refused": 0, "doubt": 1, "remark": 2}
     return sorted(findings, key=lambda finding: order[finding.severity])
@@ -111,6 +112,20 @@ def _lens_determined(found: CameraCalibration, camera: int) -> list[Finding]:
         )
         result.append(Finding("twin", "remark", text))
     return result
+
+
+def _side(found: CameraCalibration, camera: int) -> list[Finding]:
+    """A mirrored image of a plane is that of its back, which no camera saw."""
+    heights = found.singles[camera].rig.T_target_body[:, 6]
+    heights = heights[np.isfinite(heights)]
+    behind = int(np.count_nonzero(heights < 0.0))
+    if 2 * behind <= len(heights):
+        return []
+    text = (
+        f"cam{camera}: in {behind} of {len(heights)} views it stands behind the target, printed on its front: the images "
+        "are mirrored, an axis of the pixels is flipped, or corners count clockwise; the centre is that of the mirror image"
+    )
+    return [Finding("mirrored", "doubt", text)]
 
 
 def _views(found: CameraCalibration, camera: int) -> list[Finding]:

@@ -132,6 +132,16 @@ def test_focal_length_on_the_axis_is_what_small_angles_show() -> None:
         np.testing.assert_allclose(sigma**2, np.diag(by_intrinsics @ covariance @ by_intrinsics.T), rtol=1e-6)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_images_are_told(axis: int) -> None:
+    """They fit as well as the true ones: a plane seen from its back."""
+    corners = session(RADTAN, frames=16, seed=12).corners
+    assert "mirrored" not in calibrate(corners)[1]
+    pixels = corners.pixels.copy()
+    pixels[:, axis] = SIZE[axis] - 1.0 - pixels[:, axis]
+    assert calibrate(replace(corners, pixels=pixels))[1]["mirrored"].severity == "doubt"
+
+
 def test_few_views_and_little_coverage_are_said() -> None:
     corners = session(RADTAN, frames=6, seed=1).corners
     left = corners.rows(corners.pixels[:, 0] < 0.45 * SIZE[0])
