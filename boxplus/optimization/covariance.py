@@ -32,6 +32,7 @@ class Covariances:
 
     def __init__(self, problem: LeastSquares, values: Values) -> None:
         self._problem, self._values = problem, values
+        self._weighting = [group.weighting for group in problem.groups]
         self._space: NullSpace | None = None
         self._factorization = -1  # of the problem, when it was that of H here
 
@@ -140,6 +141,13 @@ class Covariances:
     def _prepare(self, wanted: NDArray[np.int64], is_determined: bool = False) -> None:
         """Factorise at the point, and refuse where one of the free variables `wanted` has no covariance."""
         problem = self._problem
+        for group, weighting in zip(problem.groups, self._weighting, strict=True):
+            if not group.is_weighed_as(*weighting):
+                raise InputError(
+                    "the losses and weights that the problem was solved with",
+                    f"others of {group.name!r} since",
+                    "ask for covariances before these are changed, or solve again, with max_iterations=0 where it is",
+                )
         if is_determined and self._space is None and self._is_where_it_was_solved():
             if self._factorization == problem.factorization:
                 return

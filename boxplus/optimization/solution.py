@@ -153,6 +153,7 @@ class Solution:
 
         Raises:
             SingularProblemError: an unobservable direction of the problem moves one of these variables.
+            InputError: losses or weights of the problem are others than those it was solved with.
         """
         rows = self._own(first)
         return self._covariances.blocks(rows, rows if second is None else self._own(second), is_determined)

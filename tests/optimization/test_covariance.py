@@ -193,3 +193,26 @@ def test_what_was_factorised_is_used_again_until_something_else_is():
     np.testing.assert_array_equal(solution.response(slopes, is_determined=True)[0], moved)
     np.testing.assert_array_equal(solution.covariance(ring.poses, is_determined=True), first)
     assert model.factorization == count + 2
+
+
+@pytest.mark.parametrize("is_determined", [False, True])
+@pytest.mark.parametrize("change", ["weights", "loss"])
+def test_other_weights_than_it_was_solved_with_are_refused(change, is_determined):
+    """H would be that of another problem, or that of this one where nothing had been linearised since."""
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), [[0.1]])
+    group = problem.add_residuals(Prior(Euclidean(1), [[0.0], [1.0]]), x[0])
+    solution = problem.solve()
+    if change == "weights":
+        problem.set_weights(group, [0.5, 0.5])
+    else:
+        group.set_loss(losses.Cauchy(1.0))
+    with pytest.raises(InputError, match="losses and weights that the problem was solved with – got others of 'Prior"):
+        solution.covariance(x, is_determined=is_determined)
+    if change == "weights":
+        again = problem.solve(start=solution, max_iterations=0)
+        np.testing.assert_allclose(again.covariance(x, is_determined=is_determined)[0], [[1.0]])
+        problem.set_weights(group, None)
+    else:
+        group.set_loss(losses.Squared())
+    np.testing.assert_allclose(solution.covariance(x, is_determined=is_determined)[0], [[0.5]])

@@ -177,6 +177,17 @@ class Group:
         """Count ‖W r‖² (N,) times from the next linearisation on, whatever the loss; None for once. See `Problem.set_weights`."""
         self._root = None if weights is None else np.sqrt(weights)
 
+    def is_weighed_as(self, loss: Loss, root: NDArray[np.float64] | None) -> bool:
+        """Whether residuals count as they did when `weighting` was this."""
+        if self.loss != loss or (self._root is None) != (root is None):
+            return False
+        return self._root is root or bool(np.array_equal(np.asarray(self._root), np.asarray(root)))
+
+    @property
+    def weighting(self) -> tuple[Loss, NDArray[np.float64] | None]:
+        """What residuals count by: the loss, and the roots (N,) of weights, where they have some."""
+        return self.loss, self._root
+
     def loss_weights(self, values: Sequence[NDArray[np.float64]] | None, threads: int = 1) -> NDArray[np.float64]:
         """(N,) weights ρ′ of the loss at the point `values`, 1 for least squares; 0 where a residual cannot be evaluated.
 
