@@ -44,6 +44,12 @@ def test_version() -> None:
     assert (result.exit_code, result.stdout) == (0, f"boxplus {boxplus.__version__}\n")
 
 
+def test_the_package_is_the_command() -> None:
+    found = subprocess.run([sys.executable, "-m", "boxplus", "--version"], capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout) == (0, f"boxplus {boxplus.__version__}\n")
+    assert subprocess.run([sys.executable, "-m", "boxplus", "oi"], capture_output=True, check=False).returncode == 2
+
+
 def test_unknown_command() -> None:
     result = CliRunner().invoke(app, ["oi"])
     assert result.exit_code == 2

@@ -40,6 +40,7 @@ from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
 from boxplus.systems.refinement.state import RefinedState
+from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
 
 Floats = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
 
     Raises:
         InputError: another folder; a run that goes on, without an IMU, whose sensors contradict each other, whose mounting is an
-            assumption, or too short.
+            assumption, too short, or most of whose scans were weak or lost.
     """
     path, closed = Path(folder), None
     if (path / "run.json").is_file() and program_of(path / "run.json") == "boxplus slam":
@@ -116,6 +117,12 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     times = trajectory.times
     if len(times) != len(log) or not np.array_equal(times, log.time_ns):
         raise InputError("the same scans in trajectory.csv and scans.csv", f"others in {path}", "run 'boxplus lio' again")
+    if is_mostly_unshown(log.status) and (closed is None or not closed.folder.georeference.is_file()):
+        raise InputError(
+            "a run whose surroundings showed every direction in half of its scans at least",
+            f"{np.count_nonzero(log.status != 'ok')} of {len(log)} scans that were weak or lost in {path}",
+            "what they left open nothing can refine but positions by satellite: 'boxplus slam' and refine its folder",
+        )
     R = quaternion.to_matrix(trajectory.q_wxyz)
     R_L = quaternion.to_matrix(log.matrix(("imu_lidar_qw", "imu_lidar_qx", "imu_lidar_qy", "imu_lidar_qz")))
     v, b_w, b_a, g, p_L = [log.column(name) for name in ("velocity", "bias_gyro", "bias_accel", "gravity", "imu_lidar_p")]
@@ -223,11 +230,12 @@ class _RefineRun:
         trajectory = self._run.trajectory
         rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
         T = (found.after if accepted else found.before).T_world_imu[scans]
+        of_run = after_unshown(self._run.rows.status)[rows] | (not accepted)
         R = quaternion.to_matrix(T[:, :4])
         with TrajectoryWriter(self._folder.path) as writer:
             for k, (scan, row) in enumerate(zip(scans.tolist(), rows.tolist(), strict=True)):
                 own = np.zeros((6, 6)) if trajectory.covariance is None else trajectory.covariance[row]
-                covariance = found.pose_covariance[scan] if accepted else own
+                covariance = own if of_run[k] else found.pose_covariance[scan]
                 status = "ok" if trajectory.status is None else trajectory.status[row]
                 writer.append(int(finished.time_ns[scan]), R[k], T[k, 4:], covariance, status)
 
@@ -323,6 +331,11 @@ class _RefineRun:
         if source == "estimated":
             doubts.append(
                 "the mounting of the LiDAR was estimated by the run: give --T-imu-lidar to 'boxplus lio' if it is known"
+            )
+        if unshown := int(np.count_nonzero(self._run.rows.status != "ok")):
+            doubts.append(
+                f"{unshown} scans were weak or lost: planes measure nothing that the surroundings did not show, and from the "
+                "first of them on covariances are those of the run"
             )
         if trajectory.covariance is not None:
             rows = np.searchsorted(trajectory.times, finished.time_ns[scans])

@@ -116,6 +116,37 @@ def test_runs_that_cannot_be_believed_are_refused(folders: tuple[Path, Path], tm
         assert code == 2 and words in err
 
 
+def with_weak_scans(run: Path, folder: Path, weak: range) -> Path:
+    """A copy of a run that says of some scans that they left a direction open."""
+    shutil.copytree(run, folder)
+    lines = (folder / "scans.csv").read_text().splitlines()
+    at = lines[0].split(",").index("status")
+    for k in weak:
+        cells = lines[1 + k].split(",")
+        lines[1 + k] = ",".join([*cells[:at], "weak", *cells[at + 1 :]])
+    (folder / "scans.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_covariances_are_those_of_the_run_from_the_first_weak_scan_on(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """What a scan was not shown stays in all later poses, whatever planes seem to measure."""
+    run = with_weak_scans(folders[0], tmp_path / "weak", range(30, 33))
+    code, out, err = call("refine", run, "-o", tmp_path / "out", "--no-report", "--recording", folders[1])
+    assert code == 0 and "3 scans were weak or lost" in out + err
+    before, after = read_trajectory(run / "trajectory.csv"), read_trajectory(tmp_path / "out" / "trajectory.csv")
+    assert before.covariance is not None and after.covariance is not None
+    np.testing.assert_allclose(after.covariance[30:], before.covariance[30:], rtol=1e-6)
+    sigma = [np.sqrt(np.trace(own[20:30, 3:, 3:].mean(axis=0))) for own in (before.covariance, after.covariance)]
+    assert sigma[1] < sigma[0]
+
+
+def test_a_run_that_was_shown_little_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    count = len(read_trajectory(folders[0] / "trajectory.csv"))
+    run = with_weak_scans(folders[0], tmp_path / "tunnel", range(count // 2 + 1))
+    code, _, err = call("refine", run, "--recording", folders[1])
+    assert code == 2 and f"{count // 2 + 1} of {count} scans that were weak or lost" in err and "by satellite" in err
+
+
 def test_results_are_replaced_on_demand_only(folders: tuple[Path, Path], refined: tuple[Path, str]) -> None:
     code, _, err = call("refine", folders[0])
     assert code == 2 and "the results of an earlier run" in err
