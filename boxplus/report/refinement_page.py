@@ -41,7 +41,11 @@ def _body(summary: RefineSummary, result: RefineResult) -> str:
         f'<p class="lead"><span class="state {"" if summary.accepted else "interrupted"}">{verdict}</span> '
         f"boxplus {escape(summary.versions['boxplus'])} · {summary.started:%Y-%m-%d %H:%M} UTC</p>" + tiles(numbers)
     )
-    parts = [head, warnings_section(escape(text) for text in summary.warnings), _table(summary)]
+    parts = [
+        head,
+        warnings_section(escape(text) for text in [*summary.warnings, *filter(None, [summary.doubt])]),
+        _table(summary),
+    ]
     parts += [_from_above(result), _shifts(result)]
     return "\n".join(parts)
 

@@ -104,7 +104,7 @@ def refine_command(
 
                     write_refinement_report(folder, summary, result)
         _print(terminal, summary, comparison, folder)
-        outcome.end(summary, summary.state)
+        outcome.end(summary, summary.state, untrusted=summary.doubt is not None)
         outcome.compare(comparison)
 
 
@@ -146,6 +146,8 @@ def _print(terminal: Terminal, summary: RefineSummary, comparison: Comparison | 
     terminal.print_rows(rows)
     for warning in summary.warnings:
         terminal.warn(warning)
+    if summary.doubt is not None:
+        terminal.doubt(summary.doubt)
     terminal.print_files(folder, ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "run.json"))
 
 

@@ -283,7 +283,7 @@ class _RefineRun:
         if refusal is not None:
             warnings.insert(0, f"not accepted, the trajectory is that of the run and no map was written: {refusal}")
         if refusal is None:
-            warnings += found.calibration.doubts + self._doubts(finished, found, scans)
+            warnings += found.calibration.doubts + self._notes()
         far = np.flatnonzero(found.loop_errors > _CONTRADICTED)
         if len(far) and finished.loops is not None:
             worst = int(np.argmax(found.loop_errors))
@@ -299,6 +299,7 @@ class _RefineRun:
             update={
                 "accepted": refusal is None,
                 "refusal": refusal,
+                "doubt": None if refusal is not None else self._doubt(finished, found, scans),
                 "scans": len(scans),
                 "keyframes": found.keyframes,
                 "planes": found.planes,
@@ -324,29 +325,30 @@ class _RefineRun:
             }
         )
 
-    def _doubts(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> list[str]:
-        """What the run claimed, against where refining has put its poses."""
-        doubts: list[str] = []
-        trajectory, source = self._run.trajectory, self._run.summary.extrinsic.source
-        if source == "estimated":
-            doubts.append(
-                "the mounting of the LiDAR was estimated by the run: give --T-imu-lidar to 'boxplus lio' if it is known"
-            )
+    def _notes(self) -> list[str]:
+        """What is known of the run that makes its refinement less than it seems."""
+        notes: list[str] = []
+        if self._run.summary.extrinsic.source == "estimated":
+            notes.append("the mounting of the LiDAR was estimated by the run: give --T-imu-lidar to 'boxplus lio' if it is known")
         if unshown := int(np.count_nonzero(self._run.rows.status != "ok")):
-            doubts.append(
+            notes.append(
                 f"{unshown} scans were weak or lost: planes measure nothing that the surroundings did not show, and from the "
                 "first of them on covariances are those of the run"
             )
-        if trajectory.covariance is not None:
-            rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
-            shift = (found.after.T_world_imu - found.before.T_world_imu)[scans, 4:]
-            sigma = np.sqrt(np.einsum("nii->ni", trajectory.covariance[rows])[:, 3:].max(axis=1)) + _LEAST_SIGMA_M
-            most = float((np.linalg.norm(shift, axis=1) / sigma).max())
-            if most > _DOUBTED:
-                doubts.append(
-                    f"poses moved by up to {most:.0f} standard deviations of what the run claimed: one of the two is wrong"
-                )
-        return doubts
+        return notes
+
+    def _doubt(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
+        """What the run claimed, against where refining has put its poses."""
+        trajectory = self._run.trajectory
+        if trajectory.covariance is None:
+            return None
+        rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
+        shift = (found.after.T_world_imu - found.before.T_world_imu)[scans, 4:]
+        sigma = np.sqrt(np.einsum("nii->ni", trajectory.covariance[rows])[:, 3:].max(axis=1)) + _LEAST_SIGMA_M
+        most = float((np.linalg.norm(shift, axis=1) / sigma).max())
+        if most <= _DOUBTED:
+            return None
+        return f"poses moved by up to {most:.0f} standard deviations of what the run claimed: one of the two is wrong"
 
     def _summary(self, state: str, error: str | None = None) -> RefineSummary:
         return RefineSummary.model_validate(

@@ -46,6 +46,7 @@ class RefineSummary(Part):
     recording: str = Field(description="path of the recording")
     accepted: bool = Field(False, description="trajectory and map are the refined ones; else they are those of the run")
     refusal: str | None = Field(None, description="why it was not accepted")
+    doubt: str | None = Field(None, description="why what was accepted is not to be trusted before somebody has looked at it")
     scans: int = 0
     keyframes: int = 0
     planes: int = 0

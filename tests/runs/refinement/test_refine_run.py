@@ -140,6 +140,16 @@ def test_covariances_are_those_of_the_run_from_the_first_weak_scan_on(folders: t
     assert sigma[1] < sigma[0]
 
 
+def test_poses_that_move_farther_than_the_run_allows_are_not_trusted(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refine_run, "_DOUBTED", 0.01)
+    code, _, err = call("refine", folders[0], "-o", tmp_path / "out", "--no-report")
+    said = "standard deviations of what the run claimed: one of the two is wrong"
+    assert code == 3 and "not to be trusted: poses moved by up to" in err and said in err
+    assert said in json.loads((tmp_path / "out" / "run.json").read_text())["doubt"]
+
+
 def test_a_run_that_was_shown_little_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     count = len(read_trajectory(folders[0] / "trajectory.csv"))
     run = with_weak_scans(folders[0], tmp_path / "tunnel", range(count // 2 + 1))
