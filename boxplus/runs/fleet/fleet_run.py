@@ -176,7 +176,7 @@ class _Fleet:
             worlds = worlds_of(len(names), found.values())
             if not 1 < len(worlds) < count:
                 break
-            pairs, count = looks.pairs_between(worlds, found, self._neighbours), len(worlds)
+            pairs, count = looks.pairs_between(worlds, found, 2 * self._neighbours), len(worlds)
         return [found[pair] for pair in sorted(found)]
 
     def _meet(self, names: Sequence[str], pairs: Sequence[Pair]) -> list[Meeting]:

@@ -5,13 +5,13 @@
    windows of a street, gets votes; that many features lie alike as well is rare where it is not the same place.
 
 Every session keeps the few others of which most features lie alike, so that the number of pairs grows with the number of
-sessions and not with its square, and so does the time. Where those that met leave several worlds, each session outside the
-largest one may look at as many again, in other worlds than its own.
+sessions and not with its square, and so does the time. Where those that met leave several worlds, each of them but the largest
+may look at a few pairs more, with sessions of other worlds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,30 +57,33 @@ class Looks:
         Args:
             per_session: others that each session keeps, the most alike first; sessions without any likeness have none.
         """
-        return self._pairs(per_session, range(len(self._descriptions)), np.arange(len(self._descriptions)), ())
+        apart = np.arange(len(self._descriptions))
+        return sorted({pair for number in apart.tolist() for _, pair in self._alike(number, per_session, apart, ())})
 
-    def pairs_between(self, worlds: Sequence[Sequence[int]], known: Container[Pair], per_session: int = 6) -> list[Pair]:
+    def pairs_between(self, worlds: Sequence[Sequence[int]], known: Container[Pair], per_world: int = 6) -> list[Pair]:
         """More pairs, of sessions in different worlds, to find out whether these are one.
 
         Args:
             worlds: numbers of the sessions of each, all of them; known: pairs that were looked at.
-            per_session: others that each session of all worlds but the largest keeps.
+            per_world: pairs that each world but the largest keeps, the most alike first.
         """
         world = np.empty(len(self._descriptions), dtype=np.int64)
         for number, members in enumerate(worlds):
             world[list(members)] = number
         largest = max(range(len(worlds)), key=lambda number: len(worlds[number]))
-        return self._pairs(per_session, np.flatnonzero(world != largest).tolist(), world, known)
+        found: set[Pair] = set()
+        for number, members in enumerate(worlds):
+            if number != largest:
+                alike = [scored for k in members for scored in self._alike(k, per_world, world, known)]
+                found.update(pair for _, pair in sorted(alike, key=lambda scored: -scored[0])[:per_world])
+        return sorted(found)
 
-    def _pairs(self, count: int, sessions: Iterable[int], world: NDArray[np.int64], known: Container[Pair]) -> list[Pair]:
-        return sorted({pair for number in sessions for pair in self._of_one(number, count, world, known)})
-
-    def _of_one(self, number: int, count: int, world: NDArray[np.int64], known: Container[Pair]) -> list[Pair]:
-        """With the sessions of other worlds that one looks most like, so many at most."""
+    def _alike(self, number: int, count: int, world: NDArray[np.int64], known: Container[Pair]) -> list[tuple[int, Pair]]:
+        """Inliers and pair with each of the sessions of other worlds that one looks most like, so many at most."""
         voted = self._voted(number, _ALIGNED * count, world, known)
         inliers = {other: self._inliers(number, matched) for other, matched in voted.items()}
         alike = sorted(voted, key=lambda other: -inliers[other])[:count]  # stable: of as many inliers, by votes
-        return [_pair(number, other) for other in alike]
+        return [(inliers[other], _pair(number, other)) for other in alike]
 
     def _voted(
         self, number: int, count: int, world: NDArray[np.int64], known: Container[Pair]
