@@ -35,11 +35,11 @@ def standing_in_common(own: Surface, there: Surface, T_there_own: Floats, config
 
 def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
     points = own.points[:: max(len(own.points) // _POINTS, 1)]
-    points = points[_above_ground(points)]
+    q = se3.act(T_there_own, points.astype(np.float64)).reshape(-1, 3)
+    is_seen = np.linalg.norm(q[:, :2], axis=1) <= _sight(there)
+    points, q = points[is_seen], q[is_seen]
     is_level = np.abs(plane_normals(points, own, config)[:, 2]) > _LEVEL
-    q = se3.act(T_there_own, points[~is_level].astype(np.float64)).reshape(-1, 3)
-    q = q[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)]
-    near = there.tree.nearest(q, 1, max_distance=config.near).counts > 0
+    near = there.tree.nearest(q[_above_ground(points) & ~is_level], 1, max_distance=config.near).counts > 0
     return int(near.sum()), len(near)
 
 
@@ -50,6 +50,8 @@ def _sight(surface: Surface) -> float:
 
 def _above_ground(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which points are higher than the lowest one near by."""
+    if not len(points):
+        return np.zeros(0, dtype=np.bool_)
     cell = np.floor(points[:, :2].astype(np.float64) / _CELL).astype(np.int64)
     cell -= cell.min(axis=0) - 1
     lowest = np.full(cell.max(axis=0) + 2, np.inf)

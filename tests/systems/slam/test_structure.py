@@ -55,3 +55,13 @@ def test_a_ceiling_and_bare_ground_do_not_stand() -> None:
     shared, asked = standing_in_common(room, room, HERE, CONFIG)
     assert asked < 100 and shared == asked
     assert standing_in_common(surface(ground(random)), surface(ground(random)), HERE, CONFIG) == (0, 0)
+
+
+def test_a_stray_point_far_away_costs_nothing() -> None:
+    random = np.random.default_rng(4)
+    parts = ground(random), wall(random, 5.0)
+    stray = np.array([[1e6, -1e6, 0.0]])
+    shared, asked = standing_in_common(surface(*parts, stray), surface(*parts, stray), HERE, CONFIG)
+    assert shared == asked > 300
+    apart = se3.exp(np.array([0.0, 0.0, 0.0, 500.0, 0.0, 0.0]))
+    assert standing_in_common(surface(*parts), surface(*parts), apart, CONFIG) == (0, 0)
