@@ -22,7 +22,7 @@ LOG_COLUMNS = Columns(
 SEARCH_COLUMNS = Columns(
     numbers=(
         *("place", "qw", "qx", "qy", "qz", "x", "y", "z"),
-        *("agreement", "fit", "overlap", "rms", "measured", "seen_through"),
+        *("agreement", "fit", "distance", "overlap", "rms", "measured", "seen_through"),
     ),
     texts=("refusal", "verdict"),
     statuses=("passes", "refused"),
@@ -64,7 +64,7 @@ class SearchLog(RowLogWriter):
             OutputError: the disk is full; the row is taken back.
         """
         for c in search.candidates:
-            numbers = [c.place, *c.T_map_query, c.agreement, c.fit, c.overlap, c.rms, c.measured, c.seen_through]
+            numbers = [c.place, *c.T_map_query, c.agreement, c.fit, c.distance, c.overlap, c.rms, c.measured, c.seen_through]
             status = "passes" if c.refusal is None else "refused"
             self.append_row(search.time_ns, status, numbers, [c.refusal or "", search.verdict])
 

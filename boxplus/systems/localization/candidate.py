@@ -12,13 +12,14 @@ from boxplus.manifolds import se3
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, same_pose
 from boxplus.systems.localization.standing import seen_through, standing
-from boxplus.systems.slam.registration import Surface, approach, register
+from boxplus.systems.slam.registration import Surface, approach, mean_distance, register
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _NEAR = 0.3  # m, between a point that stands and the map's
 _ASKED = 4000  # points that stand, for the fit
+_FAR = 0.15  # m, that a point is off its surface at most: beyond, it does not belong to it
 _FAR_WORSE = 0.5  # of the best fit, before the last stage of registration: what fits less is not worth that stage
 _NO_PLANES = "too few points on planes of the map"
 
@@ -32,6 +33,7 @@ class Candidate:
         T_map_query: (7,) after registration; covariance (6, 6) on the right of it [rad, m].
         agreement: of both from above, see `Guess`.
         fit: share of the query's points that stand within 0.3 m of points of the map.
+        distance: their mean distance from the map's surfaces, where each counts 15 cm at most; that where nobody looked [m].
         overlap: share of all points within 0.5 m.
         rms: spread of distances to the map's planes [m].
         measured: how many of the six directions the surfaces determine.
@@ -45,6 +47,7 @@ class Candidate:
     covariance: Floats
     agreement: float
     fit: float
+    distance: float
     overlap: float
     rms: float
     measured: int
@@ -92,6 +95,7 @@ def examine(guess: Guess, T_approached: Floats, query: Query, surroundings: Surf
         found.covariance,
         guess.agreement,
         fit,
+        mean_distance(query.stands, surroundings, T, _FAR, config.registration),
         found.overlap[0],
         found.rms,
         6 - len(found.weak),
@@ -135,12 +139,35 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
     for other in ranked:
         if other is best or same_pose(other.T_map_query, best.T_map_query):
             continue
-        is_clearly_worse = 1.0 - other.fit >= config.telling_misfit * (1.0 - best.fit)
+        is_clearly_worse = (
+            1.0 - other.fit >= config.telling_misfit * (1.0 - best.fit)
+            or (1.0 - config.telling_lead) * other.distance >= best.distance
+        )
         if best.fit - other.fit < config.telling * (0.5 if is_clearly_worse else 1.0):
             away = float(np.linalg.norm(other.T_map_query[4:] - best.T_map_query[4:]))
             return best, f"another pose, {away:.1f} m away, fits nearly as well: {_percent(other)} and {_percent(best)}", False
         at_once = at_once and other.fit * config.decisive <= best.fit
     return best, "", at_once
+
+
+def distinct(candidates: list[Candidate]) -> list[Candidate]:
+    """The first of each pose: several guesses come to the same one."""
+    found: list[Candidate] = []
+    for one in candidates:
+        if not any(same_pose(one.T_map_query, other.T_map_query) for other in found):
+            found.append(one)
+    return found
+
+
+def lead(best: Candidate, candidates: list[Candidate]) -> float:
+    """By what part less than at the best rival the points that stand are off the map's surfaces; negative where they are more.
+
+    What both places have is their kind: racks, columns and walls fit wherever there are such, also in the map of another hall.
+    The rest tells which place of its kind this one is. In its own map most of it lies where it did; in that of another place it
+    fits no better than at the rivals (docs/localization.md).
+    """
+    others = [one.distance for one in candidates if one is not best and not same_pose(one.T_map_query, best.T_map_query)]
+    return 1.0 - best.distance / max(min(others, default=_FAR), 1e-9)
 
 
 def examine_all(
@@ -171,7 +198,7 @@ def examine_all(
 
 def _unfit(guess: Guess, T_map_query: Floats, fit: float, refusal: str) -> Candidate:
     none = float("nan")
-    return Candidate(guess.place, T_map_query, np.eye(6), guess.agreement, fit, none, none, 0, none, refusal)
+    return Candidate(guess.place, T_map_query, np.eye(6), guess.agreement, fit, _FAR, none, none, 0, none, refusal)
 
 
 def _share_near(points: Points, target: Surface, T: Floats) -> float:

@@ -33,6 +33,10 @@ class LocalizationConfig(BaseModel):
     decisive: float = Field(3.0, ge=1, description="fit over that of the second-best place to be believed at once")
     telling: float = Field(0.1, gt=0, lt=1, description="fit more than any other pose to be believed when two queries agree")
     telling_misfit: float = Field(3.0, gt=1, description="or half of that, and so many times less that does not fit")
+    telling_lead: float = Field(0.3, gt=0, lt=1, description="or half of that, and so much less far off the map's surfaces")
+    least_lead: float = Field(
+        0.23, ge=0, lt=1, description="part by which what stands is less far off the map's surfaces than at any other pose, mean"
+    )
     track_interval: float = Field(0.3, ge=0, description="time between registrations of a scan to the map [s]")
     track_voxel: float = Field(0.5, gt=0, description="voxel that thins a scan for it [m]")
     track_points: int = Field(1000, ge=100, description="points of a scan for it, at most")

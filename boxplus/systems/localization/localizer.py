@@ -22,7 +22,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
-from boxplus.systems.localization.candidate import Candidate, Query, examine_all, rivalry
+from boxplus.systems.localization.candidate import Candidate, Query, distinct, examine_all, lead, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
 from boxplus.systems.localization.place_map import PlaceMap
@@ -37,6 +37,10 @@ _STILL = 1.0  # s after a registration was taken that a pose is localised, where
 _HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _REMEMBERED = 4  # poses that fitted a query
 _NEVER = -(2**62)
+_ANOTHER = (
+    "a place of the same kind, perhaps another one: what stands lies {:.0f} % nearer to surfaces of the map than at any other "
+    "pose, {:.0f} % asked for"
+)
 _JUMP_S = 2.0  # between scans, after which nothing is known of the motion between
 
 
@@ -100,6 +104,8 @@ class Localizer:
         self._tracker: Tracker | None = None
         self._before: tuple[int, Floats] | None = None
         self._promising: Floats | None = None  # T_map_odo of the query before, where it was nearly believed
+        self._leads: list[float] = []  # of the same place, in the queries up to the one before
+        self._leading: Floats | None = None  # T_map_odo of that place
         self._earlier: list[tuple[int, Floats]] = []  # place and T_map_odo of what fitted the query before
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         self._begin_search()
@@ -160,7 +166,7 @@ class Localizer:
             candidates = examine_all(guesses, query, self._map.points_near, config)
             candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
             T_odo_query = se3.inverse(local_map.T_odo_map)
-            fitting = [candidate for candidate in candidates if candidate.fit >= config.least_fit][:_REMEMBERED]
+            fitting = distinct([candidate for candidate in candidates if candidate.fit >= config.least_fit])[:_REMEMBERED]
             self._earlier = [(one.place, se3.compose(one.T_map_query, T_odo_query)) for one in fitting]
             verdict = self._judge(candidates, local_map, T_query_body)
         self.last_search = Search(time_ns, tuple(candidates), verdict)
@@ -171,10 +177,20 @@ class Localizer:
         if not candidates:
             return "nothing that was seen stands, or none of it agrees with the map"
         best, verdict, at_once = rivalry(candidates, self.config)
-        if best is None or verdict:
-            self._promising = None
+        if best is None:
+            self._promising = self._leading = None
             return verdict
         T_map_odo = se3.compose(best.T_map_query, se3.inverse(local_map.T_odo_map))
+        # Every query of a place is counted, also those that are not believed: the lead of one varies by a third of itself.
+        if self._leading is None or not self._agree(self._leading, T_map_odo, local_map.T_odo_map):
+            self._leads = []
+        self._leads.append(lead(best, candidates))
+        self._leading = T_map_odo
+        if not verdict and (mean := float(np.mean(self._leads))) < self.config.least_lead:
+            verdict = _ANOTHER.format(100.0 * mean, 100.0 * self.config.least_lead)
+        if verdict:
+            self._promising = None
+            return verdict
         if not at_once:
             before, self._promising = self._promising, T_map_odo
             if before is None or not self._agree(before, T_map_odo, local_map.T_odo_map):
@@ -231,7 +247,8 @@ class Localizer:
     def _begin_search(self) -> None:
         config = self.config
         self._tracker = None
-        self._promising = None
+        self._promising = self._leading = None
+        self._leads = []
         self._earlier = []
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         voxel = self._map.voxel

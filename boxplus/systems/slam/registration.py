@@ -193,6 +193,17 @@ def fitting_share(
     return 0.0 if found is None else float(np.count_nonzero(np.abs(found.e) <= tolerance)) / len(points)
 
 
+def mean_distance(
+    points: NDArray[np.float32], target: Surface, T_target_source: Floats, limit: float, config: LocalMapRegistrationConfig
+) -> float:
+    """Mean distance of points (N, 3) of a source from the planes of the target, each `limit` [m] at most, and without one."""
+    found = _Matched.of(points, target, T_target_source, _STAGES[-1][0], config)
+    if found is None:
+        return limit
+    beyond = limit * (len(points) - len(found.e))
+    return (float(np.minimum(np.abs(found.e), limit).sum()) + beyond) / len(points)
+
+
 def plane_normals(points: NDArray[np.float32], surface: Surface, config: LocalMapRegistrationConfig) -> Floats:
     """(N, 3) unit normals of the planes through a surface's points next to each of these; NaN where there is none."""
     planes, valid = _planes(points, surface, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _STAGES[-1][0], config)

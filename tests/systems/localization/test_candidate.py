@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from boxplus.manifolds import se3
 from boxplus.simulation.worlds.worlds import yard
-from boxplus.systems.localization.candidate import Candidate, rivalry
+from boxplus.systems.localization.candidate import Candidate, distinct, lead, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import PlaceImages, same_pose
 from boxplus.systems.localization.standing import seen_through, standing
@@ -15,9 +16,9 @@ from tests.systems.localization.days import INDOORS, drive_of, known_map
 HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-def candidate(fit: float, x: float = 0.0, refusal: str | None = None) -> Candidate:
+def candidate(fit: float, x: float = 0.0, refusal: str | None = None, distance: float = 0.05) -> Candidate:
     T = HERE + np.array([0.0, 0.0, 0.0, 0.0, x, 0.0, 0.0])
-    return Candidate(0, T, np.eye(6), 0.5, fit, 1.0, 0.02, 6, 0.0, refusal)
+    return Candidate(0, T, np.eye(6), 0.5, fit, distance, 1.0, 0.02, 6, 0.0, refusal)
 
 
 def judged(*candidates: Candidate) -> tuple[bool, bool]:
@@ -37,9 +38,21 @@ def test_a_rival_that_fits_nearly_as_well_forbids_to_believe() -> None:
     # Nearly nothing does not fit here, and three times as much there.
     assert judged(candidate(0.99), candidate(0.93, 30.0)) == (True, False)
     assert judged(candidate(0.99), candidate(0.96, 30.0))[0] is False
+    # Nor does what stands lie on surfaces there.
+    assert judged(candidate(0.95), candidate(0.88, 30.0, distance=0.08)) == (True, False)
+    assert judged(candidate(0.95), candidate(0.88, 30.0, distance=0.06))[0] is False
+    assert judged(candidate(0.95), candidate(0.92, 30.0, distance=0.12))[0] is False
     # A rival that is refused is a rival all the same.
     assert judged(candidate(0.9), candidate(0.88, 30.0, "surfaces lie apart"))[0] is False
     assert judged(candidate(0.9, 0.0, "seen through"), candidate(0.4, 30.0, "too little")) == (False, False)
+
+
+def test_the_lead_is_over_the_best_of_all_other_poses() -> None:
+    best, twin = candidate(0.9, distance=0.03), candidate(0.9, 0.4, distance=0.031)
+    assert lead(best, [best]) == pytest.approx(0.8)  # nothing else lies nearer than a point that belongs to no surface
+    assert lead(best, [best, twin, candidate(0.8, 3.0, distance=0.06), candidate(0.7, 9.0, distance=0.1)]) == pytest.approx(0.5)
+    assert lead(best, [best, candidate(0.8, 3.0, distance=0.024)]) == pytest.approx(-0.25)
+    assert distinct([best, twin, candidate(0.5, 3.0)])[1].fit == 0.5
 
 
 def test_a_wall_of_the_map_that_a_scan_sees_past_speaks_against_it() -> None:

@@ -10,6 +10,7 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.simulation.worlds.alike import parallel_corridors
+from boxplus.simulation.worlds.sites import warehouse
 from boxplus.simulation.worlds.world import World
 from boxplus.simulation.worlds.worlds import yard
 from boxplus.systems.localization.config import LocalizationConfig
@@ -94,6 +95,19 @@ def test_another_place_is_not_found_and_it_is_said_why(place_map: KnownMap) -> N
     search = localizer.last_search
     assert search is not None and search.verdict
     assert all(candidate.refusal for candidate in search.candidates)
+
+
+def test_another_warehouse_with_the_same_racks_is_not_taken_for_the_one_of_the_map() -> None:
+    place_map = known_map(warehouse(seed=31), [[-10, 0], [6, 0]], INDOORS, seed=31)
+    at_once = LocalizationConfig(candidates=4, decisive=1.0, telling=0.05)  # so that nothing else refuses it, nor asks for more
+    ends = []
+    for seed in (31, 131):
+        drive = drive_of(warehouse(seed=seed), [[-8, 0.4], [-2.5, 0.4]], seed=5)
+        localizer = Localizer(place_map, at_once)
+        ends.append(push_all(localizer, drive, own_world(drive))[-1].status)
+    search = localizer.last_search
+    assert ends == ["localised", "searching"]
+    assert search is not None and search.candidates[0].refusal is None and "place of the same kind" in search.verdict
 
 
 def test_corridors_that_are_alike_are_not_told_apart() -> None:
