@@ -11,22 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from boxplus._jit import kernel
+from boxplus.maps.plane_voxels.membership import PlaneBlocks, sum_on_planes
 from boxplus.maps.plane_voxels.voxel_sums import (
     COUNT,
-    EMPTY,
     SQUARES,
     SUM,
     SUMS,
     VoxelSums,
-    add_point,
     clusters,
     coordinates,
-    key_of,
     moments,
     pack,
     shifted,
-    slot_of,
 )
 
 _SPLITS = 3  # a voxel is halved so often
@@ -58,7 +54,7 @@ class PlaneMap:
         planes: (P, 4) unit normal n and offset d of nᵀ(x − c) + d = 0; centres: (P, 3) c.
         thickness: (P,) standard deviation of the points across each [m].
         cell: edge of the smallest voxels [m].
-        keys, plane_of: table of these voxels, and the plane of each, −1 for none.
+        keys, plane_of: (v,) the voxels that a plane is in, and which.
         is_one_sided: normals point to where a plane is seen from, and nothing is on it that was seen from behind.
     """
 
@@ -71,21 +67,19 @@ class PlaneMap:
     is_one_sided: bool = False
     # Of all planes, and worked out once: a long recording has a hundred thousand, of which a scan sees a few hundred.
     _gate: NDArray[np.float64] = field(init=False, repr=False)
-    _widest_gate: float = field(init=False, repr=False)
-    _sums: NDArray[np.float64] = field(init=False, repr=False)
+    _blocks: PlaneBlocks = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # A plane that was found by half of its points, beside a face of its voxel, is thinner than it will be.
         usual = float(np.median(self.thickness)) if len(self.thickness) else 0.0
         object.__setattr__(self, "_gate", _GATE * np.maximum(self.thickness, max(usual, _NEGLIGIBLE_M)))
-        object.__setattr__(self, "_widest_gate", float(self._gate.max(initial=0.0)))
-        object.__setattr__(self, "_sums", np.zeros((len(self), SUMS)))
+        object.__setattr__(self, "_blocks", PlaneBlocks.of(self.keys, self.plane_of, self._gate))
 
     def __len__(self) -> int:
         return len(self.planes)
 
     def seen_from(self, p: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(k,) 1 where p (3,) lies before planes `numbers` (k,), 0 where it lies behind them, by their normals."""
+        """(k,) 1 where p (3,) or (k, 3) lies before planes `numbers` (k,), 0 where it lies behind them, by their normals."""
         height = np.einsum("ki,ki->k", self.planes[numbers, :3], p - self.centres[numbers]) + self.planes[numbers, 3]
         side: NDArray[np.int64] = (height > 0.0).astype(np.int64)
         return side
@@ -115,18 +109,26 @@ class PlaneMap:
 
         p is where they were seen from, too.
         """
-        touched = np.empty(min(len(points), len(self)), dtype=np.int64)
-        count = _on_planes(
-            points, R, p, self.cell, self.keys, self.plane_of, self.planes, self.centres,
-            self._gate, self._widest_gate, self._sums, touched,
+        _, plane, own = self.clusters_of_scans(points, np.array([0, len(points)]), R[None], p[None])
+        order = np.argsort(plane)
+        return plane[order], own[order]
+
+    def clusters_of_scans(
+        self, points: NDArray[np.float32], begin: NDArray[np.int64], R: NDArray[np.float64], p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """The same of many scans: scan (k,), ascending, plane (k,), and Σ [x; 1][x; 1]ᵀ (k, 4, 4) of points of this on that.
+
+        Args:
+            points: (n, 3), those of scan m are [begin[m], begin[m + 1]), placed by R (m, 3, 3) and p (m, 3).
+        """
+        most = len(points)  # a point is on one plane at most; memory that is not written is never taken
+        scan, plane, sums = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.zeros((most, SUMS))
+        table = self._blocks
+        count = sum_on_planes(
+            points, begin, R, p, self.cell, table.keys, table.block, table.plane, table.reach, self.planes, self.centres,
+            self._gate, self.is_one_sided, np.full(len(self), -1), scan, plane, sums,
         )  # fmt: skip
-        found = np.sort(touched[:count])
-        sums = self._sums[found]
-        self._sums[found] = 0.0
-        if self.is_one_sided:
-            before = self.seen_from(p, found) == 1
-            found, sums = found[before], sums[before]
-        return found, clusters(sums)
+        return scan[:count].copy(), plane[:count].copy(), clusters(sums[:count])
 
 
 def find_planes(voxels: VoxelSums, config: PlaneVoxelConfig) -> PlaneMap:
@@ -143,8 +145,8 @@ def find_planes(voxels: VoxelSums, config: PlaneVoxelConfig) -> PlaneMap:
         if not len(open_cells):
             break
         edge = cell * (1 << level)
-        parents, parent_of = np.unique(cells[open_cells] >> level, axis=0, return_inverse=True)
-        parent_of = parent_of.reshape(-1)
+        packed, parent_of = np.unique(pack(cells[open_cells] >> level), return_inverse=True)
+        parents = coordinates(packed)
         middles = (parents + 0.5) * edge
         here = shifted(sums[open_cells], (cells[open_cells] + 0.5) * cell - middles[parent_of])
         total: NDArray[np.float64] = np.stack(
@@ -177,9 +179,8 @@ def find_planes(voxels: VoxelSums, config: PlaneVoxelConfig) -> PlaneMap:
     all_thickness = np.concatenate(thickness)
     gone = _doubles(cells, sums, plane_of, all_planes[:, :3], all_thickness, cell)
     plane_of[np.isin(plane_of, gone)] = -1
-    table = np.full(len(voxels.keys), -1, dtype=np.int32)
-    table[slots] = plane_of
-    return PlaneMap(all_planes, all_centres, all_thickness, cell, voxels.keys, table)
+    own = plane_of >= 0
+    return PlaneMap(all_planes, all_centres, all_thickness, cell, voxels.keys[slots[own]], plane_of[own])
 
 
 def _doubles(
@@ -233,84 +234,3 @@ def _mean_by(
     total = np.bincount(parent_of[finite], weights[finite] * values[finite], count)
     weight = np.bincount(parent_of[finite], weights[finite], count)
     return np.where(weight > 0.0, total / np.maximum(weight, 1.0), np.inf)
-
-
-@kernel(inline=True)
-def _plane_at(x: float, y: float, z: float, cell: float, keys: NDArray[np.int64], plane_of: NDArray[np.int32]) -> int:
-    """The plane of the voxel that a point lies in; −1 for none."""
-    key = key_of(x, y, z, cell)
-    if key == EMPTY:
-        return -1
-    slot = slot_of(key, keys)
-    return int(plane_of[slot]) if keys[slot] == key else -1
-
-
-@kernel
-def _member_of(
-    x: float,
-    y: float,
-    z: float,
-    cell: float,
-    keys: NDArray[np.int64],
-    plane_of: NDArray[np.int32],
-    planes: NDArray[np.float64],
-    centres: NDArray[np.float64],
-    gate: NDArray[np.float64],
-    widest: float,
-) -> int:
-    """The only plane whose voxels hold the foot of a point that is near enough; −1 for none or several."""
-    member, at = -1, (x, y, z)
-    for side in range(4):
-        a, b, c = x, y, z
-        if side > 0:
-            # Over the nearest face of the voxel on one axis, where a plane beyond it may be near enough.
-            inside = at[side - 1] / cell - np.floor(at[side - 1] / cell)
-            if min(inside, 1.0 - inside) * cell > widest:
-                continue
-            step = cell if inside > 0.5 else -cell
-            a, b, c = x + step * (side == 1), y + step * (side == 2), z + step * (side == 3)
-        plane = _plane_at(a, b, c, cell, keys, plane_of)
-        if plane < 0 or plane == member:
-            continue
-        u, q = planes[plane], centres[plane]
-        distance = u[0] * (x - q[0]) + u[1] * (y - q[1]) + u[2] * (z - q[2]) + u[3]
-        if not abs(distance) <= gate[plane]:
-            continue
-        foot = _plane_at(x - distance * u[0], y - distance * u[1], z - distance * u[2], cell, keys, plane_of)
-        if foot == plane:
-            if member >= 0:
-                return -1
-            member = plane
-    return member
-
-
-@kernel
-def _on_planes(
-    points: NDArray[np.float32],
-    R: NDArray[np.float64],
-    p: NDArray[np.float64],
-    cell: float,
-    keys: NDArray[np.int64],
-    plane_of: NDArray[np.int32],
-    planes: NDArray[np.float64],
-    centres: NDArray[np.float64],
-    gate: NDArray[np.float64],
-    widest: float,
-    sums: NDArray[np.float64],
-    touched: NDArray[np.int64],
-) -> int:
-    count = 0
-    for n in range(points.shape[0]):
-        a, b, c = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
-        x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0]
-        y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
-        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
-        plane = _member_of(x, y, z, cell, keys, plane_of, planes, centres, gate, widest)
-        if plane < 0:
-            continue
-        total = sums[plane]
-        if total[0] == 0.0:
-            touched[count] = plane
-            count += 1
-        add_point(total, a, b, c)
-    return count

@@ -40,6 +40,8 @@ def covariances_of(
     counted: Mapping[Group, Floats],
     held: Mapping[Group, Floats],
     options: SolverOptions,
+    *,
+    is_determined: bool = False,
 ) -> list[Floats]:
     """(n, dof, dof) of the variables of each block at a solution.
 
@@ -47,16 +49,17 @@ def covariances_of(
         counted: (N,) w of the residuals of groups that have been counted for less than they are worth; of others it is 1.
         held: (N,) weights that groups have in the problem for other reasons.
         options: that it was solved with.
+        is_determined: the problem determines all of its variables; a free one is looked for only where H cannot be factorised.
     """
     if all(bool((w == 1.0).all()) for w in counted.values()):
-        return [solution.covariance(x) for x in blocks]
+        return [solution.covariance(x, is_determined=is_determined) for x in blocks]
     sides = []
     for step in (-_STEP, _STEP):
         for group in problem.groups:
             one = np.ones(group.residual.count)
             problem.set_weights(group, held.get(group, one) * (1.0 + step * counted.get(group, one)))
         there = problem.solve(options.model_copy(update={"max_iterations": 0}), start=solution)
-        sides.append([there.covariance(x) for x in blocks])
+        sides.append([there.covariance(x, is_determined=is_determined) for x in blocks])
     for group in problem.groups:  # the solution is asked again under the weights that it was found with
         problem.set_weights(group, held.get(group))
     return [(less - more) * ((1.0 - _STEP**2) / (2.0 * _STEP)) for less, more in zip(*sides, strict=True)]

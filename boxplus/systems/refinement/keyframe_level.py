@@ -113,7 +113,9 @@ def move_keyframes(
     covariance, sigma = np.zeros((len(run), 6, 6)), dict[Variables, Floats]()
     if with_covariance:
         blocks = [x.poses, x.lidar, *(() if x.offset is None else (x.offset,)), *(() if fixes is None else fixes.blocks)]
-        own, *single = covariances_of(problem, solution, blocks, {on_planes: seen.counted}, held, options)
+        # IMU, priors and the first pose, which is held, determine all but where a straight way lies on the Earth.
+        counted, is_determined = {on_planes: seen.counted}, fixes is None
+        own, *single = covariances_of(problem, solution, blocks, counted, held, options, is_determined=is_determined)
         covariance = _between(run, keyframes, own)
         sigma = {block: np.sqrt(np.diagonal(found[0])) for block, found in zip(blocks[1:], single, strict=True)}
     elif x.offset is not None:

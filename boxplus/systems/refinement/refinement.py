@@ -103,7 +103,7 @@ def refine(
             tell("finding planes", number / config.rounds)
             T_lidar = lidar_poses(state.T_world_imu, state.T_imu_lidar)
             planes, information = planes_of(run, T_lidar, keyframes, config)
-        seen = keyframe_clusters(run, T_lidar, keyframes, planes, information)
+        seen = keyframe_clusters(run, T_lidar, keyframes, planes, information, config.threads)
         tell("moving keyframes", (number + 0.4) / config.rounds)
         is_last = number + 1 == config.rounds
         moved = move_keyframes(run, state, keyframes, planes, seen, config, free, with_covariance=is_last)
@@ -119,7 +119,7 @@ def refine(
         before=before,
         after=_anchored(state, before.T_world_imu[0]),
         pose_covariance=_relative_to_first(state.T_world_imu, moved.covariance + own, own[0]),
-        sharpness=judge(run, T_before, T_after, judging),
+        sharpness=judge(run, T_before, T_after, judging, config.threads),
         keyframes=len(keyframes),
         planes=int(np.count_nonzero(moved.is_held)),
         costs=np.array(costs),

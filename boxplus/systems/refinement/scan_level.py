@@ -40,7 +40,7 @@ def move_scans(
     between = preintegrated(run, np.arange(len(run)), state.velocity_bias, state.time_offset_s)
     imu = ImuPreintegration(between, gravity=GRAVITY * state.gravity_direction)
     by_imu = problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:], name="imu")
-    forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, information)
+    forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, information, config.threads)
     on_planes = problem.add_residuals(PoseQuadratic(forms, state.T_world_imu[:, 4:]), poses, name="planes")
     add_bias_prior(problem, states)
     options = SolverOptions(
@@ -51,5 +51,5 @@ def move_scans(
     if with_covariance:
         weights = weights_of_slices(run)
         counted = {on_planes: weights, by_imu: imu_counted(weights < 1.0)}
-        (covariance,) = covariances_of(problem, solution, [poses], counted, {}, options)
+        (covariance,) = covariances_of(problem, solution, [poses], counted, {}, options, is_determined=True)
     return replace(state, T_world_imu=solution[poses], velocity_bias=solution[states]), covariance

@@ -1,8 +1,7 @@
-"""What scans see of planes: points are gone through once for each question, and none is kept."""
+"""What scans see of planes, for the two levels of refinement and for the verdict on it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +15,11 @@ from boxplus.residuals.planes.pose_quadratic import add_plane_forms
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import Keyframes
+from boxplus.systems.refinement.sums_on_planes import add_to_sides, add_weighed, moved_clusters, points_that, sighted
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_JUDGED = 5  # of so many points one takes no part and judges the result
 _LEAST_FACING = 0.05  # squared cosine of the angle at which a plane is seen
 _SMOOTH = 0.005  # m, thickness of a plane that is never too rough
 _LEAST_SIGMA = 0.002  # m, of a distance from a plane
@@ -58,21 +57,23 @@ def planes_of(run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, config: R
     keyframe, their mean is known to σ²/n + σ_f², as if each of them had the variance σ² + n σ_f².
     """
     voxels = VoxelSums(config.smallest_voxel)
-    for k, R, p, points in _placed(run, T_lidar, judging=False):
-        voxels.add(points, R, p, int(keyframes.of_scan[k]))
+    R, p = quaternion.to_matrix(T_lidar[:, :4]), T_lidar[:, 4:]
+    for number, points in enumerate(run.points):
+        if len(points):
+            voxels.add(points_that(points, judge=False), R[number], p[number], int(keyframes.of_scan[number]))
     planes = find_planes(voxels, config)
+    del voxels
     world = np.zeros((2, len(planes), 4, 4))  # seen from behind, and from before
     facing = np.zeros((2, len(planes)))  # sum over points of the squared cosine of the angle at which the plane is seen
     latest, seen_by = np.full((2, len(planes)), -1), np.zeros((2, len(planes)))
-    for k, R, p, points in _placed(run, T_lidar, judging=False):
-        found, own = planes.clusters_of(points, R, p)
-        at = planes.seen_from(p, found), found
-        world[at] += _moved(own, R, p - planes.centres[found])
-        seen_by[at] += latest[at] != keyframes.of_scan[k]
-        latest[at] = keyframes.of_scan[k]
-        mean = own[:, :3, 3] / own[:, 3:, 3]
-        along = np.einsum("ki,ki->k", planes.planes[found, :3] @ R, mean) / np.linalg.norm(mean, axis=1)
-        facing[at] += own[:, 3, 3] * along**2
+    for seen in sighted(run.points, T_lidar, planes, config.threads):
+        scan, plane = seen.scan, seen.plane
+        side = planes.seen_from(p[scan], plane)
+        mean = seen.clusters[:, :3, 3] / seen.clusters[:, 3:, 3]
+        normal = np.einsum("kji,kj->ki", R[scan], planes.planes[plane, :3])
+        share = np.einsum("ki,ki->k", normal, mean) ** 2 / np.einsum("ki,ki->k", mean, mean)
+        moved = moved_clusters(seen.clusters, R[scan], p[scan] - planes.centres[plane])
+        add_to_sides(side, plane, keyframes.of_scan[scan], moved, share, world, facing, latest, seen_by)
     side = np.argmax(world[:, :, 3, 3], axis=0)
     own_side = side, np.arange(len(planes))
     world, facing, seen_by = world[own_side], facing[own_side], seen_by[own_side]
@@ -105,40 +106,33 @@ def weights_of_slices(run: FinishedRun) -> Floats:
 
 
 def keyframe_clusters(
-    run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap, information: Floats
+    run: FinishedRun, T_lidar: Floats, keyframes: Keyframes, planes: PlaneMap, information: Floats, threads: int = 1
 ) -> KeyframeClusters:
     """What every keyframe sees with the scans around it, of the planes that two keyframes see."""
     relative = se3.compose(se3.inverse(T_lidar[keyframes.scan[keyframes.of_scan]]), T_lidar)
     R_key, p_key = quaternion.to_matrix(relative[:, :4]), relative[:, 4:]
-    total, weights = np.zeros((len(planes), 4, 4)), weights_of_slices(run)
+    weights = weights_of_slices(run)
     keyframe: list[Ints] = []
     plane: list[Ints] = []
     clusters: list[Floats] = []
     counted: list[Floats] = []
-    squares = np.zeros(len(planes))  # Σ w² of the points
-    touched: list[Ints] = []  # planes of the keyframe that is gone through
-
-    def close(number: int) -> None:
-        seen = np.unique(np.concatenate(touched)) if touched else np.zeros(0, dtype=np.int64)
-        touched.clear()
-        keyframe.append(np.full(len(seen), number))
-        plane.append(seen)
-        clusters.append(total[seen] * information[seen, None, None])
-        counted.append(squares[seen] / total[seen, 3, 3])
-        total[seen], squares[seen] = 0.0, 0.0
-
-    current = 0
-    for k, R, p, points in _placed(run, T_lidar, judging=False):
-        if keyframes.of_scan[k] != current:
-            close(current)
-            current = int(keyframes.of_scan[k])
-        found, own = planes.clusters_of(points, R, p)
-        total[found] += weights[k] * _moved(own, R_key[k], np.broadcast_to(p_key[k], (len(found), 3)))
-        squares[found] += weights[k] ** 2 * own[:, 3, 3]
-        touched.append(found)
-    close(current)
+    begins = np.flatnonzero(np.diff(keyframes.of_scan, prepend=-1))  # no keyframe is cut in two
+    for seen in sighted(run.points, T_lidar, planes, threads, begins):
+        useful = information[seen.plane] > 0.0
+        k, number = seen.scan[useful], seen.plane[useful]
+        if not len(k):
+            continue
+        key, of = np.unique(keyframes.of_scan[k] * len(planes) + number, return_inverse=True)
+        total, squares = np.zeros((len(key), 4, 4)), np.zeros(len(key))
+        add_weighed(of, moved_clusters(seen.clusters[useful], R_key[k], p_key[k]), weights[k], total, squares)
+        keyframe.append(key // len(planes))
+        plane.append(key % len(planes))
+        clusters.append(total * information[plane[-1], None, None])
+        counted.append(squares / total[:, 3, 3])
+    if not keyframe:
+        return KeyframeClusters(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0))
     all_planes = np.concatenate(plane)
-    often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes] & (information[all_planes] > 0.0)
+    often = (np.bincount(all_planes, minlength=len(planes)) >= 2)[all_planes]
     return KeyframeClusters(
         np.concatenate(keyframe)[often],
         all_planes[often],
@@ -147,40 +141,36 @@ def keyframe_clusters(
     )
 
 
-def scan_forms(run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats) -> Floats:
+def scan_forms(
+    run: FinishedRun, T_world_imu: Floats, T_imu_lidar: Floats, planes: PlaneMap, information: Floats, threads: int = 1
+) -> Floats:
     """Q (N, 13, 13) of every scan on the planes (P,), for `PoseQuadratic` about the poses' positions; none where it is zero."""
     R_L, p_L = quaternion.to_matrix(T_imu_lidar[:4]), T_imu_lidar[4:]
     forms, weights = np.zeros((len(run), 13, 13)), weights_of_slices(run)
-    for k, R, p, points in _placed(run, lidar_poses(T_world_imu, T_imu_lidar), judging=False):
-        found, own = planes.clusters_of(points, R, p)
-        seen = information[found] > 0.0
-        found = found[seen]
-        body = _moved(own[seen], R_L, np.broadcast_to(p_L, (len(found), 3))) * (weights[k] * information[found, None, None])
-        normals = planes.planes[found, :3]
-        offsets = np.einsum("ki,ki->k", normals, T_world_imu[k, 4:] - planes.centres[found]) + planes.planes[found, 3]
-        add_plane_forms(body, normals, offsets, forms[k])
+    for seen in sighted(run.points, lidar_poses(T_world_imu, T_imu_lidar), planes, threads):
+        useful = information[seen.plane] > 0.0
+        k, number = seen.scan[useful], seen.plane[useful]
+        count = len(k)
+        body = moved_clusters(seen.clusters[useful], np.broadcast_to(R_L, (count, 3, 3)), np.broadcast_to(p_L, (count, 3)))
+        body *= (weights[k] * information[number])[:, None, None]
+        normals = planes.planes[number, :3]
+        offsets = np.einsum("ki,ki->k", normals, T_world_imu[k, 4:] - planes.centres[number]) + planes.planes[number, 3]
+        begins = np.flatnonzero(np.diff(k, prepend=-1))
+        for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), count], strict=True):
+            add_plane_forms(body[begin:end], normals[begin:end], offsets[begin:end], forms[k[begin]])
     return forms
 
 
-def judge(run: FinishedRun, T_before: Floats, T_after: Floats, planes: PlaneMap) -> tuple[Sharpness, Sharpness]:
+def judge(run: FinishedRun, T_before: Floats, T_after: Floats, planes: PlaneMap, threads: int = 1) -> tuple[Sharpness, Sharpness]:
     """The sharpness of the points that took no part, before and after, on planes that were found before; LiDAR poses (N, 7)."""
     world = np.zeros((2, len(planes), 4, 4))
-    R_after, p_after = quaternion.to_matrix(T_after[:, :4]), T_after[:, 4:]
-    for k, R, p, points in _placed(run, T_before, judging=True):
-        found, own = planes.clusters_of(points, R, p)
-        for side, (turn, shift) in enumerate(((R, p), (R_after[k], p_after[k]))):
-            world[side, found] += _moved(own, turn, shift - planes.centres[found])
+    poses = [(quaternion.to_matrix(T[:, :4]), T[:, 4:]) for T in (T_before, T_after)]
+    for seen in sighted(run.points, T_before, planes, threads, judge=True):
+        for side, (R, p) in enumerate(poses):
+            moved = moved_clusters(seen.clusters, R[seen.scan], p[seen.scan] - planes.centres[seen.plane])
+            add_weighed(seen.plane, moved, np.ones(len(moved)), world[side], np.zeros(len(planes)))
     variance = np.maximum(planes.thickness, _LEAST_SIGMA) ** 2
     return sharpness(world[0], variance), sharpness(world[1], variance)
-
-
-def _placed(run: FinishedRun, T_lidar: Floats, *, judging: bool) -> Iterator[tuple[int, Floats, Floats, NDArray[np.float32]]]:
-    """Scan by scan its number, R, p, and the points that take part, or those that judge."""
-    R = quaternion.to_matrix(T_lidar[:, :4])
-    for k, points in enumerate(run.points):
-        if len(points):
-            chosen = (np.arange(len(points)) % _JUDGED == 0) == judging
-            yield k, R[k], T_lidar[k, 4:], np.ascontiguousarray(points[chosen])
 
 
 def _usual(values: Floats, weights: Floats) -> float:
@@ -188,11 +178,3 @@ def _usual(values: Floats, weights: Floats) -> float:
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])]) if len(values) and total[-1] > 0.0 else np.inf
-
-
-def _moved(clusters: Floats, R: Floats, p: Floats) -> Floats:
-    """Σ [x; 1][x; 1]ᵀ (k, 4, 4) of points moved to R x + p, with one p (k, 3) for each cluster."""
-    T = np.zeros((len(clusters), 4, 4))
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, p, 1.0
-    moved: Floats = T @ clusters @ np.swapaxes(T, 1, 2)
-    return moved

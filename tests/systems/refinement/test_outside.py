@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -31,9 +30,8 @@ def _poses(random: np.random.Generator, count: int, metres: float = 5.0) -> Floa
 
 def _planes(normals: Floats) -> PlaneMap:
     count = len(normals)
-    none = np.zeros(0)
-    fields = dict.fromkeys((field.name for field in dataclasses.fields(PlaneMap) if field.init), none)
-    return PlaneMap(**fields | {"planes": np.hstack([normals, np.zeros((count, 1))]), "centres": np.zeros((count, 3))})
+    planes, nowhere = np.hstack([normals, np.zeros((count, 1))]), np.zeros(0, dtype=np.int64)
+    return PlaneMap(planes, np.zeros((count, 3)), np.zeros(count), 0.5, nowhere, nowhere.astype(np.int32))
 
 
 def _seen(keyframes: list[int], weight: float) -> KeyframeClusters:
