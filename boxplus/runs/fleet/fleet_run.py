@@ -24,6 +24,7 @@ from boxplus.runs.fleet.tasks import RunOutline, meet_runs, outline_run, run_of,
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.joined import merge_facts
 from boxplus.runs.sessions.merge_run import merge_runs
+from boxplus.runs.sessions.repeated import repeated
 from boxplus.runs.sessions.tables import write_encounters
 from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.storage.output_folder import SUMMARY
@@ -103,7 +104,7 @@ class _Fleet:
         self._run_recordings()
         if len(self._sound()) > 1:
             self._note(stage="pairs")
-            outlines = self._outlines(self._sound())
+            outlines = self._without_repeated(self._outlines(self._sound()))
             meetings = self._meetings(outlines)
             self._note(stage="map", pairs_looked_at=len(meetings))
             sessions = [outline.session for outline in outlines.values()]
@@ -159,6 +160,14 @@ class _Fleet:
             else:
                 self._note_recording(numbers[names[end.number]], state="failed", error=f"its local maps: {end.error}")
         return {name: found[name] for name in names if name in found}
+
+    def _without_repeated(self, outlines: Mapping[str, RunOutline]) -> dict[str, RunOutline]:
+        """A recording that is in the fleet twice would bear witness for itself: the second one is named and left out."""
+        again = repeated({name: own.identity for name, own in outlines.items()})
+        for number, row in enumerate(self._rows):
+            if (first := again.get(row.name)) is not None:
+                self._note_recording(number, doubt=f"it is the recording of {first} again")
+        return {name: own for name, own in outlines.items() if name not in again}
 
     def _meetings(self, outlines: Mapping[str, RunOutline]) -> list[Meeting]:
         """Of sessions that look alike; of all pairs where there are few, or where nothing is described.

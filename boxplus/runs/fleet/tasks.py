@@ -19,6 +19,7 @@ from boxplus.recordings import open_recording
 from boxplus.runs.fleet.status import RecordingStatus
 from boxplus.runs.fleet.store import Store, open_store
 from boxplus.runs.lidar_inertial.earlier_run import refuse_other_recording
+from boxplus.runs.sessions.repeated import RecordingIdentity
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.slam.config import SlamRunConfig, dump_slam_config
 from boxplus.runs.slam.folder import SlamFolder
@@ -45,10 +46,12 @@ class RunOutline:
     Attributes:
         session: its local maps, of no point each.
         features: what they look like; empty where density images are not asked for.
+        identity: of its recording.
     """
 
     session: Session
     features: list[Features]
+    identity: RecordingIdentity
 
 
 def run_of(name: str) -> str:
@@ -75,12 +78,13 @@ def run_recording(store: str, name: str, recording: str, config: SlamRunConfig) 
 def outline_run(store: str, name: str, config: SlamConfig) -> RunOutline:
     """Where the local maps of a run are, and what they look like."""
     with open_store(store).reading(run_of(name), OF_A_SESSION) as folder:
-        session = open_session_run(folder, name, needs_scans=False).session
+        run = open_session_run(folder, name, needs_scans=False)
+        session = run.session
         maps, features = LocalMapFolder(SlamFolder(folder).local_maps), list[Features]()
         if config.appearance == "density":
             features = [described(maps[number], config) for number in range(len(session.maps))]
     none = np.zeros((0, 3), dtype=np.float32)
-    return RunOutline(replace(session, maps=[replace(own, points=none) for own in session.maps]), features)
+    return RunOutline(replace(session, maps=[replace(own, points=none) for own in session.maps]), features, run.identity)
 
 
 def meet_runs(store: str, names: tuple[str, str], numbers: tuple[int, int], config: SessionsConfig) -> Meeting:
@@ -145,9 +149,13 @@ def _is_of(place: Store, name: str, recording: Path, summary: SlamSummary, confi
 
 
 def _changed_at(recording: Path) -> float:
-    """When a file of a recording was last written [s since 1970]; infinity where there is none."""
+    """When a file of a recording was last written or put there [s since 1970]; infinity where there is none.
+
+    A file that is moved or unpacked over another keeps the time at which it was written.
+    """
     files = [recording] if recording.is_file() else [file for file in recording.rglob("*") if file.is_file()]
-    return max((file.stat().st_mtime for file in files), default=math.inf)
+    times = (time_s for file in files for time_s in (file.stat().st_mtime, file.stat().st_ctime))
+    return max(times, default=math.inf)
 
 
 def _is_begun(folder: SlamFolder, config: SlamRunConfig) -> bool:

@@ -20,7 +20,8 @@ from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
 from boxplus.runs.sessions.joined import merge_facts, write_session_trajectory
-from boxplus.runs.sessions.session_run import SessionRun, open_session_run, refuse_repeated, session_names
+from boxplus.runs.sessions.repeated import refuse_repeated
+from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
 from boxplus.runs.sessions.summary import MergeSummary
 from boxplus.runs.sessions.tables import write_changes, write_encounters
 from boxplus.systems.sessions.encounter import Meeting
@@ -74,7 +75,7 @@ def merge_runs(
         raise InputError("two runs at least, each given once", f"{[str(path) for path in paths]}", "name their output folders")
     runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
     sessions = [run.session for run in runs]
-    refuse_repeated(sessions)
+    refuse_repeated({run.session.name: run.identity for run in runs})
     with replaced_merge(output, overwrite=overwrite) as own:
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
         world = alignment.worlds[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.sessions.repeated import RecordingIdentity
 from boxplus.runs.slam.folder import PROGRAM, SlamFolder
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.spool import read_spool
@@ -51,6 +51,7 @@ class SessionRun:
         folder: its output folder; session: what is aligned; correction: of its own loops.
         doubt: why the run itself is not to be trusted; None where nothing speaks against it.
         p_imu_lidar: (3,) the LiDAR in the frame of the poses [m].
+        identity: of its recording.
     """
 
     folder: SlamFolder
@@ -58,6 +59,7 @@ class SessionRun:
     correction: Correction
     doubt: str | None
     p_imu_lidar: Floats
+    identity: RecordingIdentity
 
     def placed(self, T_world_map: Floats) -> Correction:
         """What takes poses of the odometry into the world in which the local maps are at T_world_map (n, 7)."""
@@ -116,31 +118,12 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     stored_maps = [stored[number] for number in range(len(placed.time_ns))]
     maps = [replace(local_map, covariance=drift * local_map.covariance) for local_map in stored_maps]
     loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
-    extrinsic = read_summary(own.odometry.summary).extrinsic
+    odometry = read_summary(own.odometry.summary)
+    extrinsic = odometry.extrinsic
     T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
     session = Session.of(name, maps, placed.T_map, loops)
-    return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3])
-
-
-def refuse_repeated(sessions: Sequence[Session]) -> None:
-    """Runs of one recording agree wherever they are looked at, and count as if it had been made twice.
-
-    Raises:
-        InputError: two sessions with a local map of the same points: a copy of a folder, or the recording run again.
-    """
-    owner: dict[bytes, str] = {}
-    for session in sessions:
-        for local_map in session.maps:
-            if not len(local_map.points):
-                continue
-            key = hashlib.sha256(np.ascontiguousarray(local_map.points).tobytes()).digest()
-            other = owner.setdefault(key, session.name)
-            if other != session.name:
-                raise InputError(
-                    "runs of different recordings",
-                    f"{other} and {session.name}, whose local maps hold the same points: one recording twice, or a copied folder",
-                    "leave one of them out",
-                )
+    identity = RecordingIdentity.of(odometry, maps)
+    return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3], identity)
 
 
 def session_names(folders: Sequence[Path]) -> list[str]:

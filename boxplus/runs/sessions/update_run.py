@@ -9,7 +9,8 @@ from boxplus.errors import InputError
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.folder import MergeFolder
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
-from boxplus.runs.sessions.session_run import open_session_run, refuse_repeated, session_names
+from boxplus.runs.sessions.repeated import refuse_repeated
+from boxplus.runs.sessions.session_run import open_session_run, session_names
 from boxplus.runs.sessions.summary import read_merge_summary
 from boxplus.runs.settings_file import load_settings
 from boxplus.systems.sessions.encounter import Meeting
@@ -47,8 +48,9 @@ def update_map(
         raise InputError("runs that are not in the map", f"{sorted(again)[0]}, which is", "leave it out")
     paths = [*known, *more]
     config = load_settings(MergeConfig, own.config)
-    sessions = [open_session_run(path, name).session for path, name in zip(paths, session_names(paths), strict=True)]
-    refuse_repeated(sessions)
+    runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
+    refuse_repeated({run.session.name: run.identity for run in runs})
+    sessions = [run.session for run in runs]
     alignment = align_sessions(sessions, config.sessions, progress=progress)
     world = alignment.worlds[0]
     if 0 not in world.members or all(number < len(known) for number in world.members):

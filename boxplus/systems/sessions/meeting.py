@@ -9,7 +9,8 @@
 4. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
    look like one of the other: refused.
 5. *Support*: enough encounters, of different local maps, along a way.
-6. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well.
+6. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well; where
+   nothing does, nothing tells them apart.
 7. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
 """
 
@@ -42,6 +43,7 @@ _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a poi
 _BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: by which two likenesses of one alignment differ
 _PREDICTED = 2  # places that are looked at for each local map of the query session
 _AS_WELL = "the maps fit as well"  # begins what is said of a rival
+_FEWEST_STANDING = 100  # points, of all encounters together
 _FIRST = 2  # encounters that agree make a hypothesis
 
 
@@ -101,6 +103,8 @@ class _Meeting:
             self._standing_share([loop for loop in self.loops.values() if id(loop) in kept]),
             self.config.least_standing,
         )
+        if math.isnan(share):
+            return self._refused("nothing stands upright where they lie over each other that could tell", predicted, confirmed)
         if share < least:
             why = f"{100.0 * share:.0f} % of what stands upright in one stands at the same place in the other"
             return self._refused(f"{why}, {100.0 * least:.0f} % are asked for", predicted, confirmed, share)
@@ -118,7 +122,7 @@ class _Meeting:
         return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)
 
     def _standing_share(self, loops: list[Loop]) -> float:
-        """Step 6, over encounters together; none where nothing stands."""
+        """Step 6, over encounters together; NaN where too little stands to tell."""
         found = [
             standing_in_common(
                 self.query.surface(loop.query), self.place.surface(loop.place), loop.T_place_query, self.config.slam.registration
@@ -126,7 +130,7 @@ class _Meeting:
             for loop in loops
         ]
         asked = sum(of for _, of in found)
-        return sum(shared for shared, _ in found) / max(asked, 1)
+        return sum(shared for shared, _ in found) / asked if asked >= _FEWEST_STANDING else math.nan
 
     def _nothing_found(self) -> str:
         if not self.loops:

@@ -26,11 +26,13 @@ _SEEN = 0.75  # of a map's points lie within the distance from its middle that c
 def standing_in_common(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
     """Points of two maps that do not lie on level planes, where the other map sees: of how many there is one near, and how many.
 
+    Of the two directions it is the one with less in common that has any such points; (0, 0) where neither has.
+
     Args:
         T_there_own: (7,) the maps laid over each other.
     """
-    found = [_one_way(own, there, T_there_own, config), _one_way(there, own, se3.inverse(T_there_own), config)]
-    return min(found, key=lambda shared: shared[0] / max(shared[1], 1))
+    both = [_one_way(own, there, T_there_own, config), _one_way(there, own, se3.inverse(T_there_own), config)]
+    return min((found for found in both if found[1]), key=lambda found: (found[0] / found[1], -found[1]), default=(0, 0))
 
 
 def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:

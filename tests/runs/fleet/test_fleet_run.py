@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -252,6 +253,34 @@ def test_a_run_is_of_its_recording_not_of_its_name(tmp_path: Path, monkeypatch: 
     seconds[first] = 2.5  # replaced where it lies
     os.utime(first, (4e9, 4e9))
     assert state_of(first) == "failed"
+
+
+def test_a_file_moved_over_another_is_a_new_one(tmp_path: Path) -> None:
+    """It keeps the time at which it was written, which may be long before the run."""
+    bag, other = tmp_path / "r.bag", tmp_path / "other.bag"
+    for file in (bag, other):
+        file.touch()
+        os.utime(file, (1e9, 1e9))
+    before = time.time()
+    other.replace(bag)
+    assert bag.stat().st_mtime == 1e9 and tasks._changed_at(bag) > before - 60.0
+
+
+def test_a_recording_that_is_there_twice_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy under another name would vouch for the first one wherever they are looked at."""
+
+    def copied(store: str, name: str, recording: str, config: SlamRunConfig) -> RecordingStatus:
+        status = drive(store, "monday" if name == "copy" else name, recording, config)
+        if name == "copy":
+            shutil.copytree(Path(store) / "runs" / "monday", Path(store) / "runs" / "copy")
+        return status.model_copy(update={"name": name})
+
+    monkeypatch.setattr(fleet_run, "run_recording", copied)
+    recordings = {name: tmp_path / f"{name}.bag" for name in ("monday", "friday", "copy")}
+    status = run_fleet(recordings, tmp_path / "fleet", InProcess(), merging=load_settings(MergeConfig, None, QUICK))
+    found = {own.name: own for own in status.recordings}
+    assert found["copy"].doubt == "it is the recording of monday again" and not found["copy"].joined
+    assert status.pairs_looked_at == 1 and set(status.joined) == {"monday", "friday"}
 
 
 def finished(store: Path, bag: Path, config: SlamRunConfig) -> SlamFolder:

@@ -65,3 +65,12 @@ def test_a_stray_point_far_away_costs_nothing() -> None:
     assert shared == asked > 300
     apart = se3.exp(np.array([0.0, 0.0, 0.0, 500.0, 0.0, 0.0]))
     assert standing_in_common(surface(*parts), surface(*parts), apart, CONFIG) == (0, 0)
+
+
+def test_a_direction_with_nothing_to_show_does_not_hide_the_other() -> None:
+    """Bare ground over ground with two walls: the one has nothing that stands, the walls of the other are not there."""
+    random = np.random.default_rng(5)
+    bare, walls = surface(ground(random)), surface(ground(random), wall(random, 5.0), wall(random, -9.0))
+    shared, asked = standing_in_common(bare, walls, HERE, CONFIG)
+    assert shared == 0 and asked > 300
+    assert standing_in_common(walls, bare, HERE, CONFIG) == (shared, asked)
