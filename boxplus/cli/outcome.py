@@ -12,6 +12,7 @@ import typer
 from pydantic import BaseModel, SerializeAsAny
 
 from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_UNTRUSTED, print_error
+from boxplus.cli.interrupt import left_at_once
 from boxplus.errors import BoxplusError, InputError, printable
 
 if TYPE_CHECKING:
@@ -45,10 +46,12 @@ class Outcome(BaseModel):
     def end(self, run: BaseModel | None, state: str = "finished", *, untrusted: bool = False) -> None:
         """It came to an end: with this state of `run.json`, and with results that are to be trusted or not."""
         self.run = run
-        if state == "interrupted" or self.exit_code == EXIT_INTERRUPTED:
+        if state == "interrupted":
             self.outcome, self.exit_code = "interrupted", EXIT_INTERRUPTED
         elif untrusted:
             self.outcome, self.exit_code = "not to be trusted", EXIT_UNTRUSTED
+        elif self.exit_code == EXIT_INTERRUPTED:  # while the report was drawn
+            self.outcome = "interrupted"
         else:
             self.outcome, self.exit_code = "finished", self.exit_code or 0
 
@@ -64,7 +67,7 @@ class Outcome(BaseModel):
         Ctrl-C leaves the report out, not the results.
         """
         try:
-            with terminal.status("drawing the report"):
+            with left_at_once(), terminal.status("drawing the report"):
                 yield
         except KeyboardInterrupt:
             self.exit_code = EXIT_INTERRUPTED

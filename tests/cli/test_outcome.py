@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.cli.ground_truth import Comparison
+from boxplus.cli.interrupt import stop_on_interrupt
 from boxplus.cli.outcome import Outcome, reported
 from boxplus.cli.terminal import Terminal
 from boxplus.errors import InputError, OutputError
@@ -101,9 +103,25 @@ def test_an_interrupt_leaves_the_report_out_and_not_the_results(untrusted: bool,
         told.end(Facts(), "finished", untrusted=untrusted)
     printed = capsys.readouterr()
     found = Outcome.model_validate_json(printed.out)
-    assert end.value.exit_code == found.exit_code == 130 and found.outcome == "interrupted" and found.run is not None
+    outcome, code = ("not to be trusted", 3) if untrusted else ("interrupted", 130)
+    assert end.value.exit_code == found.exit_code == code and found.outcome == outcome and found.run is not None
     assert found.error == "interrupted: the report was not drawn, all other results are there"
     assert "Traceback" not in printed.err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_the_report_where_a_run_would_come_to_its_end(number: signal.Signals) -> None:
+    """The first one only asks a run to stop; nothing asks that of a drawing, and several runs are not to go on after it."""
+    told, announced, drawn = Outcome(input="walk.bag", output="out"), [], []
+    before = signal.getsignal(number)
+    with stop_on_interrupt(lambda: announced.append(True)) as should_stop:
+        with told.drawing(Terminal(quiet=True, as_json=True)):
+            os.kill(os.getpid(), number)
+            time.sleep(5.0)
+            drawn.append(True)
+        assert should_stop() and announced and not drawn
+    told.end(Facts())
+    assert told.outcome == "interrupted" and told.exit_code == 130 and signal.getsignal(number) is before
 
 
 def test_pgo_writes_its_results_where_the_report_cannot_be_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,7 @@ def _parts(folder: Path) -> list[Path]:
         raise RecordingError(
             "one recording: a folder with metadata.yaml, or with files NAME_0, NAME_1, … that follow each other without a gap",
             f"{folder.name} with {len(recordings)} recordings: {second.name} does not go on where {first.name} ends",
-            "give one of the files; 'boxplus lio' and 'boxplus fleet run' take all of a folder, each as a recording of its own",
+            "give one of the files; where they are one recording with a pause, let 'ros2 bag reindex' write metadata.yaml; of "
+            "files that are a recording each 'boxplus lio' and 'boxplus fleet run' take all",
         )
     return recordings[0]

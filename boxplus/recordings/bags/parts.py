@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterable
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from boxplus.recordings.bags.container import READ_ERRORS
 from boxplus.recordings.bags.indexed import IndexedContainer, rosbags_errors
@@ -36,11 +37,15 @@ def is_described(folder: Path) -> bool:
 def recordings_among(files: Iterable[Path]) -> list[list[Path]]:
     """Files by recording, the parts of each in order."""
     found: list[list[Path]] = []
+    ends: int | None = None  # of the last part that says so
     for file in sorted(files, key=_order):
-        if found and _goes_on(found[-1][-1], file):
+        times = _times(file) if _numbered(file)[1] >= 0 else _UNKNOWN
+        if found and _is_next(found[-1][-1], file) and _goes_on(ends, times):
             found[-1].append(file)
+            ends = times.end_ns if times.end_ns is not None else ends
         else:
             found.append([file])
+            ends = times.end_ns
     return found
 
 
@@ -54,18 +59,30 @@ def _numbered(file: Path) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (file.stem, -1)
 
 
-def _goes_on(before: Path, file: Path) -> bool:
-    """Whether a file is the next part after another one; by its name alone where the times cannot be read."""
+def _is_next(before: Path, file: Path) -> bool:
+    """Whether a file is the next part after another one by its name."""
     (name, number), (next_name, next_number) = _numbered(before), _numbered(file)
-    if number < 0 or before.suffix != file.suffix or (next_name, next_number) != (name, number + 1):
-        return False
-    ends, begins = _span(before), _span(file)
-    begin = first_time_ns(file) if begins is None else begins[0]
-    return ends is None or begin is None or abs(begin - ends[1]) <= _SEAM_NS
+    return number >= 0 and before.suffix == file.suffix and (next_name, next_number) == (name, number + 1)
 
 
-def _span(file: Path) -> tuple[int, int] | None:
-    """First and last reception time [ns] by the index; None without one."""
+class _Times(NamedTuple):
+    """First and last reception time [ns] of a file; None where they cannot be read, or where no message is in it."""
+
+    begin_ns: int | None
+    end_ns: int | None
+
+
+_UNKNOWN = _Times(None, None)
+
+
+def _goes_on(ends_ns: int | None, times: _Times) -> bool:
+    """Whether a part begins where the ones before it end; its name alone says so where the times are not known."""
+    return ends_ns is None or times.begin_ns is None or abs(times.begin_ns - ends_ns) <= _SEAM_NS
+
+
+def _times(file: Path) -> _Times:
+    """By the index; the first one from the file itself, where it has none."""
     with suppress(*READ_ERRORS, *rosbags_errors()), closing(IndexedContainer(file, [file])) as container:
-        return container.start_ns, container.end_ns
-    return None
+        is_empty = container.start_ns > container.end_ns  # an interrupted recorder may have begun a file and no more
+        return _UNKNOWN if is_empty else _Times(container.start_ns, container.end_ns)
+    return _Times(first_time_ns(file), None)

@@ -92,6 +92,6 @@ def _entries(folder: Path) -> list[Path]:
             raise InputError(
                 "recordings of one file each, or in a folder of their own",
                 f"{len(parts)} parts of one, {parts[0].name} to {parts[-1].name}, beside others in {folder}",
-                "put them into a folder of their own",
+                "put them into a folder of their own; where all are one with a pause, let 'ros2 bag reindex' write metadata.yaml",
             )
     return sorted(entry for entry in folder.iterdir() if _is_recording(entry))

@@ -56,7 +56,7 @@ class RunStatistics(EstimateStatistics):
         open_scans, why = self.count - self.status["ok"], []
         if mounting_sigma is not None:
             turn, arm = mounting_sigma
-            why.append(f"T_imu_lidar was known to {turn:.2g} deg and {arm * 100:.2g} cm only (give --T-imu-lidar)")
+            why.append(f"T_imu_lidar was known to {turn:.2g} deg and {arm * 100:.2g} cm at first (better: --T-imu-lidar)")
         if open_scans:
             why.append(f"{open_scans} of {self.count} scans left directions open")
         text = (

@@ -67,7 +67,10 @@ def test_what_does_not_follow_is_several(tmp_path: Path, names: tuple[str, str],
         write_part(folder, name, first, 30 if firsts[1] == 0 else 3)
     assert [[file.stem for file in files] for files in recordings_among(bag_files(folder))] == [[names[0]], [names[1]]]
     assert holds_recordings(folder) and list(find_recordings(folder)) == list(names)
-    with pytest.raises(RecordingError, match=rf"2 recordings: {names[1]}.mcap does not go on .* 'boxplus fleet run' take all"):
+    with pytest.raises(
+        RecordingError,
+        match=rf"2 recordings: {names[1]}.mcap does not go on .* 'ros2 bag reindex' .* take all",
+    ):
         open_recording(folder)
 
 
@@ -89,3 +92,14 @@ def test_one_file_among_other_recordings_is_one_of_several(tmp_path: Path) -> No
     (tmp_path / "days" / "tuesday").mkdir()
     (tmp_path / "days" / "tuesday" / "metadata.yaml").touch()
     assert list(find_recordings(tmp_path / "days")) == ["monday", "tuesday"] and holds_recordings(tmp_path / "days")
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite3"])
+def test_an_empty_part_goes_on_by_its_name(tmp_path: Path, container: Container) -> None:
+    """A recorder that is stopped just after it began the next file; the one after that follows the last message."""
+    folder = tmp_path / "flight"
+    for name, first, scans in (("flight_0", 0, 3), ("flight_1", 3, 0), ("flight_2", 3, 3), ("flight_3", 6, 0)):
+        write_part(folder, name, first, scans, container)
+    assert len(recordings_among(bag_files(folder))) == 1
+    times = starts(folder)
+    assert len(times) == 6 and times == sorted(times)

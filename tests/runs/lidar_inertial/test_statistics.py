@@ -69,7 +69,7 @@ def test_what_may_be_behind_it_is_said() -> None:
     (warning,) = vague.vague_warnings((1.75, 0.3))
     assert warning.text == (
         "by its own covariance the run knows its last position to 31 cm (1 sigma) only, after a way of 8.0 m: T_imu_lidar was "
-        "known to 1.8 deg and 30 cm only (give --T-imu-lidar), and 2 of 5 scans left directions open"
+        "known to 1.8 deg and 30 cm at first (better: --T-imu-lidar), and 2 of 5 scans left directions open"
     )
     (warning,) = straight(8.0, 12.0, np.ones(3)).vague_warnings(None)
     assert "to 12.0 m (1 sigma) only" in warning.text
