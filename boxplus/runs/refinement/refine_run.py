@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import BoxplusError, InputError, printable
 from boxplus.filtering.nav_state import NavState
 from boxplus.formats.output import atomic_file
@@ -36,6 +35,7 @@ from boxplus.runs.run_loop import peak_memory_mb, versions
 from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.finished_run import FinishedRun
+from boxplus.systems.refinement.loops import contradicted
 from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
@@ -47,7 +47,6 @@ Floats = NDArray[np.float64]
 _FEWEST_SCANS = 20
 _DOUBTED = 5.0  # standard deviations of the run's, by which a pose moved
 _LEAST_SIGMA_M = 0.002
-_CONTRADICTED = math.sqrt(chi_square_quantile(0.9999, 6))  # standard deviations of a loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -284,12 +283,12 @@ class _RefineRun:
             warnings.insert(0, f"not accepted, the trajectory is that of the run and no map was written: {refusal}")
         if refusal is None:
             warnings += found.calibration.doubts + self._notes()
-        far = np.flatnonzero(found.loop_errors > _CONTRADICTED)
-        if len(far) and finished.loops is not None:
+        far = contradicted(found.loop_errors)
+        if far.any() and finished.loops is not None:
             worst = int(np.argmax(found.loop_errors))
             which = f"{finished.loops.query[worst]} → {finished.loops.place[worst]}"
             warnings.append(
-                f"{len(far)} of {len(found.loop_errors)} loops lie up to {found.loop_errors[worst]:.0f} standard deviations "
+                f"{np.count_nonzero(far)} of {len(far)} loops lie up to {found.loop_errors[worst]:.0f} standard deviations "
                 f"({which}) from where refining has put the visits: look at them in the report of 'boxplus slam'"
             )
         missing = len(self._run.rows.time_ns) - len(scans)
@@ -318,7 +317,7 @@ class _RefineRun:
                 "time_offset_sigma_s": found.calibration.time_offset_sigma,
                 "loops": len(found.loop_errors),
                 "loops_told_by_planes": int(found.loop_is_told.sum()),
-                "loops_contradicted": int(np.count_nonzero(found.loop_errors > _CONTRADICTED)),
+                "loops_contradicted": int(np.count_nonzero(far)),
                 "receiver": _receiver(finished, after),
                 "map_points": stored,
                 "warnings": warnings,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_exceeded
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.plane_voxels.plane_map import PlaneMap
 from boxplus.residuals.relative_pose import RelativePose
@@ -20,6 +21,8 @@ from boxplus.systems.refinement.sightings import KeyframeClusters
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+_BY_CHANCE = 1e-4  # probability that any loop of a sound run is named
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +37,26 @@ class KeyframeLoops:
     query: Ints
     residual: RelativePose
     is_told: NDArray[np.bool_]
+
+
+def contradicted(errors: Floats) -> NDArray[np.bool_]:
+    """(L,) which loops lie beyond their covariance from where refining has put the visits.
+
+    Of many sound loops some are far out by chance: a bound that one alone exceeds once in 10,000 times, a thousand of them would
+    exceed in every tenth run. The bound is that of all of them together (Bonferroni).
+
+    Args:
+        errors: (L,) what they are off by [standard deviations].
+
+    Example:
+        >>> contradicted(np.array([1.0, 5.5])).tolist()
+        [False, True]
+        >>> bool(contradicted(np.array([5.5] + [2.0] * 999)).any())
+        False
+
+    Source: Dunn, Multiple Comparisons Among Means, JASA 1961.
+    """
+    return np.asarray(errors**2 > chi_square_exceeded(_BY_CHANCE / max(len(errors), 1), 6))
 
 
 def between_keyframes(

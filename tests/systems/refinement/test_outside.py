@@ -13,7 +13,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.maps.plane_voxels.plane_map import PlaneMap
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.loops import between_keyframes
+from boxplus.systems.refinement.loops import between_keyframes, contradicted
 from boxplus.systems.refinement.outside import Receiver, RunFixes, RunLoops
 from boxplus.systems.refinement.refinement import refine
 from boxplus.systems.refinement.sightings import KeyframeClusters
@@ -93,6 +93,19 @@ def test_planes_that_both_visits_see_take_the_place_of_a_loop() -> None:
         one_wall.keyframe[chosen], one_wall.plane[chosen], one_wall.clusters[chosen], one_wall.counted[chosen]
     )
     assert not told(partly), "a wall leaves open what the loop knows"
+
+
+def test_many_sound_loops_are_not_doubted_by_chance_and_a_false_one_is() -> None:
+    random = np.random.default_rng(0)
+    named = 0
+    for _ in range(300):
+        errors = np.linalg.norm(random.normal(size=(1000, 6)), axis=1)
+        named += bool(contradicted(errors).any())
+        errors[500] = 12.0
+        assert contradicted(errors)[500]
+    assert named <= 1  # of 300; with the bound of a single loop one in ten
+    assert not len(contradicted(np.zeros(0)))
+    assert contradicted(np.array([5.4])).all() and not contradicted(np.array([5.2])).any()
 
 
 def _loops_of(case: Case, shift: float) -> RunLoops:
