@@ -21,6 +21,7 @@ _NEAR = 0.3  # m, between a point that stands and the map's
 _ASKED = 4000  # points that stand, for the fit
 _FAR = 0.15  # m, that a point is off its surface at most: beyond, it does not belong to it
 _FAR_WORSE = 0.5  # of the best fit, before the last stage of registration: what fits less is not worth that stage
+_ONE = 0.2, np.deg2rad(1.0), 0.2  # m, rad, m: guesses that come so near to each other go on as one
 _NO_PLANES = "too few points on planes of the map"
 
 
@@ -170,10 +171,35 @@ def lead(best: Candidate, candidates: list[Candidate]) -> float:
     return 1.0 - best.distance / max(min(others, default=_FAR), 1e-9)
 
 
+def contradiction(here: Candidate, others: list[Candidate], T_map_query: Floats, config: LocalizationConfig) -> str | None:
+    """What speaks against a place that is followed, in words; None where nothing does.
+
+    Less is asked than of a place that is to be found: a corridor may leave a direction open, a map may end.
+
+    Args:
+        here: examined from the pose (7,) at which the place is followed.
+    """
+    if here.measured == 6 and not same_pose(here.T_map_query, T_map_query):
+        away = float(np.linalg.norm(here.T_map_query[4:] - T_map_query[4:]))
+        return f"the surfaces of the map draw what is seen {away:.1f} m away"
+    if here.seen_through > config.most_seen_through:
+        return here.refusal
+    better = max((one for one in others if one.refusal is None), key=lambda one: one.fit, default=None)
+    if better is None or same_pose(better.T_map_query, T_map_query):
+        return None
+    if better.fit - here.fit < config.telling or better.distance > (1.0 - config.least_lead) * here.distance:
+        return None
+    away = float(np.linalg.norm(better.T_map_query[4:] - T_map_query[4:]))
+    return f"another pose, {away:.1f} m away, fits better: {_percent(better)} and {_percent(here)}"
+
+
 def examine_all(
     guesses: list[Guess], query: Query, points_near: Callable[[Floats, float], Points], config: LocalizationConfig
 ) -> list[Candidate]:
-    """Candidates of all guesses, each registered to the map around it; what fits far worse than the best is left at a glance."""
+    """Candidates of the guesses in their order, each registered to the map around it, and of those that come to one pose one.
+
+    What fits far worse than the best is left at a glance.
+    """
     reach = float(np.quantile(np.linalg.norm(query.points, axis=1), 0.98)) + 5.0
     around: dict[tuple[int, ...], Surface] = {}
     seen: list[tuple[Guess, Surface, Floats | None, float]] = []
@@ -183,6 +209,8 @@ def examine_all(
             around[key] = Surface.of(points_near(np.array(key) * reach / 2.0, 1.5 * reach))
         target = around[key]
         T = approach(query.surface, target, guess.T_map_query, config.registration) if len(target.points) else None
+        if T is not None and any(before is not None and same_pose(before, T, *_ONE) for _, _, before, _ in seen):
+            continue
         seen.append((guess, target, T, 0.0 if T is None else _share_near(query.stands, target, T)))
     worth = _FAR_WORSE * max((fit for *_, fit in seen), default=0.0)
     found: list[Candidate] = []

@@ -22,7 +22,7 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
-from boxplus.systems.localization.candidate import Candidate, Query, distinct, examine_all, lead, rivalry
+from boxplus.systems.localization.candidate import Candidate, Query, contradiction, distinct, examine_all, lead, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
 from boxplus.systems.localization.place_map import PlaceMap
@@ -37,6 +37,7 @@ _STILL = 1.0  # s after a registration was taken that a pose is localised, where
 _HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _REMEMBERED = 4  # poses that fitted a query
 _NEVER = -(2**62)
+_CONTRADICTIONS = 2  # in a row, after which the place is another one
 _ANOTHER = (
     "a place of the same kind, perhaps another one: what stands lies {:.0f} % nearer to surfaces of the map than at any other "
     "pose, {:.0f} % asked for"
@@ -69,7 +70,7 @@ class Localization:
             "searching": not known, then `T_map_body` is None.
         T_map_body: (7,) [qw, qx, qy, qz, x, y, z]; covariance: (6, 6) of [w, v] on the right of it [rad, m].
         matched: this scan against the map; None where it was not compared.
-        search: the query that this scan completed; None for most.
+        search: the query that this scan completed; None for most. Where a place is followed, its verdict contradicts it.
     """
 
     time_ns: int
@@ -108,6 +109,9 @@ class Localizer:
         self._leading: Floats | None = None  # T_map_odo of that place
         self._earlier: list[tuple[int, Floats]] = []  # place and T_map_odo of what fitted the query before
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
+        self._again_ns, self._again_s = 0, 0.0  # when it is looked for again, and how long after the time before
+        self._contradictions = 0  # in a row
+        self._contradicted_by: str | None = None
         self._begin_search()
 
     def push(
@@ -155,15 +159,12 @@ class Localizer:
     def _look(self, local_map: LocalMap, time_ns: int, T_odo: Floats, scan: NDArray[np.float32]) -> Search:
         config = self.config
         T_query_body = se3.compose(se3.inverse(local_map.T_odo_map), T_odo)
-        seen = se3.act(T_query_body, scan.astype(np.float64)).astype(np.float32)
         candidates: list[Candidate] = []
         verdict = "the scans have no points"
         if len(local_map.points):
-            query = Query.of(local_map.points, seen, T_query_body[4:])
-            guesses = self._images.guesses(local_map.points, config.candidates)
             # What fitted before is asked again: a place that the search misses once stays a rival.
-            guesses += [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
-            candidates = examine_all(guesses, query, self._map.points_near, config)
+            earlier = [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
+            candidates = self._candidates(local_map, T_query_body, scan, earlier)
             candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
             T_odo_query = se3.inverse(local_map.T_odo_map)
             fitting = distinct([candidate for candidate in candidates if candidate.fit >= config.least_fit])[:_REMEMBERED]
@@ -171,6 +172,15 @@ class Localizer:
             verdict = self._judge(candidates, local_map, T_query_body)
         self.last_search = Search(time_ns, tuple(candidates), verdict)
         return self.last_search
+
+    def _candidates(
+        self, local_map: LocalMap, T_query_body: Floats, scan: NDArray[np.float32], more: list[Guess]
+    ) -> list[Candidate]:
+        """What comes of the guesses from above, and of more of them, which come last."""
+        seen = se3.act(T_query_body, scan.astype(np.float64)).astype(np.float32)
+        query = Query.of(local_map.points, seen, T_query_body[4:])
+        guesses = self._images.guesses(local_map.points, self.config.candidates)
+        return examine_all([*more, *guesses], query, self._map.points_near, self.config)
 
     def _judge(self, candidates: list[Candidate], local_map: LocalMap, T_query_body: Floats) -> str:
         """Begin to follow the best candidate where it is believed; returns why not."""
@@ -200,6 +210,8 @@ class Localizer:
         self._tracker = Tracker(self._map, T_map_body, Ad @ best.covariance @ Ad.T, self.config)
         self._held_ns = self._fitting_ns = local_map.end_ns
         self._failures = 0
+        self._again_ns = local_map.end_ns + int(1e9 * self._again_s)
+        self._builder = self._new_builder()
         return ""
 
     @staticmethod
@@ -221,12 +233,38 @@ class Localizer:
             # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.
             if matched.share >= config.least_share or matched.is_beyond:
                 self._fitting_ns = time_ns
+        search = self._look_again(tracker, time_ns, T_odo, points[:0] if lost else points, up)
         reason = self._why_lost(time_ns, tracker)
         if reason:
             self._lose(reason)
-            return Localization(time_ns, "searching", None, None, matched, None)
-        status: Status = "localised" if (time_ns - self._held_ns) * 1e-9 <= _STILL else "odometry only"
-        return Localization(time_ns, status, tracker.T_map_body, tracker.covariance, matched, None)
+            return Localization(time_ns, "searching", None, None, matched, search)
+        is_held = (time_ns - self._held_ns) * 1e-9 <= _STILL and not self._contradictions
+        status: Status = "localised" if is_held else "odometry only"
+        return Localization(time_ns, status, tracker.T_map_body, tracker.covariance, matched, search)
+
+    def _look_again(
+        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats
+    ) -> Search | None:
+        """Now and then look for what is seen in the whole map, as if nothing were known, and ask whether that is here."""
+        config = self.config
+        if not config.recheck_after or time_ns < self._again_ns:
+            return None
+        queries = self._builder.push(time_ns, T_odo, np.zeros((6, 6)), points, up)
+        if not queries or not len(queries[0].points):
+            return None
+        T_query_body = se3.compose(se3.inverse(queries[0].T_odo_map), T_odo)
+        T_map_query = se3.compose(tracker.T_map_body, se3.inverse(T_query_body))
+        near = [float(np.linalg.norm(place.T_odo_map[4:] - T_map_query[4:])) for place in self._map.local_maps]
+        candidates = self._candidates(queries[0], T_query_body, points, [Guess(int(np.argmin(near)), T_map_query, 0.0)])
+        why = contradiction(candidates[0], candidates[1:], T_map_query, config)
+        self._builder = self._new_builder()
+        self._contradictions = self._contradictions + 1 if why else 0
+        if why is None:
+            self._again_ns = time_ns + int(1e9 * self._again_s)
+            self._again_s = min(2.0 * self._again_s, config.recheck_interval)
+        self._contradicted_by = why
+        self.last_search = Search(time_ns, tuple(candidates), why or "")
+        return self.last_search
 
     def _why_lost(self, time_ns: int, tracker: Tracker) -> str | None:
         config = self.config
@@ -234,6 +272,8 @@ class Localizer:
             return f"{self._failures} registrations in a row contradict the odometry"
         if (time_ns - self._fitting_ns) * 1e-9 >= config.lost_after:
             return f"less than {100 * config.least_share:.0f} % of what stands has been in the map for {config.lost_after:g} s"
+        if self._contradictions >= _CONTRADICTIONS:
+            return f"{self._contradictions} times in a row {self._contradicted_by}"
         if tracker.sigma > config.largest_sigma:
             return f"followed by the odometry alone until the position was known to {tracker.sigma:.1f} m only"
         return None
@@ -251,10 +291,19 @@ class Localizer:
         self._leads = []
         self._earlier = []
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
-        voxel = self._map.voxel
-        self._builder = LocalMapBuilder(
+        self._again_s, self._again_ns = config.recheck_after, 0
+        self._contradictions, self._contradicted_by = 0, None
+        self._builder = self._new_builder()
+
+    def _new_builder(self) -> LocalMapBuilder:
+        config = self.config
+        return LocalMapBuilder(
             LocalMapConfig(
-                length=config.query_length, duration=config.query_duration, least_length=0.0, voxel=voxel, max_range=_QUERY_RANGE
+                length=config.query_length,
+                duration=config.query_duration,
+                least_length=0.0,
+                voxel=self._map.voxel,
+                max_range=_QUERY_RANGE,
             )  # type: ignore[call-arg]
         )
 

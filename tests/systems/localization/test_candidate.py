@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from boxplus.manifolds import se3
 from boxplus.simulation.worlds.worlds import yard
-from boxplus.systems.localization.candidate import Candidate, distinct, lead, rivalry
+from boxplus.systems.localization.candidate import Candidate, contradiction, distinct, lead, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import PlaceImages, same_pose
 from boxplus.systems.localization.standing import seen_through, standing
@@ -53,6 +55,22 @@ def test_the_lead_is_over_the_best_of_all_other_poses() -> None:
     assert lead(best, [best, twin, candidate(0.8, 3.0, distance=0.06), candidate(0.7, 9.0, distance=0.1)]) == pytest.approx(0.5)
     assert lead(best, [best, candidate(0.8, 3.0, distance=0.024)]) == pytest.approx(-0.25)
     assert distinct([best, twin, candidate(0.5, 3.0)])[1].fit == 0.5
+
+
+def test_a_place_that_is_followed_is_contradicted_by_one_that_fits_clearly_better() -> None:
+    def against(here: Candidate, *others: Candidate) -> str | None:
+        return contradiction(here, list(others), HERE, LocalizationConfig())
+
+    here = candidate(0.7, distance=0.08)
+    assert against(here) is None
+    assert against(here, candidate(0.75, 9.0, distance=0.05)) is None  # a little better
+    assert against(here, candidate(0.9, 9.0, distance=0.07)) is None
+    assert against(here, candidate(0.9, 9.0, "seen through", distance=0.03)) is None
+    assert against(here, candidate(0.9, 0.5, distance=0.03)) is None  # the same place
+    assert "9.0 m away, fits better: 90 % and 70 %" in str(against(here, candidate(0.9, 9.0, distance=0.03)))
+    assert "2.8 m away" in str(against(candidate(0.9, 2.8)))  # what it is registered to is elsewhere
+    assert against(replace(candidate(0.9, 2.8), measured=5)) is None  # along a corridor
+    assert against(replace(here, seen_through=0.3, refusal="in 30 % of directions")) == "in 30 % of directions"
 
 
 def test_a_wall_of_the_map_that_a_scan_sees_past_speaks_against_it() -> None:

@@ -110,6 +110,26 @@ def test_another_warehouse_with_the_same_racks_is_not_taken_for_the_one_of_the_m
     assert search is not None and search.candidates[0].refusal is None and "place of the same kind" in search.verdict
 
 
+def test_a_place_that_fits_as_one_alike_does_is_noticed_to_be_another_one() -> None:
+    place_map = known_map(warehouse(seed=31), [[-12, 0], [12, 0]], INDOORS, seed=31)
+    bay, drive = 2.8, drive_of(warehouse(seed=31), [[-8, 0.4], [-4.5, 0.4]], seed=5)
+    after = drive_of(warehouse(seed=31), [[-4.5 + bay, 0.4], [4.5, 0.4]], seed=6)
+    # The odometry noticed nothing of a way of one bay, and the racks stand as they did.
+    T_odo = se3.compose(own_world(drive)[-1], se3.compose(se3.inverse(after.T_odo_body[0]), after.T_odo_body))
+    ends = []
+    for recheck_after in (0.0, 0.4):
+        config = LocalizationConfig(
+            candidates=5, decisive=1.0, query_duration=1.5, recheck_after=recheck_after, recheck_interval=0.5
+        )
+        localizer = Localizer(place_map, config)
+        assert push_all(localizer, drive, own_world(drive))[-1].status == "localised" and localizer.losses == 0
+        found = push_all(localizer, after, T_odo, int(drive.time_ns[-1]) + 300_000_000)
+        ends.append([one.status for one in found])
+    assert set(ends[0]) == {"localised"} and "searching" in ends[1]
+    assert "localised" not in ends[1][5 : ends[1].index("searching")]  # what is doubted is not claimed
+    assert localizer.losses == 1 and "2 times in a row another pose" in str(localizer.lost_because)
+
+
 def test_corridors_that_are_alike_are_not_told_apart() -> None:
     world = parallel_corridors(count=2, length=36.0)
     route = [[-19.5, 0], [19.5, 0], [19.5, 12], [-19.5, 12], [-19.5, 2]]
