@@ -15,13 +15,13 @@ from boxplus.systems.pose_graph.consensus import Crossings
 from boxplus.systems.pose_graph.doubts import pose_names
 from boxplus.systems.pose_graph.loops import LoopVerdict
 from boxplus.systems.pose_graph.problem import odometry_order, with_edges
+from boxplus.systems.pose_graph.refusals import refusals_doubt
 from boxplus.systems.pose_graph.start import components
 
 _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as that
 _WIDTHS = (1, 3, 10, 30)  # steps that a slip is spread over
 _ALONE = 0.1  # share of the poses that no kept loop closure checks, from which on that is told; of loop closures that are few
 _WITNESSES = 3  # loop closures that agree with each other by more than chance
-_NEARLY_ALL = 0.8  # share of the loop closures; where these mean something else than was read, a few fit as they happen to
 _OBJECTING = 2  # loop closures that may have been kept by chance, or bent; more of them confirm the odometry
 
 
@@ -39,12 +39,8 @@ def contradictions(graph: PoseGraph, verdict: LoopVerdict, bridges: list[Bridge]
             f"all {loops} loop closures were refused, and the result is odometry alone: all are false, or the odometry claims "
             "more than it can"
         )
-    elif refused >= max(_NEARLY_ALL * loops, _WITNESSES):
-        said.append(
-            f"{refused} of {loops} loop closures were refused, and the result is nearly the odometry alone: so many are false, "
-            "or loop closures and odometry differ in unit, in direction or in what they claim, and those that were kept agree by "
-            "chance"
-        )
+    elif refusals := refusals_doubt(graph, verdict):
+        said.append(refusals)
     label, before = components(with_edges(graph, verdict.is_kept)), components(graph)
     if label.max(initial=0) > before.max(initial=0):
         alone = np.setdiff1d(np.unique(label, return_index=True)[1], np.unique(before, return_index=True)[1]).astype(np.int64)

@@ -17,7 +17,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.sparse.components import connected_components
+from boxplus.sparse.cut_edges import cut_edges
 from boxplus.systems.pose_graph.doubts import Fit, edge_names, misfit, standing_out
 from boxplus.systems.pose_graph.problem import (
     consecutive_edges,
@@ -29,7 +29,7 @@ from boxplus.systems.pose_graph.problem import (
 from boxplus.systems.pose_graph.reliability import BENT, Reliability, Suspicion, suspicions
 from boxplus.systems.pose_graph.start import components, held_poses
 
-_MOST_PIECES = 100  # of odometry; more of them, and the graph is no drive
+_TOLD = 5  # lone joints, before the rest is counted
 _LARGE = 0.1  # share of the poses that hang on a lone joint, from which on the result is not to be trusted
 
 
@@ -96,33 +96,29 @@ def lone_joints(graph: PoseGraph) -> list[Suspicion]:
     is_loop = ~consecutive_edges(graph)
     label = components(with_edges(graph, ~is_loop))
     sizes = np.bincount(label, minlength=1)
-    if is_loop.all() or not 1 < len(sizes) <= _MOST_PIECES:
+    if is_loop.all() or len(sizes) < 2:
         return []
     i, j = np.sort(graph.edges[is_loop], axis=1).T
-    first = np.unique(i * len(graph.ids) + j, return_index=True)[1]
-    edges = np.flatnonzero(is_loop)[first]
+    edges = np.flatnonzero(is_loop)[np.unique(i * len(graph.ids) + j, return_index=True)[1]]
     a, b = label[graph.edges[edges]].T
     between = np.flatnonzero(a != b)
     edges, a, b = edges[between], a[between], b[between]
     held = label[graph.fixed]
-    tied = held[:1].repeat(len(held))
-    whole = connected_components(len(sizes), np.append(a, held), np.append(b, tied))[0]
-    pair, count = np.unique(np.minimum(a, b) * len(sizes) + np.maximum(a, b), return_counts=True)
+    cuts, hanging = cut_edges(np.append(a, held[1:]), np.append(b, held[:1].repeat(len(held[1:]))), sizes)
+    lone = np.flatnonzero((cuts < len(edges)) & (hanging > 1))
+    lone = lone[np.argsort(-hanging[lone], kind="stable")]
     said = []
-    for k in np.flatnonzero(np.isin(np.minimum(a, b) * len(sizes) + np.maximum(a, b), pair[count == 1])):
-        rest = np.arange(len(edges)) != k
-        pieces, side = connected_components(len(sizes), np.append(a[rest], held), np.append(b[rest], tied))
-        if pieces == whole:
-            continue
-        hanging = min(int(sizes[side == side[piece]].sum()) for piece in (a[k], b[k]))
-        if hanging < 2:
-            continue
-        one, other = graph.ids[graph.edges[edges[k]]]
+    for cut, count in zip(cuts[lone[:_TOLD]], hanging[lone[:_TOLD]], strict=True):
+        one, other = graph.ids[graph.edges[edges[cut]]]
         said.append(
             Suspicion(
-                f"{hanging} poses hang on the loop closure {one} → {other} alone, which joins stretches of odometry: whether it "
+                f"{count} poses hang on the loop closure {one} → {other} alone, which joins stretches of odometry: whether it "
                 "is right, and with it how they lie to each other, nothing can tell",
-                hanging >= _LARGE * len(graph.ids),
+                bool(count >= _LARGE * len(graph.ids)),
             )
         )
+    if len(lone) > _TOLD:
+        most = hanging[lone[_TOLD]]
+        told = f"{len(lone) - _TOLD} more stretches of odometry hang on one loop closure each, of {most} poses at most"
+        said.append(Suspicion(told, bool(most >= _LARGE * len(graph.ids))))
     return said
