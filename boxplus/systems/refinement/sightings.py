@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def scan_forms(
         normals = planes.planes[number, :3]
         offsets = np.einsum("ki,ki->k", normals, T_world_imu[k, 4:] - planes.centres[number]) + planes.planes[number, 3]
         begins = np.flatnonzero(np.diff(k, prepend=-1))
-        for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), count], strict=True):
+        for begin, end in pairwise([*begins.tolist(), count]):
             add_plane_forms(body[begin:end], normals[begin:end], offsets[begin:end], forms[k[begin]])
     return forms
 

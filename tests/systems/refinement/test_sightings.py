@@ -10,7 +10,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.sightings import judge, keyframe_clusters, planes_of
+from boxplus.systems.refinement.sightings import judge, keyframe_clusters, planes_of, scan_forms
 
 STILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 SIGMA, FACES = 0.005, (2.20, 2.24)
@@ -53,3 +53,13 @@ def test_both_faces_of_a_slab_are_not_one_plane() -> None:
         assert set(seen.keyframe) == set(range(before) if mostly else range(before, len(run)))
         ours, same = judge(run, run.T_world_imu, run.T_world_imu, planes)
         assert ours == same and abs(ours.thickness - SIGMA) < 0.1 * SIGMA
+
+
+def test_scans_that_see_no_useful_plane_say_nothing() -> None:
+    """As stretches between what is curved do; all of them in one piece of the work."""
+    run = slab_from_both_sides(4, 2)
+    keyframes = Keyframes(np.arange(len(run)), np.arange(len(run)))
+    planes, information = planes_of(run, run.T_world_imu, keyframes, RefinementConfig())  # type: ignore[call-arg]
+    assert not scan_forms(run, run.T_world_imu, run.T_imu_lidar, planes, 0.0 * information).any()
+    assert scan_forms(run, run.T_world_imu, run.T_imu_lidar, planes, information).any()
+    assert not len(keyframe_clusters(run, run.T_world_imu, keyframes, planes, 0.0 * information).plane)
