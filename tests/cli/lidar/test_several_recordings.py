@@ -104,7 +104,13 @@ def test_ctrl_c_after_the_last_scan_of_one_leaves_the_next_one_alone(
     fast = [word for word in FAST if word != "--no-report"]
     result = call("lio", bags / "in", "-o", tmp_path / "out", *fast, "--json")
     assert result.exit_code == 130
-    assert [entry["outcome"] for entry in lines(result).values()] == ["finished", "not begun", "not begun"]
+    found = lines(result)
+    assert [entry["outcome"] for entry in found.values()] == ["interrupted", "not begun", "not begun"]
+    assert found["a"]["error"] == "interrupted: the report was not drawn, all other results are there"
+    assert found["a"]["run"]["state"] == "finished"
+    monkeypatch.undo()
+    again = call("lio", bags / "in", "-o", tmp_path / "out", *FAST, "--json", "--resume")
+    assert again.exit_code == 0 and "a: finished before" in again.stderr
 
 
 def test_what_was_finished_with_other_settings_is_not_passed_off_as_these(bags: Path, tmp_path: Path) -> None:
