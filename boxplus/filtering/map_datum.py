@@ -18,6 +18,7 @@ What two poses share is in neither of them against the other. Both equations sta
 and d: with the error e₀ of an earlier pose off both, they give the covariance of e − e₀, beginning with 0 and d − e₀.
 
 The local map is what has been taken in within about one lever arm of the points: what lies farther back is not compared any more.
+Of a sensor that sees one way, neither is what it has turned away from by as much as its points spread about their mean direction.
 """
 
 from __future__ import annotations
@@ -32,11 +33,13 @@ from boxplus._jit import kernel
 from boxplus.filtering.degeneracy import PoseDirections, strong_covariance
 from boxplus.filtering.nav_state import MEASURED, P, R
 from boxplus.filtering.small_linalg import symmetric_eigen_into
+from boxplus.manifolds import so3
 
 _FIRST, _MARKED = 0, 1  # the pose that errors are counted against
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)
 _NOTHING = np.zeros((6, 6))
+_LEAST_SPREAD = 0.05  # rad, of the points about their mean direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,23 +51,40 @@ class Correction:
         noise: (6, 6) covariance of the pose from the noise of the points.
         alone: (6, 6) covariance of the pose from the points alone, zero along directions they do not determine.
         lever_arm: root mean square distance of the points [m].
+        facing: (3,) mean of the unit vectors towards the points, along the IMU's axes: short where they are all around.
     """
 
     gain: NDArray[np.float64]
     noise: NDArray[np.float64]
     alone: NDArray[np.float64]
     lever_arm: float
+    facing: NDArray[np.float64]
 
     @classmethod
-    def of(cls, cov: NDArray[np.float64], A: NDArray[np.float64], directions: PoseDirections) -> Correction:
+    def of(
+        cls, cov: NDArray[np.float64], A: NDArray[np.float64], directions: PoseDirections, facing: NDArray[np.float64]
+    ) -> Correction:
         """Of a filter.
 
         Args:
             cov: (24, 24) after the scan.
             A: (12, 12) information of the scan as the filter took it, with the directions of the pose it determines.
+            facing: as the attribute.
         """
         gain = cov[_POSE][:, MEASURED] @ A
-        return cls(gain[:, _POSE], gain @ cov[MEASURED][:, _POSE], strong_covariance(A, directions), directions.lever_arm)
+        noise = gain @ cov[MEASURED][:, _POSE]
+        return cls(gain[:, _POSE], noise, strong_covariance(A, directions), directions.lever_arm, facing)
+
+    def share_left(self, moved: NDArray[np.float64], turned: NDArray[np.float64]) -> float:
+        """Of the points compared before, the share still compared after a motion of the IMU, 0 to 1.
+
+        Args:
+            moved: (3,) [m], along any axes.
+            turned: (3,) rotation vector about the IMU's axes [rad].
+        """
+        spread = math.sqrt(max(1.0 - float(self.facing @ self.facing), _LEAST_SPREAD**2))
+        aside = float(np.linalg.norm(np.cross(turned, self.facing))) / spread
+        return math.exp(-float(np.linalg.norm(moved)) / self.lever_arm - aside)
 
 
 class MapDatum:
@@ -83,6 +103,7 @@ class MapDatum:
         self._joint = np.zeros((2, 12, 12))
         self._joint[_FIRST, _POSE, _POSE] = self._filter
         self._p_world_imu = x[P : P + 3].copy()
+        self._R_world_imu = x[R : R + 9].reshape(3, 3).copy()
         self._local_points = 0.0
         self._new_share = 0.0
 
@@ -104,9 +125,11 @@ class MapDatum:
             x: (36,) posterior; cov_prior, cov: (n, n), covariance of the filter before and after the scan, the pose first.
             correction: by the scan; None if the filter took none.
         """
+        R_world_imu = x[R : R + 9].reshape(3, 3).copy()
         if correction is not None:
-            shift = float(np.linalg.norm(x[P : P + 3] - self._p_world_imu))
-            self._local_points *= math.exp(-shift / correction.lever_arm)
+            turned = so3.log(self._R_world_imu.T @ R_world_imu)
+            self._local_points *= correction.share_left(x[P : P + 3] - self._p_world_imu, turned)
+        self._R_world_imu = R_world_imu
         gain, noise, alone = (_NOTHING,) * 3 if correction is None else (correction.gain, correction.noise, correction.alone)
         brought = self._shared * self._new_share
         _follow(

@@ -54,6 +54,10 @@ class PlaneMeasurement:
         weight: factor of the information, below 1 where the points are not where they seem.
         confirm: whether planes on which something hangs are held against more of the map: false ones are refused
             (`plane_confirmation`), curved ones bent (`curved_patches`).
+
+    Attributes:
+        lever_arm: root mean square distance of the points from the LiDAR [m], 0.1 at least.
+        facing: (3,) mean of the unit vectors towards the points, LiDAR frame: zero all around, 0.9 long in a cone of 70 degrees.
     """
 
     def __init__(
@@ -82,6 +86,8 @@ class PlaneMeasurement:
         self._directions: PoseDirections
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
         self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
+        towards = np.einsum("ij,i->j", p_lidar, 1.0 / np.sqrt(np.maximum(squared, 1e-12))) / max(n, 1)
+        self.facing: NDArray[np.float64] = towards
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,6 +13,7 @@ from boxplus.filtering.nav_state import MEASURED, NavState
 from boxplus.manifolds import so3
 
 seeds = st.integers(0, 2**32 - 1)
+ALL_AROUND = np.zeros(3)
 
 
 def _state(R_world_imu: np.ndarray, p_world_imu: np.ndarray) -> np.ndarray:
@@ -34,12 +36,19 @@ def _updated(cov_prior: np.ndarray, A: np.ndarray) -> np.ndarray:
     return np.linalg.inv(information)
 
 
-def _scan(datum: MapDatum, random: np.random.Generator, x: np.ndarray, cov: np.ndarray, noise: float) -> np.ndarray:
+def _scan(
+    datum: MapDatum,
+    random: np.random.Generator,
+    x: np.ndarray,
+    cov: np.ndarray,
+    noise: float,
+    facing: np.ndarray = ALL_AROUND,
+) -> np.ndarray:
     """One scan; returns the filter's covariance after it."""
     cov_prior = cov + noise**2 * np.eye(24)
     A = _information(random)
     posterior = _updated(cov_prior, A)
-    datum.follow(x, cov_prior, posterior, Correction.of(posterior, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0)))
+    datum.follow(x, cov_prior, posterior, Correction.of(posterior, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0), facing))
     return posterior
 
 
@@ -76,6 +85,26 @@ def test_a_map_that_moves_with_the_sensor_loses_the_start() -> None:
     assert (final[1][4:] > 10.0 * final[0][4:]).all()  # across the way, by the lever of the heading
 
 
+def test_a_view_that_turns_away_compares_with_what_it_brought_itself() -> None:
+    """A cone looks at new places as it turns about what is across it; about its own axis, and all around, it does not."""
+    turns = {"aside": np.array([0.0, 0.0, 0.1]), "about its axis": np.array([0.1, 0.0, 0.0])}
+    ahead = np.array([0.9, 0.0, 0.0])
+    final = {}
+    for name, facing in (("aside", ahead), ("about its axis", ahead), ("aside", ALL_AROUND)):
+        random = np.random.default_rng(0)
+        R, cov = np.eye(3), 1e-8 * np.eye(24)
+        datum = MapDatum(_state(R, np.zeros(3)), cov)
+        datum.insert(1000)
+        for _ in range(150):
+            R = R @ so3.exp(turns[name])
+            cov = _scan(datum, random, _state(R, np.zeros(3)), cov, 1e-3, facing)
+            datum.insert(100)
+        key = name if facing is ahead else "all around"
+        final[key] = np.sqrt(np.trace(datum.pose_covariance(_state(R, np.zeros(3)))[:3, :3]))
+    assert final["aside"] > 2.0 * final["all around"]
+    assert final["about its axis"] == pytest.approx(final["all around"], rel=0.2)
+
+
 def test_sampled_errors_spread_as_it_says() -> None:
     """Errors drawn through the equations of `map_datum`, in a world frame that is not the IMU's."""
     random, runs, share_new = np.random.default_rng(1), 20000, 0.5
@@ -89,7 +118,7 @@ def test_sampled_errors_spread_as_it_says() -> None:
         A, cov_prior = _information(random), cov + 1e-4 * np.eye(24)
         cov = _updated(cov_prior, A)
         points += 100.0
-        datum.follow(x, cov_prior, cov, Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0)))
+        datum.follow(x, cov_prior, cov, Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0), ALL_AROUND))
         noise = np.linalg.cholesky(turn @ np.linalg.inv(A[:6, :6]) @ turn.T)
         if points > 100.0:
             d += np.sqrt(share_new) * random.normal(size=(runs, 6)) @ noise.T
@@ -145,7 +174,8 @@ def test_what_all_poses_share_is_not_between_two(seed: int, step: float, turn: f
     assert (np.linalg.eigvalsh(between[0]) > 0.0).all()
 
 
-def test_sampled_errors_between_two_poses_spread_as_it_says() -> None:
+@pytest.mark.parametrize(("facing", "turned_away"), [(0.0, 0.0), (0.8, 0.4)])  # 0.3 rad × 0.8 over a spread of 0.6
+def test_sampled_errors_between_two_poses_spread_as_it_says(facing: float, turned_away: float) -> None:
     """Errors drawn through the equations of `map_datum` on a way that turns, the error of the marked pose moved along."""
     random, runs, marked_at = np.random.default_rng(2), 20000, 3
     x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
@@ -166,7 +196,7 @@ def test_sampled_errors_between_two_poses_spread_as_it_says() -> None:
         cov_prior = cov.copy()
         cov_prior[:6, :6] = _turned(along, turn.T) + 1e-5 * np.eye(6)
         cov = _updated(cov_prior, A)
-        correction = Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0))
+        correction = Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0), np.array([facing, 0.0, 0.0]))
         datum.follow(x, cov_prior, cov, correction)
         noise = np.linalg.cholesky(turn @ np.linalg.inv(A[:6, :6]) @ turn.T)
         d = d + np.sqrt(new) * random.normal(size=(runs, 6)) @ noise.T
@@ -176,7 +206,7 @@ def test_sampled_errors_between_two_poses_spread_as_it_says() -> None:
         if k == marked_at:
             datum.mark()
             marked = e
-        local = local * np.exp(-np.linalg.norm(shift) / correction.lever_arm) + 100.0
+        local = local * np.exp(-np.linalg.norm(shift) / correction.lever_arm - turned_away) + 100.0
         new = 100.0 / local
         datum.insert(100)
         d = (1.0 - new) * d + new * e

@@ -149,3 +149,17 @@ def test_no_points_give_no_information() -> None:
     assert information.used == 0
     assert information.residual_rms == 0.0
     assert not information.A.any()
+
+
+@settings(max_examples=20)
+@given(seeds, st.floats(0.0, 3.1))
+def test_where_a_scan_faces(seed: int, half_angle: float) -> None:
+    """The mean of unit vectors, whatever the distances: (1 + cos α) / 2 along the axis of a cone of half the angle α."""
+    random = np.random.default_rng(seed)
+    across = random.uniform(np.cos(half_angle), 1.0, 20000)
+    around, distance = random.uniform(0.0, 2.0 * np.pi, 20000), random.uniform(0.5, 80.0, 20000)
+    side = np.sqrt(1.0 - across**2)
+    rays = np.stack([across, side * np.cos(around), side * np.sin(around)], axis=1)
+    points = (distance[:, None] * rays).astype(np.float32)
+    facing = _measure(points, IkdTree()).facing
+    np.testing.assert_allclose(facing, [0.5 * (1.0 + np.cos(half_angle)), 0.0, 0.0], atol=0.02)

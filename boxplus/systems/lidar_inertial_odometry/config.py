@@ -71,7 +71,7 @@ class LioConfig(LidarOdometryConfig):
         None, gt=0, description="gyroscope noise [rad/s/√Hz], vibration included; None is told from its samples, 0.0005 to 0.002"
     )
     accel_noise: float | None = Field(
-        None, gt=0, description="accelerometer noise [m/s²/√Hz], likewise; None is told from its samples, 0.005 to 0.02"
+        None, gt=0, description="accelerometer noise [m/s²/√Hz], likewise; None is told from its samples, 0.005 to 0.05"
     )
     gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
     accel_bias_walk: float = Field(1e-3, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]")

@@ -9,9 +9,10 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_noise import sample_noise
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
-# Densities of gyroscope [rad/s/√Hz] and accelerometer [m/s²/√Hz]: of one that a motor or a gait shakes, and of one that moves
-# smoothly, which is believed more, though its scale, its axes and its clock are never exact.
-_SHAKEN = np.array([2e-3, 2e-2])
+# Densities of gyroscope [rad/s/√Hz] and accelerometer [m/s²/√Hz]: of one that a motor or a gait shakes, as two real flights
+# showed against their ground truth over 1 to 4 s, and of one that moves smoothly, which is believed more, though its scale, its
+# axes and its clock are never exact.
+_SHAKEN = np.array([2e-3, 5e-2])
 _SMOOTH = np.array([5e-4, 5e-3])
 _MARGIN = 5.0  # the filter's density over that of the samples: what they do not show, and what has been filtered out of them
 _MEMORY_S = 1.0

@@ -121,7 +121,8 @@ def align(
     moved = cov @ (gradient + deviation)
     cov = cov + np.outer(moved, moved)
     expected += np.outer(moved[_LAST_POSE], moved[_LAST_POSE])
-    correction = Correction(gain, noise, strong_covariance(said.A, said.directions), said.directions.lever_arm)
+    alone = strong_covariance(said.A, said.directions)
+    correction = Correction(gain, noise, alone, said.directions.lever_arm, measurement.facing)
     return Alignment(motion, cov, True, said, measurement, expected, correction, steps, converged)
 
 
