@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import typer
 from typer.core import TyperCommand
 
 from boxplus.cli.examples import EXAMPLES
@@ -15,6 +16,14 @@ _VALUES = {"path": "PATH", "int": "N", "int range": "N", "float": "X", "float ra
 
 class Command(TyperCommand):
     """A command whose help shows its options under the names of their panels, and examples of how it is called."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """What is wrong with a value, without the word that the library for checking values puts before it."""
+        try:
+            return list(super().parse_args(ctx, args))
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """`RECORDING…` for what may be repeated, `[SCENARIO]` for what may be left out."""

@@ -20,7 +20,10 @@ _STYLE = {"ok": "green", "warning": "yellow", "error": "bold red"}
 @takes_recording_options
 def inspect(
     recording: Annotated[
-        Path, typer.Argument(help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, pcap, or a recording of cameras.")
+        Path,
+        typer.Argument(
+            metavar="RECORDING", help="ROS 1 bag, ROS 2 folder or file, KITTI raw folder, pcap, or a recording of cameras."
+        ),
     ],
     T_imu_lidar: Annotated[
         str | None,
@@ -102,5 +105,6 @@ def _print_table(diagnosis: Diagnosis) -> None:
         table.add_row(Text(finding.verdict, style=style), finding.key, Text(finding.value), Text(finding.text))
     console.print(table)
     counts = {verdict: sum(finding.verdict == verdict for finding in diagnosis.evidence) for verdict in _STYLE}
-    summary = f"{counts['ok']} ok, {counts['warning']} warnings, {counts['error']} errors"
+    numbers = (f"{counts[word]} {word}{'' if counts[word] == 1 else 's'}" for word in ("warning", "error"))
+    summary = f"{counts['ok']} ok, {', '.join(numbers)}"
     console.print(Text(summary, style=_STYLE[diagnosis.verdict]))

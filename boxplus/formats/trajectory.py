@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.numbers.lines import refuse_binary
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_rows import (
     COLUMNS,
@@ -231,8 +232,8 @@ def _read_lines(path: Path) -> tuple[list[str], bool]:
     try:
         with path.open("rb") as file:
             head = file.read(4096)
-            if b"\0" in head and b"\n" not in head.split(b"\0")[0]:
-                raise InputError("a text file with one pose a line", f"a binary file ({path})", "give a trajectory file")
+            # A run that was killed may have left zeros behind its last line.
+            refuse_binary(head if b"\n" not in head.split(b"\0")[0] else b"", path, "a text file with one pose a line")
             data = head + file.read()
     except OSError as error:
         raise InputError("a readable trajectory file", f"{path}: {error.strerror}", "check the path") from error

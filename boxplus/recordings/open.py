@@ -55,5 +55,6 @@ def _open(path: Path, options: RecordingOptions) -> Recording:
     raise RecordingError(
         "a ROS 1 bag (.bag), a ROS 2 folder or file (.mcap, .db3), a KITTI raw folder (velodyne_points/, oxts/) or a pcap",
         f"{path.name}",
-        "convert the recording, or push arrays from Python (boxplus.sensors); cameras are read by open_camera_recording",
+        "convert the recording, or push arrays from Python; recordings of cameras alone are for 'boxplus vo' and 'vio' "
+        "(open_camera_recording)",
     )

@@ -111,9 +111,7 @@ def _read_yaml(path: Path, known: Sections) -> dict[str, dict[str, object]]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise InputError(
-            f"a YAML file with {sections}", f"{type(content).__name__} in {path}", "write e.g. 'odometry:' and keys below"
-        )
+        raise InputError(f"a YAML file with {sections}", f"none of them in {path}", "write e.g. 'odometry:' and keys below")
     for section, values in content.items():
         if section not in known:
             home = [name for name, model in known.items() if section in model.model_fields]

@@ -78,6 +78,11 @@ def test_usage_says_what_may_be_left_out_and_what_may_be_repeated() -> None:
         (["map", "merg"], "No such command 'merg'. Did you mean 'merge'?"),
         (["lio", "--thread", "2", "a.bag"], "No such option: --thread (Possible options: --threads)"),
         (["lio"], "Missing argument 'RECORDING'"),
+        (["inspect"], "Missing argument 'RECORDING'"),
+        (["pgo"], "Missing argument 'FILE'"),
+        (["ba"], "Missing argument 'FILE'"),
+        (["calibrate", "cameras"], "Missing argument 'CORNERS'"),
+        (["eval", "a", "b", "--align", "se33"], "Invalid value for '--align': 'se33' is not one of 'se3'"),
     ],
 )
 def test_what_was_meant_is_asked(words: list[str], told: str) -> None:

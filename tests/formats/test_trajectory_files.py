@@ -146,6 +146,9 @@ def test_missing_and_binary_files(tmp_path: Path) -> None:
     (tmp_path / "x.bag").write_bytes(b"\x13\x00\x00\x01" * 100)
     with pytest.raises(InputError, match="a binary file"):
         read_trajectory(tmp_path / "x.bag")
+    (tmp_path / "x.tum").write_bytes("0 1 2 3 0 0 0 1\n".encode("utf-16"))
+    with pytest.raises(InputError, match=r"got text in UTF-16 .* save it again as UTF-8"):
+        read_trajectory(tmp_path / "x.tum")
 
 
 @pytest.mark.parametrize("layout", ["tum", "kitti", "csv"])

@@ -29,7 +29,11 @@ class LensChoice(StrEnum):
 
 def cameras(
     corners: Annotated[
-        Path, typer.Argument(help="Corners of the target: Basalt's detected_corners.json, or a CSV of time_ns,camera,corner,u,v.")
+        Path,
+        typer.Argument(
+            metavar="CORNERS",
+            help="Corners of the target: Basalt's detected_corners.json, or a CSV of time_ns,camera,corner,u,v.",
+        ),
     ],
     target: Annotated[
         Path, typer.Option("--target", help="Kalibr's YAML of the AprilGrid; its tagSize [m] decides all lengths.")

@@ -51,7 +51,10 @@ _POINT_FORMATS: dict[FormatChoice, ReconstructionFormat] = {
 
 def ba(
     file: Annotated[
-        Path, typer.Argument(help="BAL file (plain or .bz2), the folder of a COLMAP model or of a line set (*.P, *.lines).")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="BAL file (plain or .bz2), the folder of a COLMAP model or of a line set (*.P, *.lines)."
+        ),
     ],
     output: OutputOption = None,
     loss: LossOption = "none",

@@ -72,7 +72,7 @@ class CrossBlockChoice(StrEnum):
 
 
 def pgo(
-    file: Annotated[Path, typer.Argument(help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
     output: OutputOption = None,
     start: Annotated[
         StartChoice, typer.Option("--start", help="Where to start; auto: the cheaper of the file's poses and the chordal start.")

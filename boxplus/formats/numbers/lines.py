@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import codecs
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -129,7 +130,19 @@ def first_text(path: str | Path, size: int) -> str:
     """
     source = Path(path)
     with _explaining(source), _open(source) as file:
-        return bytes(file.read(size)).decode("utf-8", "replace")
+        return bytes(file.read(size)).removeprefix(codecs.BOM_UTF8).decode("utf-8", "replace")
+
+
+def refuse_binary(head: bytes, source: Path, expected: str) -> None:
+    """Refuse a file that begins like no text.
+
+    Raises:
+        InputError: a zero byte is in it; the message says where it is text all the same, in UTF-16.
+    """
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"{expected}, in UTF-8", f"text in UTF-16 ({source})", "save it again as UTF-8")
+    if b"\0" in head:
+        raise InputError(expected, f"a binary file ({source})", "give the text file, or read it as what it is")
 
 
 @contextmanager
@@ -190,8 +203,10 @@ def _chunks(file: io.RawIOBase, source: Path, tags: Sequence[str]) -> Iterator[N
         received = file.readinto(memoryview(workspace.buffer)[held:-1]) or 0
         if not checked:
             checked = True
-            if b"\0" in workspace.buffer[: min(received, 4096)]:
-                raise InputError("a text file", f"a binary file ({source})", "give the text file, or read it as what it is")
+            refuse_binary(bytes(workspace.buffer[: min(received, 4096)]), source, "a text file")
+            if workspace.buffer.startswith(codecs.BOM_UTF8):  # as editors under Windows write it
+                received -= len(codecs.BOM_UTF8)
+                workspace.buffer[:received] = workspace.buffer[len(codecs.BOM_UTF8) : len(codecs.BOM_UTF8) + received]
         held += received
         if not received and held and workspace.buffer[held - 1] != 10:
             workspace.buffer[held] = 10  # the last line may end without a newline

@@ -9,7 +9,7 @@ from boxplus.errors import RecordingError
 from boxplus.recordings.bags.container import READ_ERRORS, Container
 from boxplus.recordings.bags.indexed import IndexedContainer, rosbags_errors
 from boxplus.recordings.bags.parts import bag_files, is_described, recordings_among
-from boxplus.recordings.bags.sequential import open_sequential
+from boxplus.recordings.bags.sequential import begins_like_a_bag, open_sequential
 
 _LOG = logging.getLogger(__name__)
 
@@ -33,6 +33,13 @@ def open_container(path: Path) -> Container:
         files = bag_files(path)
     container = open_sequential(files)
     if container is None:
+        if files and not any(map(begins_like_a_bag, files)):
+            what = "which begins like none of them" if any(file.stat().st_size for file in files) else "which is empty"
+            raise RecordingError(
+                "a ROS 1 bag, an MCAP file or a ROS 2 database",
+                f"{path.name}, {what}",
+                "give the recording, or copy it again where this is it",
+            )
         raise RecordingError(
             "a readable ROS bag or MCAP file",
             f"{path.name}: {reason}",
@@ -50,7 +57,8 @@ def _parts(folder: Path) -> list[Path]:
         raise RecordingError(
             "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
             f"{folder.name} with {', '.join(sorted(file.name for file in folder.iterdir())[:5]) or 'nothing in it'}",
-            "give the folder that holds them; of ROS 1 bags give one file; folders of images are for open_camera_recording",
+            "give the folder that holds them; of ROS 1 bags give one file; folders of images are for 'boxplus vo' and 'vio' "
+            "(open_camera_recording)",
         )
     if len(recordings) > 1:
         first, second = recordings[0][-1], recordings[1][0]

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from boxplus.recordings.bags.container import READ_ERRORS, Channel, foreign_errors
 
-ROS1_MAGIC = b"#ROSBAG V2.0\n"
+ROS1_MAGIC, _ANY_ROS1_MAGIC = b"#ROSBAG V2.0\n", b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format"
 _LARGEST_RECORD = 1 << 31
@@ -103,6 +103,12 @@ def _read(files: list[Path], damage: list[str]) -> Iterator[tuple[_Connection, i
                         yield connections[record.channel], record.time_ns, record.data
         except errors as error:
             damage.append(f"{file.name} is readable up to byte {position} only ({str(error) or type(error).__name__})")
+
+
+def begins_like_a_bag(file: Path) -> bool:
+    """Whether a file has the first bytes of a bag, of whatever version, an MCAP file or a SQLite database."""
+    with file.open("rb") as stream:
+        return stream.read(len(SQLITE_MAGIC)).startswith((_ANY_ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
 
 
 def _scanner(stream: BinaryIO) -> _Scanner:

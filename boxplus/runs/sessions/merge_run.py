@@ -72,7 +72,7 @@ def merge_runs(
     config = config if config is not None else MergeConfig()
     paths = [Path(folder) for folder in folders]
     if len({path.resolve() for path in paths}) < max(len(paths), 2):
-        raise InputError("two runs at least, each given once", f"{[str(path) for path in paths]}", "name their output folders")
+        raise InputError("two runs at least, each given once", ", ".join(map(str, paths)) or "none", "name their output folders")
     runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
     sessions = [run.session for run in runs]
     refuse_repeated({run.session.name: run.identity for run in runs})

@@ -106,6 +106,17 @@ def test_compressed_text_reads_the_same(folder: Path) -> None:
         list(read_number_lines(path))
 
 
+def test_text_as_editors_under_windows_save_it(folder: Path) -> None:
+    (chunk,) = parse(folder, b"\xef\xbb\xbfEDGE 1 2\r\nEDGE 3 4\r\n", ("EDGE",))
+    assert chunk.values.tolist() == [1.0, 2.0, 3.0, 4.0] and chunk.tag.tolist() == [0, 0]
+    assert number_lines.first_text(folder / "numbers.txt", 7) == "EDGE"
+    assert parse(folder, b"\xef\xbb\xbf") == []
+    with pytest.raises(
+        InputError, match=r"a text file, in UTF-8 – got text in UTF-16 \(.*numbers.txt\) – save it again as UTF-8"
+    ):
+        parse(folder, "EDGE 1 2\n".encode("utf-16"))
+
+
 def test_files_that_are_no_text(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"expected a text file – got a binary file"):
         parse(folder, b"1 2 3\0\0")

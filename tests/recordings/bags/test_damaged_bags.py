@@ -111,10 +111,18 @@ def test_a_damaged_chunk_is_skipped(shared_data: Path, tmp_path: Path) -> None:
 
 
 def test_a_bag_with_nothing_readable_is_refused(tmp_path: Path) -> None:
-    for name in ("empty.bag", "empty.mcap", "empty.db3"):
-        (tmp_path / name).write_bytes(b"")
-        with pytest.raises(RecordingError, match=r"a readable ROS bag or MCAP file – got " + name.replace(".", r"\.")):
-            open_recording(tmp_path / name)
+    for ending in ("bag", "mcap", "db3"):
+        path = tmp_path / f"x.{ending}"
+        path.write_bytes(b"")
+        with pytest.raises(RecordingError, match=rf"a ROS 1 bag, an MCAP .* – got x\.{ending}, which is empty"):
+            open_recording(path)
+        path.write_bytes(b"VERTEX_SE2 0 0 0 0\n" * 9)  # a file of another kind under this name
+        with pytest.raises(RecordingError, match=rf"got x\.{ending}, which begins like none of them – give the recording"):
+            open_recording(path)
+    for head in (b"#ROSBAG V1.2\n", b"\x89MCAP0\r\n"):
+        path.write_bytes(head)
+        with pytest.raises(RecordingError, match=r"a readable ROS bag or MCAP file – got x\.db3: .* nothing in this file"):
+            open_recording(path)
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
