@@ -20,7 +20,7 @@ from boxplus.optimization.minimizers.minimize import Callback, minimize, strateg
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
 from boxplus.optimization.solution import Solution, values_at
 from boxplus.optimization.solver_options import SolverOptions, options_from
-from boxplus.optimization.terms.connections import check_connections, require_connections
+from boxplus.optimization.terms.connections import check_connections, require_connections, require_manifold
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
 from boxplus.optimization.terms.group import Group, ResidualRows
 from boxplus.optimization.terms.held_components import component_mask, held_groups
@@ -39,9 +39,8 @@ _STALE = 0.05
 class Problem:
     """Minimises ½ Σ ρ(‖W r(x)‖²) over variables on manifolds.
 
-    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. Variables and
-    residuals may come and go (`extend`, `remove`, `boxplus.marginalize`); what stays keeps its name. One thread at a time may use
-    a problem, its solving included; a second one is refused (InputError).
+    The structure (variables, groups, what is fixed) is analysed once, by the first `solve` after it changed. Variables and groups
+    may come and go (`extend`, `remove`, `boxplus.marginalize`); what stays keeps its name. A second thread at a time is refused.
 
     Example:
         >>> problem = bp.Problem()
@@ -69,8 +68,9 @@ class Problem:
             name: for messages; the manifold's name and a number otherwise.
 
         Raises:
-            InputError: wrong shape, not finite, off the manifold; a name that is taken.
+            InputError: no manifold; wrong shape, not finite, off the manifold; a name that is taken.
         """
+        require_manifold(manifold)
         label = name if name is not None else f"{manifold.name}_{len(self.blocks)}"
         if any(block.name == label for block in self.blocks):
             raise InputError("a new name", f"{label!r}, which another block has", "choose another name")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
@@ -73,7 +74,12 @@ class Sequencer:
         return self._scan_steps.sentences() + self._imu_steps.sentences()
 
     def add_imu(self, samples: ImuSamples) -> None:
-        """Take samples in; non-finite ones and those that do not move forward in time are counted and left out."""
+        """Take samples in; non-finite ones and those that do not move forward in time are counted and left out.
+
+        Raises:
+            InputError: as `checked_imu`.
+        """
+        samples = checked_imu(samples)
         if not len(samples):
             return
         if self._in_order(samples):
@@ -131,7 +137,12 @@ class Sequencer:
             self._imu.append(ImuSamples(time[keep], samples.gyro[keep], samples.accel[keep]))
 
     def add_scan(self, scan: Scan) -> None:
-        """Take a scan in; one that is empty, or does not end after the one before, is counted and left out."""
+        """Take a scan in; one that is empty, or does not end after the one before, is counted and left out.
+
+        Raises:
+            InputError: as `checked_scan`.
+        """
+        scan = checked_scan(scan)
         if not len(scan):
             self.rejected["scan without a valid point"] += 1
             return

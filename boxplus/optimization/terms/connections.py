@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from boxplus.errors import InputError
+from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangents.change import POSES
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.variables import VariableRows
@@ -32,6 +33,17 @@ _MEANINGS = (
     (r"image_time_offset", "one by which images are brought to the poses"),
     (r"imu_time_offset", "one by which the IMU is brought to the poses"),
 )
+
+
+def require_manifold(manifold: Manifold) -> None:
+    """Refuse what is no manifold.
+
+    Raises:
+        InputError: the class of one, such as `Euclidean` without its dimension, or something else.
+    """
+    if not isinstance(manifold, Manifold):
+        what = manifold.__name__ if isinstance(manifold, type) else repr(manifold)
+        raise InputError("a manifold", what, "give one such as boxplus.SE3 or boxplus.Euclidean(3), dimension included")
 
 
 def require_connections(residual: Residual, connections: Sequence[object]) -> None:

@@ -81,6 +81,8 @@ class Group:
         self, residual: Residual, connections: Sequence[VariableRows], loss: Loss, name: str, *, holds: bool = False
     ) -> None:
         """`holds`: the group stands for components that are held, and is the only one that has Jacobians for them."""
+        if not isinstance(loss, Loss):
+            raise InputError("a loss of boxplus.losses", f"{loss!r}", "write it as loss=bp.losses.Huber(1.5)")
         self.residual, self.name = residual, name
         self.connections = tuple(broadcast(rows, residual.count) for rows in connections)
         self.r = np.zeros((residual.count, residual.dim))

@@ -116,12 +116,20 @@ class LidarInertialOdometry(Snapshots):
         return self._sequencer.time_steps
 
     def push_imu(self, samples: ImuSamples) -> list[Estimate]:
-        """Take IMU samples; returns the estimates that became ready."""
+        """Take IMU samples; returns the estimates that became ready.
+
+        Raises:
+            InputError: no ImuSamples, or arrays of other shapes or types than it says.
+        """
         self._sequencer.add_imu(samples)
         return self._advance(self._sequencer.frames())
 
     def push_scan(self, scan: Scan) -> list[Estimate]:
-        """Take a scan; returns the estimates that became ready."""
+        """Take a scan; returns the estimates that became ready.
+
+        Raises:
+            InputError: no Scan, arrays of other shapes or types than it says, or points from outside of its time.
+        """
         self._sequencer.add_scan(scan)
         return self._advance(self._sequencer.frames())
 

@@ -21,6 +21,7 @@ from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
@@ -104,6 +105,7 @@ class VisualInertialOdometry:
             if gyro is None or accel is None:
                 raise InputError("times, gyro and accel", "times alone", "give all three, or ImuSamples")
             samples = ImuSamples.from_arrays(samples, gyro, accel)
+        samples = checked_imu(samples)
         last = self._imu.time_ns[-1] if len(self._imu) else -(2**62)
         ahead = samples.time_ns > np.maximum.accumulate(np.concatenate([[last], samples.time_ns[:-1]]))
         usable = ahead & np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,22 @@ def test_only_the_manifold_of_the_residual_is_taken(native: Manifold, actual: Ma
     else:
         with pytest.raises(bp.InputError, match="only the updates of a pose change into each other"):
             problem.add_residuals(prior, block, carry_over=True)
+
+
+def test_what_is_no_manifold_and_no_loss() -> None:
+    problem: Any = bp.Problem()
+    with pytest.raises(
+        bp.InputError, match=r"a manifold – got Euclidean – give one such as boxplus.SE3 or boxplus.Euclidean\(3\)"
+    ):
+        problem.add_variables(bp.Euclidean, np.zeros((2, 3)))
+    with pytest.raises(bp.InputError, match="a manifold – got 3 "):
+        problem.add_variables(3, np.zeros((2, 3)))
+    x = problem.add_variables(bp.Euclidean(1), [0.0])
+    prior = bp.residuals.Prior(bp.Euclidean(1), [2.0], sigma=0.1)
+    for loss in ("huber", bp.losses.Huber):
+        with pytest.raises(bp.InputError, match=r"a loss of boxplus.losses – got .*uber.* – write it as loss=bp.losses.Huber"):
+            problem.add_residuals(prior, x, loss=loss)
+    assert problem.groups == []
 
 
 def test_poses_of_one_block_have_one_direction() -> None:
