@@ -21,6 +21,7 @@ from boxplus.report.palette import (
     STATUS,
     XYZ,
     gravity_tilt_deg,
+    highest_ms,
     shown_rows,
 )
 from boxplus.report.run_data import RunData
@@ -137,13 +138,12 @@ def add_status(figure: go.Figure, data: Timeline, rows: NDArray[np.intp]) -> Non
 
 
 def timing(data: Timeline, unit: str = "scan") -> go.Figure:
-    """Milliseconds per estimate, stacked by stage."""
+    """Milliseconds per estimate, stacked by stage; what was waited for may be higher than the axis."""
     figure, rows = go.Figure(), shown_rows(data)
-    for color, (stage, milliseconds) in zip(cycle(SERIES), data.log.pairs("timing_ms").items(), strict=False):
+    stages = data.log.pairs("timing_ms")
+    for color, (stage, milliseconds) in zip(cycle(SERIES), stages.items(), strict=False):
         add_area(figure, data, rows, milliseconds, stage, color, "%{y:.2f} ms")
-    total = data.log.column("total_ms")
-    top = 1.15 * float(np.percentile(total, 99.5)) if len(total) else 1.0
-    figure.update_yaxes(title_text=f"ms per {unit}", range=[0.0, max(top, 1e-3)])
+    figure.update_yaxes(title_text=f"ms per {unit}", range=[0.0, highest_ms(data)])
     return over_time(figure, data, 280)
 
 

@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from boxplus.report import figures
+from boxplus.report.palette import WAITED
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.runs.lidar_inertial.summary import Matrix
@@ -120,6 +121,11 @@ def _timing_text(data: RunData) -> str:
         f"{timing.reading_s:.1f} s waiting for the reader, {timing.writing_s:.1f} s writing trajectory and tiles, "
         f"{timing.merging_s:.1f} s merging the map."
     )
+    if WAITED in timing.stages_ms:
+        text += (
+            " LiDAR and IMU are compared every few seconds, beside the odometry: in a recording, read faster than it was made, "
+            f"a scan waits for the verdict ({WAITED}), so that the result does not depend on the machine; live none does."
+        )
     if timing.compiled_kernels:
         text += f" {timing.compiled_kernels} kernels were compiled during the run (first use only), which the times include."
     return text

@@ -22,6 +22,8 @@ REJECTED = (SERIES[1], SERIES[4], SERIES[6], SERIES[5], SERIES[2], SERIES[7])
 """Of what was not used, beside SERIES[0] for what was."""
 INK, FAINT, GRID = "#22303c", "#6b7a8f", "#e4e8ec"
 
+WAITED = "sensors compared"
+"""The stage of a scan in which a run over a recording waits for what goes on beside it."""
 _MOST_ROWS = 1500  # more than a page is wide
 
 
@@ -35,6 +37,18 @@ def shown_rows(data: Timeline) -> NDArray[np.intp]:
     troubled = troubled[:: max(1, len(troubled) // 1000)]
     slowest = np.argsort(data.log.column("total_ms"))[-200:]
     return np.unique(np.concatenate([even, troubled, slowest]))
+
+
+def worked_ms(data: Timeline) -> NDArray[np.float64]:
+    """(N,) milliseconds of each estimate, without those in which it waited for the comparison of the sensors."""
+    waited = data.log.pairs("timing_ms").get(WAITED, np.zeros(len(data.seconds)))
+    worked: NDArray[np.float64] = data.log.column("total_ms") - waited
+    return worked
+
+
+def highest_ms(data: Timeline) -> float:
+    """Where an axis of milliseconds per estimate ends: a few seconds of waiting would leave nothing else to be seen."""
+    return 1.15 * max(float(np.percentile(worked_ms(data), 99.5)), 1e-3) if len(data.seconds) else 1.0
 
 
 def gravity_tilt_deg(gravity: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from boxplus.formats.output import atomic_file, make_folder
-from boxplus.report.palette import FAINT, GRID, INK, MARKS, SERIES, STATUS, XYZ, shown_rows
+from boxplus.report.palette import FAINT, GRID, INK, MARKS, SERIES, STATUS, WAITED, XYZ, highest_ms, shown_rows, worked_ms
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
 from boxplus.runs.lidar_inertial.scan_log import SHARES
@@ -116,12 +116,14 @@ def _timing(data: RunData) -> Figure:
         axes.stackplot(
             data.seconds[rows], [values[rows] for values in stages.values()], labels=list(stages), colors=colors, linewidth=0
         )
-        axes.set_ylim(0.0, 1.15 * max(float(np.percentile(data.log.column("total_ms"), 99.5)), 1e-3))
+        axes.set_ylim(0.0, highest_ms(data))
         axes.legend(ncols=3, loc="upper left", fontsize=9, frameon=False)
     scan = data.summary.timing.scan_ms
     if scan is not None:
         axes.axhline(scan.median, color=INK, linewidth=0.9, linestyle="--")
-        text = f"median {scan.median:.1f} ms, 99th percentile {scan.p99:.1f} ms, largest {scan.max:.1f} ms"
+        aside = f", {WAITED} aside" if WAITED in stages else ""
+        largest = float(worked_ms(data).max())
+        text = f"median {scan.median:.1f} ms, 99th percentile {scan.p99:.1f} ms, largest {largest:.1f} ms{aside}"
         axes.set_title(text, loc="left", fontsize=11)
     axes.set(xlabel="time since the first estimate [s]", ylabel="ms per scan")
     axes.margins(x=0.0)

@@ -7,9 +7,11 @@ import shutil
 import types
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from boxplus.cli import app
@@ -159,6 +161,27 @@ def test_map_is_thinned_evenly(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert 500 < len(few) <= 2000 < len(whole)
     np.testing.assert_allclose(few.min(axis=0), whole.min(axis=0), atol=3.0)
     np.testing.assert_allclose(few.max(axis=0), whole.max(axis=0), atol=3.0)
+
+
+def test_seconds_of_waiting_leave_the_rest_to_be_seen(folder: Path) -> None:
+    data = load_run(folder)
+    highest = palette.highest_ms(data)
+    stages = {name: values.copy() for name, values in data.log.pairs("timing_ms").items()}
+    waiting, total = np.zeros(len(data.seconds)), data.log.column("total_ms").copy()
+    waiting[::5] = 3000.0
+    stages[palette.WAITED] = stages[palette.WAITED] + waiting
+
+    class Log:
+        def pairs(self, name: str) -> dict[str, NDArray[np.float64]]:
+            return stages
+
+        def column(self, name: str) -> NDArray[np.float64]:
+            return total + waiting
+
+    waited: Any = types.SimpleNamespace(seconds=data.seconds, log=Log())
+    assert palette.highest_ms(waited) == pytest.approx(highest)
+    write_report(folder)
+    assert f"a scan waits for the verdict ({palette.WAITED})" in (folder / "report.html").read_text(encoding="utf-8")
 
 
 def test_long_runs_show_their_worst_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -238,7 +238,9 @@ class LidarInertialOdometry(Snapshots):
         posterior, cov_prior = update.posterior, update.cov_prior
         on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
+        clock.lap("update")
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
+        clock.lap("sensors compared")
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov

@@ -69,7 +69,9 @@ def test_folder_holds_everything_and_agrees_with_itself(finished: tuple[RunFolde
     assert summary.extrinsic.source == "recording"
     assert summary.timing.scan_ms is not None
     assert summary.timing.scan_ms.median <= summary.timing.scan_ms.p99 <= summary.timing.scan_ms.max
-    assert set(summary.timing.stages_ms) == set(scans.pairs("timing_ms"))
+    stages = scans.pairs("timing_ms")
+    assert set(summary.timing.stages_ms) == set(stages) and "sensors compared" in stages
+    np.testing.assert_array_less(sum(stages.values()), scans.column("total_ms") + 0.01)
 
 
 def test_scan_log_gives_back_the_estimates(finished: tuple[RunFolder, RunSummary]) -> None:
