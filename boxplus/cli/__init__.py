@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import importlib
+import io
 import logging
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -107,6 +110,11 @@ class _Commands(TyperGroup):
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None
+        except OSError as error:
+            if error.errno != errno.ENOSPC or error.filename is not None:
+                raise
+            print_error(f"expected to write to the standard output – got {error.strerror} – make room where it is kept")
+            raise typer.Exit(EXIT_FAILED) from None
 
 
 app = typer.Typer(
@@ -157,5 +165,8 @@ def main() -> None:
     """Entry point of the command `boxplus`."""
     if "OMP_NUM_THREADS" not in os.environ:  # our threads call BLAS; its own would have to be started, and wait spinning
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):  # a pipe under Windows knows no χ² and no arrow; results are not to end with it
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     atexit.register(gc.freeze)  # what is left goes with the process; to look for garbage among it takes a seventh of a second
     app(prog_name="boxplus")

@@ -138,6 +138,27 @@ def test_imports_leave_the_collector_as_it_was(enabled: bool) -> None:
         (gc.enable if before else gc.disable)()
 
 
+def test_an_output_that_knows_few_letters_gets_the_others_replaced(tmp_path: Path) -> None:
+    (tmp_path / "x.bag").touch()
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "boxplus", "inspect", str(tmp_path / "x.bag")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and not done.stderr.strip()
+    assert "got x.bag, which is empty ? give the recording" in done.stdout
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_an_output_without_room_is_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("".join(f"{i} {i} {i % 3} 0 0 0 0 1\n" for i in range(20)))
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "boxplus", "eval", str(path), str(path)]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: expected to write to the standard output – got No space left on device – make room")
+    assert "Traceback" not in done.stderr
+
+
 def test_the_threads_of_blas_that_a_user_asked_for_stay() -> None:
     code = (
         "import os; from boxplus.cli import main\ntry: main()\nexcept SystemExit: print(os.environ.get('OPENBLAS_NUM_THREADS'))"
