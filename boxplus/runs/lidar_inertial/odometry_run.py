@@ -265,6 +265,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 duration_s=info.duration_s,
                 messages=info.message_count,
                 progress=self._recording.progress,
+                first_points=statistics.first_points,
                 evidence=[{"key": e.key, "value": e.value, "verdict": e.verdict, "text": e.text} for e in info.evidence],
             ),
             extrinsic=ExtrinsicFacts(

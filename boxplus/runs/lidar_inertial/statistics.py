@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 
 import numpy as np
@@ -21,6 +22,7 @@ class RunStatistics(EstimateStatistics):
     def __init__(self) -> None:
         super().__init__("scans")
         self.scans_read = 0
+        self.first_points: str | None = None  # digest of those of the first scan that has any
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
         self._position_sigma_m = 0.0
@@ -31,6 +33,9 @@ class RunStatistics(EstimateStatistics):
         if isinstance(event, Scan):
             self.scans_read += 1
             if len(event):
+                if self.first_points is None:
+                    points = np.ascontiguousarray(event.p_lidar)
+                    self.first_points = hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()
                 self._scan_gaps.add(np.array([event.end_ns]))
         else:
             self.add_imu(event.time_ns)

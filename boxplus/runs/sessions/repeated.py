@@ -24,11 +24,14 @@ class RecordingIdentity:
 
     Attributes:
         facts: topic, number of messages, length [s] and time of the last scan [ns]; None where the run does not know them.
-        way_m: length of the way that was found [m]. Simulated recordings may have the rest in common.
+        first_points: digest of the points of the first scan, which simulated recordings do not have in common as they have the
+            rest: their clocks begin alike, and their ways may be as long as each other. None where an older run did not keep it.
+        way_m: length of the way that was found [m].
         maps: of the points of each local map; a copied folder has the same.
     """
 
     facts: _Facts | None
+    first_points: str | None
     way_m: float
     maps: frozenset[bytes]
 
@@ -44,10 +47,12 @@ class RecordingIdentity:
             for own in maps
             if len(own.points) >= _FEWEST_POINTS
         )
-        return cls(facts, odometry.path_length_m, frozenset(digests))
+        return cls(facts, recording.first_points, odometry.path_length_m, frozenset(digests))
 
-    def goes_as_far_as(self, other: RecordingIdentity) -> bool:
-        """Whether the two ways are as long as each other."""
+    def begins_like(self, other: RecordingIdentity) -> bool:
+        """Whether two with the same facts begin with the same points; where one does not know, whether they go equally far."""
+        if self.first_points is not None and other.first_points is not None:
+            return self.first_points == other.first_points
         return abs(self.way_m - other.way_m) <= _WAY_M + _WAY_SHARE * max(self.way_m, other.way_m)
 
 
@@ -62,7 +67,7 @@ def repeated(identities: Mapping[str, RecordingIdentity]) -> dict[str, str]:
     for name, own in identities.items():
         alike = [owner[key] for key in own.maps if key in owner]
         if own.facts is not None:
-            alike += [other for other in same_facts.get(own.facts, []) if identities[other].goes_as_far_as(own)]
+            alike += [other for other in same_facts.get(own.facts, []) if identities[other].begins_like(own)]
         if alike:
             found[name] = alike[0]
             continue

@@ -74,6 +74,14 @@ def test_folder_holds_everything_and_agrees_with_itself(finished: tuple[RunFolde
     np.testing.assert_array_less(sum(stages.values()), scans.column("total_ms") + 0.01)
 
 
+def test_a_recording_is_known_again_by_its_first_points(finished: tuple[RunFolder, RunSummary], tmp_path: Path) -> None:
+    kept = finished[1].recording.first_points
+    other = as_recording(simulate("walk", seed=1, duration_s=1.0, lidar=LIDAR))
+    settings = load_run_config(settings=["scan_voxel=1.0", "map.save=false"])
+    assert run_odometry(walk(1.0), tmp_path / "again", settings).recording.first_points == kept is not None
+    assert run_odometry(other, tmp_path / "other", settings).recording.first_points not in (None, kept)
+
+
 def test_scan_log_gives_back_the_estimates(finished: tuple[RunFolder, RunSummary]) -> None:
     folder, summary = finished
     scans = read_scan_log(folder.scans)

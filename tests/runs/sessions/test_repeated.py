@@ -17,9 +17,16 @@ HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def identity(
-    way_m: float = 50.0, last_ns: int | None = LAST_NS, topic: str = "points", seed: int = 0, count: int = 200
+    way_m: float = 50.0,
+    last_ns: int | None = LAST_NS,
+    topic: str = "points",
+    seed: int = 0,
+    count: int = 200,
+    first_points: str | None = None,
 ) -> RecordingIdentity:
-    recording = RecordingFacts(path="a.bag", format="ros1", lidar_topic=topic, imu_topic="imu", duration_s=20.0, messages=4200)
+    recording = RecordingFacts(
+        path="a.bag", format="ros1", lidar_topic=topic, imu_topic="imu", duration_s=20.0, messages=4200, first_points=first_points
+    )
     odometry = RunSummary(
         versions={}, state="finished", process=1, started=NOW, updated=NOW, recording=recording, path_length_m=way_m,
         last_time_ns=last_ns,
@@ -38,6 +45,13 @@ def test_another_voxel_is_another_run_of_the_same_recording() -> None:
 
 def test_simulated_recordings_with_the_same_times_went_other_ways() -> None:
     assert not repeated({"first": identity(50.0, seed=1), "second": identity(57.0, seed=2), "still": identity(0.01, seed=3)})
+
+
+def test_simulated_recordings_with_the_same_times_and_ways_as_long_begin_with_other_points() -> None:
+    runs = {"first": identity(seed=1, first_points="a"), "second": identity(seed=2, first_points="b")}
+    assert not repeated(runs)
+    assert repeated(runs | {"again": identity(50.6, seed=3, first_points="a")}) == {"again": "first"}
+    assert repeated(runs | {"longer": identity(70.0, seed=3, first_points="b")}) == {"longer": "second"}
 
 
 def test_two_lidars_of_one_recording_are_two() -> None:
