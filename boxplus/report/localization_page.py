@@ -53,8 +53,7 @@ def _body(own: LocalizationFolder, result: LocalizationResult) -> str:
         '<a href="odometry/report.html">report of the odometry</a></p>' + tiles(numbers)
     )
     said = [*summary.warnings, *(f"lost at {text}" for text in summary.losses)]
-    if summary.contradiction is not None:
-        said.insert(0, summary.contradiction)
+    said[:0] = [text for text in (summary.doubt, summary.contradiction) if text is not None]
     notes = "".join(f"<li>{escape(text)}</li>" for text in summary.map_report)
     map_section = f"<section><h2>The map</h2><ul>{notes}</ul></section>"
     parts = [head, warnings_section([escape(text) for text in said]), _overview(own, result), _timeline(own)]

@@ -56,7 +56,8 @@ def localize(
     """Find out where a recording was made in a map, and follow it there.
 
     The odometry of 'boxplus lio', and beside it the search for its place in the map. Poses in the map's frame are written from
-    where it is found on, and never while it is searched for. Exit codes: as 'boxplus lio'; 3 also where no place was found.
+    where it is found on, and never while it is searched for. Exit codes: as 'boxplus lio'; 3 also where no place was found,
+    or where one was and may be wrong.
     """
     from boxplus.runs.localization.config import load_localization_config
 
@@ -89,9 +90,10 @@ def localize(
 
                     write_localization_report(folder, result)
         summary, files = result.summary, ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
-        doubt = summary.contradiction
+        doubts = [text for text in (summary.doubt, summary.contradiction) if text is not None]
         if summary.found_after_s is None:
-            doubt = "; ".join(["no place was found", *summary.best_candidates, *([] if doubt is None else [doubt])])
+            doubts = ["no place was found", *summary.best_candidates, *doubts]
+        doubt = "; ".join(doubts) or None
         terminal.print_results(result.odometry, _rows(result), folder, files, warnings=summary.warnings, doubt=doubt)
         outcome.end(summary, summary.state, untrusted=doubt is not None)
 

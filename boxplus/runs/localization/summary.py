@@ -35,6 +35,7 @@ class LocalizationSummary(Part):
     found_after_s: float | None = Field(None, description="from the first scan to the first pose in the map; null: never [s]")
     searches: int = Field(0, description="queries looked for in the whole map")
     losses: list[str] = Field(default=[], description="when and why the place was lost")
+    doubt: str | None = Field(None, description="why poses in the map that were given out are not to be trusted; null: nothing")
     best_candidates: list[str] = Field(default=[], description="of the last search, where no place was found at its end")
     T_map_world: list[float] | None = Field(
         None, description="the odometry's world in the map at the end [qw … z]; null: unknown"

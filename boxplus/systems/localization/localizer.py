@@ -26,6 +26,7 @@ from boxplus.systems.localization.candidate import Candidate, Query, contradicti
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
 from boxplus.systems.localization.place_map import PlaceMap
+from boxplus.systems.localization.stays import Stays
 from boxplus.systems.localization.tracking import Matched, Tracker
 
 Floats = NDArray[np.float64]
@@ -91,6 +92,7 @@ class Localizer:
     Attributes:
         last_search: the newest query.
         losses: how often the place was lost; lost_because: why last, None before it was.
+        stays: whether the places agree with each other; `stays.doubt` says why poses that were given out are not to be trusted.
 
     Example: docs/localization.md.
     """
@@ -100,6 +102,7 @@ class Localizer:
         self.last_search: Search | None = None
         self.lost_because: str | None = None
         self.losses = 0
+        self.stays = Stays()
         self._map = place_map
         self._images = PlaceImages(place_map.local_maps)
         self._tracker: Tracker | None = None
@@ -112,6 +115,7 @@ class Localizer:
         self._again_ns, self._again_s = 0, 0.0  # when it is looked for again, and how long after the time before
         self._contradictions = 0  # in a row
         self._contradicted_by: str | None = None
+        self._is_odometry_lost = False  # since a scan fitted last
         self._begin_search()
 
     def push(
@@ -138,9 +142,10 @@ class Localizer:
         points = points[np.isfinite(points).all(axis=1)]
         seconds = 0.0 if self._before is None else (time_ns - self._before[0]) * 1e-9
         step = _HERE if self._before is None else se3.compose(se3.inverse(self._before[1]), T_odo)
-        self._before = int(time_ns), T_odo
         if seconds > _JUMP_S:
-            self._lose(f"no scan for {seconds:.1f} s")
+            self._lose(f"no scan for {seconds:.1f} s", is_contradicted=False)
+        self._before = int(time_ns), T_odo
+        self.stays.walk(float(np.linalg.norm(step[4:])))
         up = as_floats(up_odo, "up_odo")
         if self._tracker is None:
             return self._search(int(time_ns), T_odo, points[:0] if lost else points, up)
@@ -209,7 +214,8 @@ class Localizer:
         Ad = se3.adjoint(se3.inverse(T_query_body))
         self._tracker = Tracker(self._map, T_map_body, Ad @ best.covariance @ Ad.T, self.config)
         self._held_ns = self._fitting_ns = local_map.end_ns
-        self._failures = 0
+        self._failures, self._is_odometry_lost = 0, False
+        self.stays.begin(local_map.end_ns, T_map_odo, se3.compose(local_map.T_odo_map, T_query_body))
         self._again_ns = local_map.end_ns + int(1e9 * self._again_s)
         self._builder = self._new_builder()
         return ""
@@ -224,6 +230,7 @@ class Localizer:
     ) -> Localization:
         config = self.config
         matched = None
+        self._is_odometry_lost |= lost
         if not lost and len(points) and (time_ns - self._tried_ns) * 1e-9 >= config.track_interval:
             self._tried_ns = time_ns
             matched = tracker.correct(points, _level(T_odo, up))
@@ -232,11 +239,12 @@ class Localizer:
             self._held_ns = time_ns if matched.measured else _NEVER
             # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.
             if matched.share >= config.least_share or matched.is_beyond:
-                self._fitting_ns = time_ns
+                self._fitting_ns, self._is_odometry_lost = time_ns, False
         search = self._look_again(tracker, time_ns, T_odo, points[:0] if lost else points, up)
         reason = self._why_lost(time_ns, tracker)
         if reason:
-            self._lose(reason)
+            # Beyond the map, or after scans that the odometry lost, nothing that is seen speaks against where it was.
+            self._lose(reason, is_contradicted=reason != self._why_vague(tracker) and not self._is_odometry_lost)
             return Localization(time_ns, "searching", None, None, matched, search)
         is_held = (time_ns - self._held_ns) * 1e-9 <= _STILL and not self._contradictions
         status: Status = "localised" if is_held else "odometry only"
@@ -259,6 +267,7 @@ class Localizer:
         why = contradiction(candidates[0], candidates[1:], T_map_query, config)
         self._builder = self._new_builder()
         self._contradictions = self._contradictions + 1 if why else 0
+        self.stays.is_confirmed = why is None and (candidates[0].refusal is None or self.stays.is_confirmed)
         if why is None:
             self._again_ns = time_ns + int(1e9 * self._again_s)
             self._again_s = min(2.0 * self._again_s, config.recheck_interval)
@@ -274,12 +283,18 @@ class Localizer:
             return f"less than {100 * config.least_share:.0f} % of what stands has been in the map for {config.lost_after:g} s"
         if self._contradictions >= _CONTRADICTIONS:
             return f"{self._contradictions} times in a row {self._contradicted_by}"
-        if tracker.sigma > config.largest_sigma:
+        return self._why_vague(tracker)
+
+    def _why_vague(self, tracker: Tracker) -> str | None:
+        if tracker.sigma > self.config.largest_sigma:
             return f"followed by the odometry alone until the position was known to {tracker.sigma:.1f} m only"
         return None
 
-    def _lose(self, reason: str) -> None:
-        if self._tracker is not None:
+    def _lose(self, reason: str, *, is_contradicted: bool) -> None:
+        if self._tracker is not None and self._before is not None:
+            time_ns, T_odo = self._before
+            T_map_odo = se3.compose(self._tracker.T_map_body, se3.inverse(T_odo))
+            self.stays.end(time_ns, T_map_odo, reason, is_contradicted=is_contradicted)
             self.lost_because = reason
             self.losses += 1
         self._begin_search()

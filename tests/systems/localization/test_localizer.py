@@ -52,6 +52,7 @@ def test_a_start_elsewhere_is_found_and_followed(world: World, place_map: KnownM
     lost = [localizer.push(end + k * 400_000_000, T, drive.scans[-1], lost=True) for k in range(1, 8)]
     assert all(one.matched is None for one in lost)
     assert lost[-1].status == "searching" and lost[-1].T_map_body is None
+    assert localizer.losses == 1 and localizer.stays.doubt is None  # nothing speaks against where it was until then
 
 
 def test_a_sensor_that_is_carried_away_is_noticed_and_found_again(world: World, place_map: KnownMap) -> None:
@@ -69,6 +70,7 @@ def test_a_sensor_that_is_carried_away_is_noticed_and_found_again(world: World, 
     begin = statuses.index("searching")
     again = errors(after[begin:], replace(second, T_world_body=second.T_world_body[begin:]))
     assert len(again) and np.linalg.norm(again[:, 3:], axis=1).max() < 0.1
+    assert localizer.stays.doubt is not None and "from where the odometry has it" in localizer.stays.doubt
     end = after[-1].time_ns + 3_000_000_000
     assert localizer.push(end, T_odo[-1], second.scans[-1]).status == "searching"
     assert localizer.lost_because == "no scan for 3.0 s"
@@ -128,6 +130,7 @@ def test_a_place_that_fits_as_one_alike_does_is_noticed_to_be_another_one() -> N
     assert set(ends[0]) == {"localised"} and "searching" in ends[1]
     assert "localised" not in ends[1][5 : ends[1].index("searching")]  # what is doubted is not claimed
     assert localizer.losses == 1 and "2 times in a row another pose" in str(localizer.lost_because)
+    assert localizer.stays.doubt is not None and "another pose" in localizer.stays.doubt
 
 
 def test_corridors_that_are_alike_are_not_told_apart() -> None:
