@@ -68,7 +68,7 @@ def lidar_path_backwards(scans: Sequence[Scan], config: RegistrationConfig, gues
     # Half a nanosecond is rounded the other way round.
     middle_ns = {middle_of(turned_scan): middle_of(scan) for turned_scan, scan in zip(mirrored, scans[::-1], strict=True)}
     time_ns = np.array([middle_ns[time] for time in back.time_ns[::-1].tolist()], np.int64)
-    return LidarPath(time_ns, R, p, information, segment, weak, misfit, cost, back.failed)
+    return LidarPath(time_ns, R, p, information, segment, weak, misfit, cost, back.failed, back.scan_s)
 
 
 def _mirrored(guess: Turning, turned_ns: int) -> Turning:

@@ -9,7 +9,7 @@ determine stays without information, whatever number the registration has come t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,8 @@ _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
 
+_OF_POSES = ("time_ns", "R_path_lidar", "p_path_lidar", "information", "segment", "weak", "misfit", "cost")
+
 
 Poses = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 """Times (K,) [ns], attitudes (K, 3, 3) and positions (K, 3) [m] of the LiDAR, in any frame."""
@@ -69,6 +71,7 @@ class LidarPath:
         misfit: (K,) float64, rms distance of the points from their planes [m].
         cost: (K,) float64, mean squared distance, points without a plane counted as far off [m²].
         failed: scans that could not be registered.
+        scan_s: how long a scan lasts, over which a pose is the mean of where the LiDAR was; 0 for poses at instants [s].
     """
 
     time_ns: NDArray[np.int64]
@@ -80,6 +83,7 @@ class LidarPath:
     misfit: NDArray[np.float64]
     cost: NDArray[np.float64]
     failed: int
+    scan_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -91,17 +95,7 @@ class LidarPath:
 
     def part(self, chosen: NDArray[np.bool_]) -> LidarPath:
         """The poses that are chosen (K,)."""
-        return LidarPath(
-            self.time_ns[chosen],
-            self.R_path_lidar[chosen],
-            self.p_path_lidar[chosen],
-            self.information[chosen],
-            self.segment[chosen],
-            self.weak[chosen],
-            self.misfit[chosen],
-            self.cost[chosen],
-            self.failed,
-        )
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_POSES})
 
 
 Twist = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -157,6 +151,7 @@ class LidarMotion:
         self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _MOST_POINTS)
         self._map_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
         self._poses: list[_Pose] = []
+        self._lasted_s: list[float] = []
         self._failed = 0
         self._segment = -1
         self._usual = 0.0
@@ -185,6 +180,7 @@ class LidarMotion:
             np.array([pose.misfit for pose in poses], np.float64),
             np.array([pose.cost for pose in poses], np.float64),
             self._failed,
+            float(np.median(self._lasted_s)) if self._lasted_s else 0.0,
         )
 
     @property
@@ -198,6 +194,7 @@ class LidarMotion:
             self._failed += 1
             self._restart()
             return
+        self._lasted_s.append((scan.end_ns - scan.start_ns) * 1e-9)
         scan = thinned(scan, _MOST_RAW)
         middle_ns = (scan.start_ns + scan.end_ns) // 2
         if self._previous_ns is None:

@@ -282,10 +282,10 @@ def _stretch(
     path: LidarPath, time_ns: NDArray[np.int64], imu: ImuSamples, attitude: BodyAttitude, index: NDArray[np.intp]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Equations of a stretch: q₀, v₀ (n, 3, 6), the shared unknowns (n, 3, 13), values (n, 3), root weights (n, 3, 3)."""
-    t0, t1 = int(time_ns[index[0]]), int(time_ns[index[-1]])
-    low, high = np.searchsorted(imu.time_ns, [t0, t1], side="right")
-    grid = np.concatenate([[t0], imu.time_ns[low:high], [t1]])
-    grid = np.unique(np.concatenate([grid, time_ns[index]]))
+    half_ns, t0 = round(0.5e9 * path.scan_s), int(time_ns[index[0]])
+    begins, ends = time_ns[index] - half_ns, time_ns[index] + half_ns
+    low, high = np.searchsorted(imu.time_ns, [begins[0], ends[-1]], side="right")
+    grid = np.unique(np.concatenate([imu.time_ns[low:high], time_ns[index], begins, ends]))
     R = attitude.at(grid)
     a = np.stack([np.interp(grid, imu.time_ns, imu.accel[:, i]) for i in range(3)], axis=1)
     seconds = (grid - t0) * 1e-9
@@ -296,18 +296,39 @@ def _stretch(
     velocity = np.vstack([np.zeros(21), np.cumsum(0.5 * (integrand[1:] + integrand[:-1]) * dt, axis=0)])
     swept = velocity[:-1] * dt + (2.0 * integrand[:-1] + integrand[1:]) / 6.0 * dt**2
     position = np.vstack([np.zeros(21), np.cumsum(swept, axis=0)])
-    at = np.searchsorted(grid, time_ns[index])
-    n, t = len(index), seconds[at]
+    # From where the IMU was at t0, and at the velocity that it had there.
+    zero = int(np.searchsorted(grid, t0))
+    position = position - position[zero] - seconds[:, None] * velocity[zero]
+    position, R = (_mean_over(values, grid, begins, ends) for values in (position, R.reshape(-1, 9)))
+    n, t = len(index), (time_ns[index] - t0) * 1e-9
     rows = np.zeros((n, 3, 6))
     rows[:, :, :3] = np.eye(3)
     rows[:, :, 3:] = t[:, None, None] * np.eye(3)
     shared = np.zeros((n, 3, _SHARED))
-    shared[:, :, GRAVITY] = 0.5 * (t**2)[:, None, None] * np.eye(3)
-    shared[:, :, BIAS] = -position[at, 3:12].reshape(n, 3, 3)
-    shared[:, :, ARM] = R[at]
-    shared[:, :, SLOPE] = position[at, :3]
-    shared[:, :, TURN] = position[at, 12:].reshape(n, 3, 3)
+    shared[:, :, GRAVITY] = 0.5 * (t**2 + path.scan_s**2 / 12.0)[:, None, None] * np.eye(3)
+    shared[:, :, BIAS] = -position[:, 3:12].reshape(n, 3, 3)
+    shared[:, :, ARM] = R.reshape(n, 3, 3)
+    shared[:, :, SLOPE] = position[:, :3]
+    shared[:, :, TURN] = position[:, 12:].reshape(n, 3, 3)
     return rows, shared, path.p_path_lidar[index], _root_weights(path, index)
+
+
+def _mean_over(
+    values: NDArray[np.float64], grid: NDArray[np.int64], begins: NDArray[np.int64], ends: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(n, c) means of values (m, c), linear between times (m,), from begins (n,) to ends (n,), which are among these [ns].
+
+    The registration of a scan finds the mean of where the LiDAR was: undistorted at a constant velocity, a step of 1.8 Hz seems
+    smaller by a twentieth in scans of 0.1 s.
+    """
+    first, last = np.searchsorted(grid, begins), np.searchsorted(grid, ends)
+    if np.array_equal(first, last):
+        return values[first]
+    seconds = (grid - grid[0]) * 1e-9
+    swept = 0.5 * (values[1:] + values[:-1]) * np.diff(seconds)[:, None]
+    total = np.vstack([np.zeros(values.shape[1]), np.cumsum(swept, axis=0)])
+    means: NDArray[np.float64] = (total[last] - total[first]) / (seconds[last] - seconds[first])[:, None]
+    return means
 
 
 def _attitudes_known(path: LidarPath, index: NDArray[np.intp]) -> bool:
