@@ -24,9 +24,9 @@ from tests.systems.visual_inertial_odometry.simulated_rays import (
 SIGMAS = np.repeat([5e-4, 0.005, 0.005, 2e-4, 5e-3], 3)  # θ, p, v, b_ω, b_a, as after some seconds
 
 
-def watched(seed: int, scale: float, silent: int = -1) -> InertialWatch:
+def watched(seed: int, scale: float, silent: int = -1, duration_s: float = 12.0) -> InertialWatch:
     """Estimates that err as their covariance says, but for lengths; the frame `silent` comes after a silence."""
-    flight, watch, rng = Flight(seed, 12.0), InertialWatch(9.81), np.random.default_rng([seed, 5])
+    flight, watch, rng = Flight(seed, duration_s), InertialWatch(9.81), np.random.default_rng([seed, 5])
     for number, k in enumerate(range(300, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY)):
         ends = flight.time_ns[[k - IMAGE_EVERY, k]]
         step = Preintegration.integrate(flight.time_ns, flight.gyro, flight.accel, noise=NOISE, intervals_ns=[ends])
@@ -49,6 +49,17 @@ def test_estimates_as_good_as_they_say_are_believed() -> None:
 def test_lengths_that_are_not_the_accelerometers_are_named(scale: float) -> None:
     said = [watched(seed, scale).contradiction for seed in range(3)]
     assert all(sentence is not None and "baseline" in sentence and "scale" in sentence for sentence in said)
+
+
+def test_a_few_per_cent_of_length_are_measured_and_named() -> None:
+    """Three segments alone do not tell them from chance: `ratio` stays below its bound."""
+    found = [watched(seed, 1.04, duration_s=30.0) for seed in range(4)]
+    for watch in found:
+        share, sigma = watch.length
+        assert abs(share - 0.04) < 4.0 * sigma and sigma < 0.01
+    assert sum("longer" in (watch.contradiction or "") for watch in found) >= 3
+    sound = [watched(seed, 1.0, duration_s=30.0) for seed in range(4)]
+    assert all(watch.contradiction is None and abs(watch.length[0]) < 3.0 * watch.length[1] for watch in sound)
 
 
 def test_little_time_and_silence_say_nothing() -> None:
