@@ -25,7 +25,7 @@ from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import CameraFacts, VioSummary
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
-from boxplus.systems.visual_inertial_odometry.odometry import VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.odometry import REPEATED, VisualInertialOdometry
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 
 _TOLD = {
@@ -231,6 +231,10 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         counts, start = self.counts, self._odometry.start
         shared = self.shared_facts(state, error, with_imu=True)
         shared["warnings"] += self._gap_warnings()
+        repeated = self._odometry.counters.get(REPEATED, 0)
+        if repeated:
+            text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"
+            shared["warnings"].append(WarningFacts(text=text, count=repeated))
         shared["warnings"] += [WarningFacts(text=f"{_MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
             **shared,

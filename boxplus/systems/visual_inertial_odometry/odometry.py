@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._extras import require
 from boxplus.errors import InputError
-from boxplus.manifolds import quaternion
+from boxplus.manifolds import quaternion, so3
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.eight_bits import EightBits
@@ -33,6 +33,7 @@ from boxplus.systems.visual_inertial_odometry.health import Health, position_sig
 from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
+from boxplus.systems.visual_inertial_odometry.repeated_images import RepeatedImages, imu_moves, is_motion
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
 from boxplus.systems.visual_inertial_odometry.start.start import Start
@@ -40,6 +41,7 @@ from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
 _OUTLIER = 4.0  # standard deviations
+REPEATED = "images that are the one before, while the IMU moved"
 _GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
 
 
@@ -88,6 +90,7 @@ class VisualInertialOdometry:
         self._imu = ImuSamples.joined([])
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._search = StartSearch()
+        self._repeated = RepeatedImages()
         self._time_ns = 0  # of the frame before
         self._health = Health(self.config)
         self._watch = InertialWatch(self.config.gravity)
@@ -182,9 +185,32 @@ class VisualInertialOdometry:
             if self.start is not None and not self._has_imu_since_last_frame(time_ns):
                 self._counters["images between two IMU samples"] += 1
                 continue
+            images = self._new_ones(time_ns, images)
+            if not images:
+                continue
             estimates.append(self._frame(time_ns, images))
             self._time_ns = time_ns
         return estimates
+
+    def _new_ones(self, time_ns: int, images: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
+        """Images but those that are the ones before, although the IMU moved meanwhile."""
+        repeated = self._repeated.among(images)
+        if repeated and self._moves(time_ns):
+            self._counters[REPEATED] += len(repeated)
+            images = {camera: image for camera, image in images.items() if camera not in repeated}
+        self._repeated.keep(images)
+        return images
+
+    def _moves(self, time_ns: int) -> bool:
+        """Whether the IMU moved since the frame before."""
+        if self.start is None:
+            first, last = np.searchsorted(self._imu.time_ns, [self._time_ns, time_ns], side="right")
+            return imu_moves(self._imu.gyro[first:last], self._imu.accel[first:last], self.config.gravity)
+        pose, state = self.window.predict(time_ns, self._imu)
+        before = self.window.bodies.values[-1]
+        turn = so3.log(quaternion.to_matrix(before[:4]).T @ quaternion.to_matrix(pose[:4]))
+        focal_px = self.rig.cameras[0].model.fx
+        return is_motion(float(np.linalg.norm(turn)), pose[4:] - before[4:], state[:3], focal_px)
 
     def _has_imu_since_last_frame(self, time_ns: int) -> bool:
         """Whether a sample lies between the newest frame and this time: without one they cannot be told apart by the IMU.

@@ -125,6 +125,23 @@ def test_a_gap_of_the_imu_that_images_bridge_is_a_warning(
     assert not any("a gap" in one.text for one in finished[1].warnings)
 
 
+def test_images_that_come_again_in_motion_are_left_out_and_said(
+    recorded: Path, tmp_path: Path, finished: tuple[VioFolder, VioSummary]
+) -> None:
+    path = shutil.copytree(recorded, tmp_path / "room")
+    for folder in path.glob("mav0/cam*/data"):
+        images = sorted(folder.iterdir())
+        stamps = np.array([int(image.stem) for image in images]) - int(images[0].stem)
+        first, last = np.searchsorted(stamps, [2_600_000_000, 2_900_000_000])
+        for image in images[first:last]:
+            shutil.copy(images[first - 1], image)
+    with open_camera_recording(path) as recording:
+        summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
+    (warning,) = (one for one in summary.warnings if "images again" in one.text)
+    assert warning.count == 2 * (last - first) == 2 * (finished[1].frames - summary.frames)
+    assert summary.contradiction is None and not any("images again" in one.text for one in finished[1].warnings)
+
+
 def test_a_run_with_lines_says_so_and_is_as_good(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["vio", str(recorded), "-o", str(out), "--lines", "--no-report", "--set", "cell_size=12"])
