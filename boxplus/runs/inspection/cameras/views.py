@@ -19,6 +19,7 @@ _FEW_CORNERS, _FEW_A_PIXEL = 40.0, 0.0004
 _LITTLE_STRUCTURE = 3.0
 _BLURRED = 0.35
 _MANY_BLURRED = 0.1
+_CHANGE = 0.5  # of the median change from image to image, before and after images that come again
 
 
 @dataclass(slots=True)
@@ -30,6 +31,7 @@ class Views:
         brightness: mean in 255ths.
         structure: mean difference of neighbouring blocks of 8 × 8 pixels, grey values; noise hardly shows in it.
         sharpness: energy of the finest differences over that of four times coarser ones, along the axis where it is less.
+        change: mean difference to the image before, grey values; 0 only where it is that image to the bit.
         size: (width, height) [px].
     """
 
@@ -37,7 +39,9 @@ class Views:
     brightness: list[float] = field(default_factory=list)
     structure: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
+    change: list[float] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
+    _before: NDArray[np.uint8] | None = None
 
     def note(self, image: CameraImage, grey: NDArray[np.uint8] | None) -> None:
         """Note one image; `grey` (H, W) is left out for depths."""
@@ -47,6 +51,16 @@ class Views:
             self.brightness.append(float(grey[::4, ::4].mean()))
             self.structure.append(_structure(grey))
             self.sharpness.append(_sharpness(grey))
+            self.change.append(_change(self._before, grey))
+            self._before = grey
+
+
+def _change(before: NDArray[np.uint8] | None, grey: NDArray[np.uint8]) -> float:
+    if before is None or before.shape != grey.shape:
+        return np.inf
+    if np.array_equal(before, grey):
+        return 0.0
+    return max(float(np.abs(np.subtract(grey[::4, ::4], before[::4, ::4], dtype=np.float32)).mean()), 1e-6)
 
 
 def _structure(grey: NDArray[np.uint8]) -> float:
@@ -78,7 +92,31 @@ def check_views(name: str, views: Views) -> list[Evidence]:
     found = [_brightness(name, views)]
     if len(views.structure) >= 3:
         found.append(_covered(name, views))
+        found += _repeats(name, views)
     return found
+
+
+def _repeats(name: str, views: Views) -> list[Evidence]:
+    """Images that are the one before to the bit, between images that change: nothing that moves stops and goes on so."""
+    change, structure = np.array(views.change), np.array(views.structure)
+    change[~np.isfinite(change)] = -1.0  # the first image
+    usual = float(np.median(change[change > 0.0])) if (change > 0.0).any() else np.inf
+    same = (change == 0.0) & (structure >= _EMPTY)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+    runs = [
+        (begin, end)
+        for begin, end in zip(edges[::2], edges[1::2], strict=True)
+        if change[begin - 1] > _CHANGE * usual and end < len(change) and change[end] > _CHANGE * usual
+    ]
+    if not runs:
+        return []
+    count, (begin, end) = sum(end - begin for begin, end in runs), max(runs, key=lambda run: run[1] - run[0])
+    time_s = (np.array(views.time_ns) - views.time_ns[0]) * 1e-9
+    text = (
+        f"{count} of {len(change)} images are the one before to the bit, with another stamp, between images that change; the "
+        f"longest stretch is {end - begin} from {time_s[begin]:.2f} s on: a driver that stalls, or a recorder that fills gaps"
+    )
+    return [Evidence(f"{name}_repeats", f"{count}", "warning", text)]
 
 
 def _brightness(name: str, views: Views) -> Evidence:

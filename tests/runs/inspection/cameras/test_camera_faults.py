@@ -186,6 +186,22 @@ def test_what_images_show() -> None:
     assert "few corners" in check_corners("cam0", [60, 70, 75], bare)[0].text
 
 
+def test_images_that_come_again_between_images_that_change_are_named() -> None:
+    texture = np.kron(np.random.default_rng(4).integers(0, 255, (30, 60)), np.ones((16, 16), int)).astype(np.uint8)
+    moving = [texture[:240, 3 * k : 3 * k + 320] for k in range(60)]
+    assert "cam0_repeats" not in said_of(moving)
+    stalled = [moving[20] if 20 < k < 26 else image for k, image in enumerate(moving)]
+    stalled[40] = stalled[39]
+    found = said_of(stalled)["cam0_repeats"]
+    assert (found.value, found.verdict) == ("6", "warning") and "longest stretch is 5 from" in found.text
+    # Without noise images are equal at rest, too: these come slowly to a stop and slowly go on.
+    places = np.cumsum(np.concatenate([np.arange(6, 0, -1), np.zeros(8, int), np.arange(7)]))
+    assert "cam0_repeats" not in said_of([texture[:240, k : k + 320] for k in places])
+    assert "cam0_repeats" not in said_of([moving[0]] * 10 + moving)
+    black = np.zeros((240, 320), np.uint8)
+    assert "cam0_repeats" not in said_of([*moving[:30], black, black, *moving[30:]])
+
+
 @pytest.fixture(scope="module")
 def filmed() -> CameraSimulation:
     """A simulation that renders every image once."""
