@@ -367,7 +367,7 @@ class Problem:
                 for group in self.groups
             },
             faded=faded,
-            notes=(*notes, *jacobian_notes(self.groups, began, model.values), *faded_notes(self.groups, faded)),
+            notes=(*notes, *jacobian_notes(self.groups, began, model.values), *faded_notes(self.groups, faded, model.values)),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )

@@ -35,10 +35,12 @@ class Fit:
         chi2: of the counted edges.
         dof: their rows less the degrees of freedom that the poses take up; the mean of χ² where the information is right, and no
             whole number of a part of the edges.
+        is_partial: whether a robust loss leaves edges uncounted.
     """
 
     chi2: float
     dof: float
+    is_partial: bool = False
 
     @property
     def excess(self) -> float:
@@ -72,6 +74,8 @@ class Fit:
     @property
     def sentence(self) -> str:
         """χ² and what the information promises of it."""
+        if self.dof == 0 and self.is_partial:
+            return "under this loss too few edges count by half or more to hold χ² against what the information promises"
         if self.dof == 0:
             return "no redundancy: nothing checks the measurements"
         ratio = self.chi2 / self.dof
@@ -87,7 +91,7 @@ class Fit:
         """Of the edges `counted` (m,), of which every one adds `squared` (m,) to χ², with `held` poses held."""
         d = graph.information.shape[1]
         free = len(graph.ids) - held
-        return cls(float(squared[counted].sum()), max(d * int(np.count_nonzero(counted)) - d * free, 0))
+        return cls(float(squared[counted].sum()), max(d * int(np.count_nonzero(counted)) - d * free, 0), not counted.all())
 
 
 def misfit(fit: Fit) -> str:

@@ -57,6 +57,20 @@ def test_a_wrong_minimum_says_that_most_residuals_hardly_count(loss):
     assert convex_cost(problem, right) < 0.1 * convex_cost(problem, lost)
 
 
+@pytest.mark.parametrize("sigma, is_told", [(0.01, False), (0.004, True)], ids=["right", "too small"])
+def test_noise_as_promised_hardly_counts_without_a_word(sigma, is_told):
+    # Of six numbers ‖r‖² is above 9, where Cauchy(1) gives a weight of 0.1, in 17 of 100 cases by noise alone.
+    rng = np.random.default_rng(5)
+    z = rng.normal(0.0, 0.01, (400, 6))
+    problem = Problem()
+    x = problem.add_variables(Euclidean(6), np.zeros(6), name="x")
+    prior = Prior(Euclidean(6), z, sigma=sigma)
+    problem.add_residuals(prior, x[np.zeros(400, dtype=np.int64)], loss=losses.Cauchy(1.0), name="measured")
+    found = problem.solve()
+    assert found.faded["measured"] > 0.1
+    assert any("hardly count" in note for note in found.notes) == is_told
+
+
 def test_convex_and_plain_losses_are_solved_as_they_are():
     for loss in (None, losses.Huber(1.0)):
         one, pose, _, _ = registration(1, loss)

@@ -123,3 +123,11 @@ def test_lone_joints_are_found_in_any_number_of_pieces():
     (_, *rest) = lone_joints(with_edges(graph, np.isin(np.arange(count), rows)))
     assert len(rest) == 5 and rest[-1].sentence.startswith("994 more stretches of odometry hang on one loop closure each")
     assert not lone_joints(replace(graph, fixed=np.array([0, len(ids) - 1])))
+
+
+def test_a_narrow_loss_of_sound_edges_is_not_said_to_silence_them():
+    graph = simulate_pose_graph(dimension=3, poses=100, loops=80, seed=2).graph
+    result = optimize_pose_graph(graph, loss=losses.Cauchy(1.0))
+    assert (result.weights < 0.1).mean() > 0.05
+    assert result.notes == () and result.doubt is None
+    assert result.fit.sentence.startswith("under this loss too few edges count")
