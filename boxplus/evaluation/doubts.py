@@ -23,6 +23,7 @@ _AS_GOOD = 1.5  # times the error of the better one of two readings, up to which
 _SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from 1, from which on a scale is told
 _LEAST, _ROUNDS, _TURNS = 50, 10, 0.05  # poses; repetitions; turning in rad, about every axis, for another point to show
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
+_CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
 
 
@@ -56,7 +57,8 @@ def alignment_doubts(
     mean = so3.log(_mean_rotation(R)[None])[0]
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
-    if constant > 2.0 and scatter < min(0.5 * constant, _FAR_DEG) and not (undetermined or about_line):
+    told = max(_CONSTANT_DEG, _LOOSE * _loose_deg(alignment, rmse, wide))
+    if constant > told and scatter < min(0.5 * constant, _FAR_DEG) and not (undetermined or about_line):
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
             f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
@@ -64,6 +66,17 @@ def alignment_doubts(
             f"given, for this rotation with --transform-right 'xyz_qxyzw: 0 0 0 {x:.5f} {y:.5f} {z:.5f} {w:.5f}'"
         )
     return doubts
+
+
+def _loose_deg(alignment: Alignment, rmse: float, wide: float) -> float:
+    """Rotation that an alignment by positions may be off by where they are off by `rmse`, as drift is [degrees].
+
+    Args:
+        wide: how far the path spreads horizontally [m].
+    """
+    if alignment.kind in ("none", "origin"):
+        return 0.0
+    return float(np.degrees(rmse / max(wide if alignment.kind == "yaw" else alignment.spread_m[1], 1e-12)))
 
 
 def reading_doubts(association: Association, alignment: Alignment, translation: NDArray[np.float64]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -36,6 +37,8 @@ _KINDS = {
 _NAMED_TRUTH = re.compile(r"(^|[^a-z])(gt|ground_?-?truth|truth)([^a-z]|$)", re.IGNORECASE)
 _NAMES_OF_RUNS = ("trajectory.tum", "trajectory.csv", "trajectory.kitti.txt")
 _NOTICED_OFFSET_S = 0.02  # between clocks; less is not worth a word
+_SURE, _OF_INTERVAL = 2.0, 0.2  # of its standard deviations, and of the longer interval between poses, that an offset has to be
+_FAR_BETTER = 0.8  # times the error of now, from which on an offset is told whatever motions say; as much worse refutes it
 _BETTER = 0.99  # times the error of now, what an offset has to reach to be advised
 
 
@@ -219,13 +222,14 @@ def evaluate(
     warnings += _association_doubts(association, estimate, ground_truth)
     noticed = association.time_offset
     if noticed is not None and abs(noticed.offset_s) > _NOTICED_OFFSET_S:
-        try:
+        rmse_with = None
+        with suppress(InputError):
             other = matches(association.offset_s + noticed.offset_s)
             moved = _find_alignment(other, alignment, align_by_first).apply(other.estimate)
-            errors = translation_errors(projected(moved, plane), projected(other.ground_truth, plane))
-            warnings.append(_clock_doubt(noticed, other.offset_s, rms(translation), rms(errors)))
-        except InputError:
-            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, rms(translation), None))
+            rmse_with = rms(translation_errors(projected(moved, plane), projected(other.ground_truth, plane)))
+        gain = 1.0 if rmse_with is None else rms(translation) / max(rmse_with, 1e-300)
+        if gain > 1.0 / _FAR_BETTER or (gain > _FAR_BETTER and _is_told(noticed, estimate, ground_truth)):
+            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, rms(translation), rmse_with))
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
@@ -292,7 +296,7 @@ def _association_doubts(association: Association, estimate: Trajectory, ground_t
     doubts = []
     if association.method != "index":
         inside = len(estimate) - association.outside
-        if len(association) < 0.8 * inside:
+        if len(association) < 0.8 * inside and not _is_of_sparse_truth(association, ground_truth):
             doubts.append(
                 f"only {len(association)} of the {inside} poses within the ground truth's time were matched: the numbers "
                 "speak for these alone"
@@ -308,6 +312,20 @@ def _association_doubts(association: Association, estimate: Trajectory, ground_t
                 "motion between the stamps: --interpolate does not"
             )
     return doubts
+
+
+def _is_of_sparse_truth(association: Association, ground_truth: Trajectory) -> bool:
+    """Whether poses are unmatched only because the ground truth has fewer, evenly over the time of the estimate."""
+    if association.method != "nearest" or association.unmatched_ground_truth > 0.2 * len(association):
+        return False
+    longest_s = max((end - begin for begin, end in association.gaps), default=0.0)
+    return longest_s < 5.0e-9 * float(np.median(np.diff(ground_truth.times)))
+
+
+def _is_told(found: TimeOffset, estimate: Trajectory, ground_truth: Trajectory) -> bool:
+    """Whether motions know an offset well enough not to have come by it by noise, or between poses."""
+    interval_s = max(float(np.median(np.diff(poses.times))) * 1e-9 for poses in (estimate, ground_truth))
+    return abs(found.offset_s) > max(_SURE * found.deviation_s, _OF_INTERVAL * interval_s)
 
 
 def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,11 +24,13 @@ class TimeOffset:
         offset_s: to be added to the stamps of the estimate [s].
         correlation: normalised correlation of the two motions at that offset, at most 1.
         signal: `rotation` or `translation`: which speed was compared.
+        deviation_s: standard deviation of the offset, where what does not correlate is noise [s].
     """
 
     offset_s: float
     correlation: float
     signal: str
+    deviation_s: float
 
 
 def estimate_time_offset(
@@ -36,7 +39,7 @@ def estimate_time_offset(
     """Correlate the speeds of both trajectories within ±2 s, and where nothing fits there, within ±60 s.
 
     Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation
-    not on their scale. The better of the two signals counts.
+    not on their scale. The signal that knows the offset better counts.
 
     Args:
         t_estimate, t_ground_truth: (N,) int64 stamps to use [ns], in the place of the trajectories' own.
@@ -69,13 +72,25 @@ def estimate_time_offset(
             return None
         tried = [(signal, *_best_lag(a, b, lags)) for signal, a, b in speeds]
         found = [
-            TimeOffset(lag * step * 1e-9, correlation, signal)
-            for signal, lag, correlation in tried
+            TimeOffset(
+                lag * step * 1e-9, correlation, signal, _deviation_s(b, step * 1e-9, correlation, float(end - begin) / window)
+            )
+            for (signal, lag, correlation), (_, _, b) in zip(tried, speeds, strict=True)
             if correlation >= least and abs(lag) < lags
         ]
         if found:
-            return max(found, key=lambda offset: offset.correlation)
+            return min(found, key=lambda offset: offset.deviation_s)
     return None
+
+
+def _deviation_s(truth: NDArray[np.float64], step_s: float, correlation: float, count: float) -> float:
+    """How well speeds `truth` (n,) tell an offset, where what does not correlate is noise with `count` independent values.
+
+    An offset τ changes them by τ b′, so its variance is that of the noise over count · mean b′².
+    """
+    slope = float(np.mean((np.diff(truth) / step_s) ** 2))
+    noise = (1.0 / min(correlation, 1.0) ** 2 - 1.0) * float(truth.var())
+    return math.sqrt(noise / (count * slope)) if slope > 0.0 else math.inf
 
 
 def _translation_speed(

@@ -157,6 +157,62 @@ def test_an_offset_is_advised_only_where_the_error_gets_smaller_with_it() -> Non
     assert advised and withheld
 
 
+def _wandering(seed: int, turning: float) -> tuple[Trajectory, Trajectory]:
+    """Ground truth over 120 s at 20 Hz, which turns little, and an estimate with noise that drifts."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 120.0, 0.05)
+    waves = [
+        sum(rng.normal() * np.sin(2.0 * np.pi * f * t + a) for f, a in rng.uniform((0.006, 0.0), (0.02, 6.0), (6, 2)))
+        for _ in "xyz"
+    ]
+    p = np.column_stack(waves) * (6.0, 6.0, 1.0)
+    tilts = [
+        sum(rng.normal() * np.sin(2.0 * np.pi * f * t + a) for f, a in rng.uniform((0.06, 0.0), (0.2, 6.0), (6, 2)))
+        for _ in "xyz"
+    ]
+    R = Rotation.from_rotvec(turning * np.column_stack(tilts))
+    time_ns = 1_500_000_000_000_000_000 + np.round(t * 1e9).astype(np.int64)
+    truth = Trajectory(time_ns, p, R.as_quat()[:, [3, 0, 1, 2]])
+    drifting = Trajectory(time_ns, p + np.cumsum(rng.normal(scale=0.004, size=p.shape), axis=0), truth.q_wxyz)
+    return truth, disturbed(drifting, seed, sigma_m=0.02, sigma_rad=0.003)
+
+
+def _of(trajectory: Trajectory, rows: slice) -> Trajectory:
+    return Trajectory(trajectory.time_ns[rows], trajectory.p[rows], trajectory.q_wxyz[rows])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_clocks_that_agree_are_not_doubted(seed: int) -> None:
+    truth, estimate = _wandering(seed, turning=0.03)
+    halves = _of(truth, slice(None, 1600)), _of(estimate, slice(800, None))
+    for one, other in (halves, (truth, _of(estimate, slice(None, None, 10))), (_of(truth, slice(None, None, 20)), estimate)):
+        result = evaluate(other, one, deltas=())
+        assert not any("the motions fit best" in warning or "were matched" in warning for warning in result.warnings)
+        found = result.association.time_offset
+        assert found is None or found.deviation_s > 0.0
+    truth, estimate = _wandering(seed, turning=0.3)
+    late = Trajectory(estimate.time_ns + 300_000_000, estimate.p, estimate.q_wxyz)
+    told = " ".join(evaluate(late, truth, deltas=()).warnings)
+    assert re.search(r"with --offset -0\.(299|30\d) the ATE", told)
+
+
+def test_ground_truth_with_a_gap_matches_only_some() -> None:
+    truth, estimate = _wandering(1, turning=0.03)
+    rows = np.r_[0:800:20, 1600:2400:20]
+    result = evaluate(estimate, Trajectory(truth.time_ns[rows], truth.p[rows], truth.q_wxyz[rows]), deltas=())
+    assert any("were matched" in warning for warning in result.warnings)
+
+
+def test_a_rotation_that_the_alignment_leaves_open_is_no_other_body_frame() -> None:
+    told = 0
+    for seed in range(10):
+        truth, estimate = _wandering(seed, turning=0.03)
+        short = evaluate(_of(estimate, slice(1000, 1160)), _of(truth, slice(1000, 1160)), deltas=())
+        told += np.degrees(np.linalg.norm(Rotation.from_matrix(short.alignment.R_world_estimate).as_rotvec())) > 2.0
+        assert not any("body frames" in warning for warning in short.warnings)
+    assert told  # without the limit such a rotation would be named
+
+
 def test_another_body_frame_is_noticed() -> None:
     truth = SmoothPath(4).sample(T)
     turned = (Rotation.from_quat(truth.q_wxyz[:, [1, 2, 3, 0]]) * Rotation.from_euler("z", 90, degrees=True)).as_quat()
