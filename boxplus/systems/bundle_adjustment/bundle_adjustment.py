@@ -17,6 +17,7 @@ from boxplus.optimization.outliers.convex_start import solve_from_convex
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
@@ -32,7 +33,12 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_notes,
     structure_notes,
 )
-from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction, start_values
+from boxplus.systems.bundle_adjustment.reconstruction_problem import (
+    add_reconstruction,
+    adjusted_reconstruction,
+    pixel_errors,
+    start_values,
+)
 from boxplus.systems.bundle_adjustment.strays import stray_notes, stray_points
 
 _ROUNDS = 3  # of looking for points that have a lower minimum elsewhere
@@ -121,7 +127,7 @@ def adjust_bundle(
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
     problem.fix(points[sound.cheirality.dropped])
     start = [block.values for block in problem.blocks]
-    errors_start = _errors(problem, start)
+    errors_start = pixel_errors(problem, start)
     start[cameras.number], start[points.number] = start_values(sound.reconstruction)
     solution = solve_from_convex(problem, config.solver, start=start, callback=callback)
     camera_of, point_of = (
@@ -131,7 +137,7 @@ def adjust_bundle(
     strayed: list[NDArray[np.int64]] = []
     astray = np.zeros(0, dtype=np.int64)
     while True:
-        errors = _errors(problem, list(solution.values))
+        errors = pixel_errors(problem, list(solution.values))
         adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
         depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
         is_out = solution.reason.startswith("iteration limit")
@@ -157,13 +163,15 @@ def adjust_bundle(
     notes += stray_notes(strayed, astray, ids)
     notes += point_notes(errors, point_of, _weights(problem, solution, loss), ids)
     is_given = "sigma_px" in config.model_fields_set
-    notes += [*outlier_notes(errors, loss), *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
+    gross = outlier_notes(errors, loss)
+    notes += [*gross, *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
     notes += misfit_notes(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     seen = np.unique(point_of)
     lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
     if lens is not None and not lens.is_grave:
         notes.append(lens.sentence)
     said = [
+        bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution) if gross else None,
         sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
         coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),
         mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
@@ -251,14 +259,3 @@ def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, 
     if faded > _MOST:
         reasons.append(f"{faded:.0%} of the observations hardly count under the robust loss: a wrong start, or a sigma too small")
     return "; ".join(reasons) or None
-
-
-def _errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Distances in pixels of all groups, one after the other."""
-    distances = []
-    for group in problem.groups:
-        r, valid = np.zeros_like(group.r), np.ones(group.residual.count, dtype=np.bool_)
-        x = tuple(values[c.block.number] for c in group.connections)
-        group.residual.evaluate_into(0, group.residual.count, x, tuple(c.rows for c in group.connections), r, valid)
-        distances.append(np.where(valid, np.linalg.norm(r, axis=1), np.nan))
-    return np.concatenate(distances)

@@ -105,9 +105,11 @@ def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_g
     off = _OFF_GIVEN if is_given else _OFF
     if noise is None or sigma_px / off <= noise <= off * sigma_px:
         return []
+    taken = "given" if is_given else "assumed (--sigma)"
+    wrong = "small" if noise > sigma_px else "large"
     return [
-        f"the errors are those of sigma = {noise:.2g} px, {sigma_px:g} px was given: standard deviations are too small by a "
-        f"factor of {noise / sigma_px:.2g}, and a robust loss is scaled wrongly"
+        f"the errors are those of sigma = {noise:.2g} px, {sigma_px:g} px was {taken}: standard deviations are too {wrong} by a "
+        f"factor of {max(noise / sigma_px, sigma_px / noise):.2g}, and a robust loss is scaled wrongly"
     ]
 
 

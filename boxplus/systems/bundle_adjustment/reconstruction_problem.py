@@ -154,3 +154,14 @@ def adjusted_reconstruction(
     mean = mean_error_of_points(len(p_world), errors, point_of)
     known = np.where(np.isfinite(mean), mean, -1.0)
     return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params), errors=known)
+
+
+def pixel_errors(problem: Problem, values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Distances in pixels of all groups, one after the other."""
+    distances = []
+    for group in problem.groups:
+        r, valid = np.zeros_like(group.r), np.ones(group.residual.count, dtype=np.bool_)
+        x = tuple(values[c.block.number] for c in group.connections)
+        group.residual.evaluate_into(0, group.residual.count, x, tuple(c.rows for c in group.connections), r, valid)
+        distances.append(np.where(valid, np.linalg.norm(r, axis=1), np.nan))
+    return np.concatenate(distances)

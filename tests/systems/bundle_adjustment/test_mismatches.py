@@ -58,3 +58,23 @@ def test_without_a_loss_they_are_told():
     told = [note for note in adjust_bundle(start).notes if "of the cost" in note and "use a robust loss" in note]
     assert len(told) == 1
     assert not any("of the cost" in note for note in adjust_bundle(reconstruction(47)).notes)
+
+
+@pytest.mark.parametrize("format", ["bal", "colmap", "gbp"])
+@pytest.mark.parametrize("seed", range(60, 63))
+def test_what_a_few_bend_without_a_loss_is_not_to_be_trusted(seed, format):
+    start, wrong = with_mismatches(seed, 0.02, format)
+    assert wrong.any()
+    assert "few gross errors bend all the rest" in adjust_bundle(start, CONFIG.model_copy(update={"sigma_px": 1.0})).doubt
+
+
+@pytest.mark.parametrize("seed", range(64, 68))
+def test_few_errors_bend_no_more_than_noise_does(seed):
+    start = reconstruction(seed, "bal")
+    rng = np.random.default_rng([seed, 5])
+    heavy = rng.random(len(start.pixels)) < 0.01
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(start.pixels))
+    aside = np.where(heavy, 20.0 * SIGMA, 0.0)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    result = adjust_bundle(replace(start, pixels=start.pixels + aside))
+    assert any("of the cost" in note and "use a robust loss" in note for note in result.notes)
+    assert result.doubt is None

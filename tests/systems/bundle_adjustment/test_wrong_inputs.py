@@ -107,10 +107,15 @@ def test_two_scenes_in_one_file_are_told():
     assert note_of(two, "pieces").startswith("the reconstruction falls into 2 pieces that share no point")
 
 
-@pytest.mark.parametrize(("sigma", "factor"), [(1e-9, "5e+08"), (1e9, "5e-10"), (20.0, "0.02")])
+@pytest.mark.parametrize(
+    ("sigma", "factor"),
+    [(1e-9, "small by a factor of 5e+08"), (1e9, "large by a factor of 2e+09"), (20.0, "large by a factor of 40")],
+)
 def test_a_sigma_that_the_errors_contradict_is_told(sigma, factor):
     note = note_of(reconstruction(68), "the errors are those of sigma = 0.", config=BundleAdjustmentConfig(sigma_px=sigma))
-    assert float(note.split("by a factor of ")[1].split(",")[0]) == pytest.approx(float(factor), rel=0.3)
+    way, number = factor.split(" by a factor of ")
+    assert f"px was given: standard deviations are too {way} by a factor of " in note
+    assert float(note.split("by a factor of ")[1].split(",")[0]) == pytest.approx(float(number), rel=0.3)
 
 
 def test_a_sigma_that_fits_and_one_near_it_are_not():
