@@ -107,3 +107,12 @@ def test_the_page_of_the_command_line_has_a_row_for_every_command() -> None:
     (told,) = re.findall(r"^(.*) take `--json` and `--quiet`", page, re.MULTILINE)
     both = {path for path, command in ALL.items() if {"--json", "--quiet"} <= {name for p in command.params for name in p.opts}}
     assert set(re.findall(r"`([^`]+)`", told)) == {"calibrate" if path.startswith("calibrate") else path for path in both}
+
+
+def test_a_command_that_may_end_without_trust_says_so_itself() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "command_line.md").read_text(encoding="utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith("| 3 |"))
+    named = [path for path in re.findall(r"`([a-z -]+)`", row) if path in ALL]
+    assert len(named) > 5
+    silent = [path for path in named if not re.search(r"\b3\b|as 'boxplus lio'", re.sub(r"\s+", " ", ALL[path].help or ""))]
+    assert not silent

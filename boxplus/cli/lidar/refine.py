@@ -55,7 +55,8 @@ def refine_command(
 
     The recording is read once more. Trajectory and map are written anew where points that took no part then lie nearer to their
     planes than before; where they do not, the trajectory stays that of the run, and run.json and the report say so. Exit codes: 0
-    done, accepted or not, 1 the results could not be written, 2 bad input, 130 interrupted (nothing was refined).
+    done, accepted or not, 1 the results could not be written, 2 bad input, 3 poses moved farther than the covariance of the run
+    allows, 130 interrupted (nothing was refined).
     """
     from boxplus.runs.refinement.config import load_refine_config
 
