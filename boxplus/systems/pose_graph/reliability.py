@@ -39,6 +39,7 @@ _ALIKE = 9.2  # difference of squares by which one suspect is a hundred times li
 BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
 _LEAST_STEPS = 10  # of odometry, for a scale or a drift of its own
 _LEAST_SPARE = 10.0  # redundancy from which on a group of edges is judged on its own
+_NONE_LEFT = 0.5  # redundancy, which is a whole number but for rounding
 _CLEARLY, _WRONG = 1.5, 4.0  # times what the information promises of a group's χ², to be told, and not to be trusted
 _SLACK = 0.25
 _STEP = 1e-6  # of differences by a scale and by an angle [rad]
@@ -147,9 +148,12 @@ def suspicions(known: Reliability, solution: Solution, variables: Variables, odo
     usual = max(float(np.median(squared[checked] / half[directions[checked]])), 1.0)
 
     def noise(explained: float, by: int) -> float:
-        """χ² over its mean without what was explained: one cause contradicts many edges where there are few."""
+        """χ² over its mean without what was explained: one cause contradicts many edges where there are few.
+
+        Where nothing is left, as with a single loop, no error speaks of another noise than information promises.
+        """
         spare = float(known.redundancy.sum()) - by
-        return min(usual, max((total - explained) / spare, 1.0)) if spare > 0.0 else usual
+        return min(usual, max((total - explained) / spare, 1.0)) if spare > _NONE_LEFT else 1.0
 
     worst = int(np.argmax(squared))
     common = _systematic(known, solution, variables, odometry) if np.count_nonzero(odometry) >= _LEAST_STEPS else []

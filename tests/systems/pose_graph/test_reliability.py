@@ -176,3 +176,12 @@ def test_bridges_are_the_edges_that_hold_something_together(n, m, seed):
         if child[edge] >= 0:
             below = (place >= place[child[edge]]) & (place <= last[child[edge]])
             assert np.array_equal(below, label == label[child[edge]])
+
+
+@pytest.mark.parametrize("count", [21, 35, 60])
+def test_a_single_loop_that_does_not_close_is_not_to_be_trusted_whatever_rounding_leaves(count):
+    for seed in range(6):
+        graph = row(count, ((0, count - 1),), seed)
+        assert optimize_pose_graph(graph).doubt is None
+        wrong = slipped(graph, len(graph.edges) - 1, 200.0, seed)
+        assert "all other edges contradict" in (optimize_pose_graph(wrong).doubt or "")
