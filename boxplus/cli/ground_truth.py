@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,17 +53,26 @@ def read_ground_truth(path: Path | None) -> Trajectory | None:
 def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment: AlignmentKind) -> Comparison:
     """Write `evaluation.json`. Where that is not possible the run is as good as without it: nothing is raised.
 
+    A straight drive does not determine the rotation about it: such a run is compared from its first pose on, which is said.
+
     Args:
         estimate: the trajectory that a run wrote.
         evaluation: the file to write.
         alignment: of the estimate onto the ground truth: what the estimator leaves open.
     """
+    from boxplus.evaluation.alignment import UndeterminedAlignmentError
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.output import atomic_file
     from boxplus.formats.trajectory import read_trajectory
 
     try:
-        found = evaluate(read_trajectory(estimate), truth, alignment=alignment, method="interpolate")
+        poses = read_trajectory(estimate)
+        try:
+            found = evaluate(poses, truth, alignment=alignment, method="interpolate")
+        except UndeterminedAlignmentError as error:
+            found = evaluate(poses, truth, alignment="origin", method="interpolate")
+            undetermined = f"compared from the first pose on, not by all positions: {error.got}"
+            found = replace(found, warnings=(*found.warnings, undetermined))
         figures = found.to_dict()
         with atomic_file(evaluation) as file:
             file.write(f"{json.dumps(figures, indent=2)}\n".encode())

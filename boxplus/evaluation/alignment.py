@@ -21,6 +21,18 @@ _ROUNDING = 1e-9  # of the mean squared size of a path, below which its errors a
 _COLLINEAR = 1e-3  # second against first principal standard deviation
 
 
+class UndeterminedAlignmentError(InputError):
+    """Positions that do not determine the alignment asked for: too few, all in one place, or on one line.
+
+    Example:
+        >>> try:
+        ...     bp.evaluation.alignment.align(np.zeros((5, 3)), np.zeros((5, 3)))
+        ... except bp.InputError as error:
+        ...     print(type(error).__name__)
+        UndeterminedAlignmentError
+    """
+
+
 @dataclass(frozen=True, slots=True)
 class Alignment:
     """x_world = scale · R_world_estimate · x_estimate + p_world_estimate.
@@ -63,8 +75,9 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignm
             estimator with gravity does not know: Zhang and Scaramuzza, IROS 2018) or `none` (identity).
 
     Raises:
-        InputError: fewer than three positions, or positions that do not determine the rotation: all in one place or on
-            one line; for `yaw` one above the other.
+        InputError: arrays of other shapes.
+        UndeterminedAlignmentError: fewer than three positions, or positions that do not determine the rotation: all in one
+            place or on one line; for `yaw` one above the other.
     """
     x, y = np.asarray(p_estimate, dtype=np.float64), np.asarray(p_ground_truth, dtype=np.float64)
     if x.ndim != 2 or x.shape[1:] != (3,) or x.shape != y.shape:
@@ -75,24 +88,24 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignm
     if kind == "none":
         return Alignment(kind, np.eye(3), np.zeros(3), 1.0, spread, False)
     if len(x) < 3:
-        raise InputError(
-            "at least three matched positions to align", f"{len(x)}", "compare with --align none, or match more poses"
+        raise UndeterminedAlignmentError(
+            "at least three matched positions to align", f"{len(x)}", "compare with --align origin or none, or match more poses"
         )
     if kind == "yaw":
         return _align_heading(x, y, spread)
     for name, values in (("ground truth", spread), ("estimate", principal_spread(x))):
         if values[0] < _COINCIDENT_M:
-            raise InputError(
+            raise UndeterminedAlignmentError(
                 f"{name} positions that differ, to align by them",
                 f"{len(x)} positions within {values[0]:.1e} m: rotation undetermined",
-                "compare with --align none",
+                "compare with --align origin, by the first pose, or none",
             )
         if values[1] < _COLLINEAR * values[0]:
-            raise InputError(
+            raise UndeterminedAlignmentError(
                 f"{name} positions off one line, to align by them",
                 f"{len(x)} positions that stray {values[1]:.2g} m from a line of {values[0]:.3g} m (standard deviations): the "
                 "rotation about that line is undetermined",
-                "compare with --align none",
+                "compare with --align origin, by the first pose, or none",
             )
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
     U, d, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
@@ -118,10 +131,10 @@ def _align_heading(x: NDArray[np.float64], y: NDArray[np.float64], spread: NDArr
     for name, flat in (("ground truth", flat_y), ("estimate", flat_x)):
         size = float(np.sqrt(np.mean(np.abs(flat) ** 2)))
         if size < _COINCIDENT_M:
-            raise InputError(
+            raise UndeterminedAlignmentError(
                 f"{name} positions that differ horizontally, to align the heading by them",
                 f"{len(x)} positions within {size:.1e} m of one vertical",
-                "compare with --align none",
+                "compare with --align origin, by the first pose, or none",
             )
     angle = float(np.angle(np.vdot(flat_x, flat_y)))
     R = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])

@@ -58,7 +58,7 @@ def test_wrong_settings_are_explained(settings: list[str], message: str) -> None
         ("scan_voxel: 0.5", "got 'scan_voxel' – write it below 'odometry:'"),
         ("odometri:\n  scan_voxel: 0.5", "got 'odometri' – did you mean odometry"),
         ("odometry: 3", "expected keys and values below 'odometry:'"),
-        ("[1, 2]", "expected a YAML file with the sections recording, odometry, map.*– got list"),
+        ("[1, 2]", r"expected a YAML file with the sections recording, odometry, map.*– got none of them in .*a\.yaml"),
         ("a: [1", "expected a YAML file – got .*line"),
         ("odometry:\n  scan_voxl: 1", "got 'scan_voxl' – did you mean scan_voxel"),
     ],
