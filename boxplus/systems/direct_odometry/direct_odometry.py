@@ -33,6 +33,7 @@ from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth_of_two
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.estimate import Estimate
+from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
@@ -51,6 +52,8 @@ _SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lo
 _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
 _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find again in its second view
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
+_SEEN_PX = 0.5  # a motion of the image that shows
+_AGAIN = Verdict("lost", ("the image is the one before, to the bit, while the camera moves: the last pose stays",), np.nan)
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
 
 
@@ -93,8 +96,7 @@ class DirectOdometry:
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
         self._log_gain, self._offset = 0.0, 0.0
         self._reference: WindowKeyframe | None = None
-        self._shape: tuple[int, int] | None = None
-        self._time_ns: int | None = None
+        self._frames = FrameOrder()
         self._seen_ns: int | None = None
         self._watch, self._calibration, self._registration = Watch(self.config), CalibrationWatch(), RegistrationWatch()
         self._start: TwoViewStart | None = None
@@ -160,34 +162,24 @@ class DirectOdometry:
         grey = as_image(image)
         if self._reference is not None:
             return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
-        self._check(time_ns, grey)
+        self._frames.take(time_ns, grey)
         watch, self._start = Stopwatch(), self._start or TwoViewStart(self.camera)
-        views, self._time_ns = self._start.push(time_ns, grey), time_ns
+        views = self._start.push(time_ns, grey)
         begun = None if views is None else self._begin_alone(self._start, views, watch)
         if begun is not None or self._seen_ns is None:
             return begun
         lost = Verdict("lost", (f"the view was lost, and no two views tell depths again: {self._start.problem}",), np.nan)
         return self._estimate(time_ns, -1, False, None, lost, watch)
 
-    def _check(self, time_ns: int, image: Image) -> None:
-        shape, self._shape = self._shape or image.shape, self._shape or image.shape
-        if image.shape != shape:
-            raise InputError(
-                f"images of shape {shape}, as the first", f"{image.shape}", "resize it, or begin anew with its camera"
-            )
-        if self._time_ns is not None and time_ns <= self._time_ns:
-            raise InputError(
-                "frames in the order of time", f"{time_ns} ns after {self._time_ns} ns", "sort them, or drop this one"
-            )
-
     def _push(self, time_ns: int, image: Image, depth_of: DepthOf) -> Estimate:
-        self._check(time_ns, image)
+        elapsed_s = self._frames.take(time_ns, image)
         watch = Stopwatch()
         if self._reference is None:
             return self._begin(time_ns, image, depth_of, watch)
-        elapsed_s = (time_ns - (self._time_ns or time_ns)) * 1e-9
-        self._time_ns = time_ns
-        keyframe, alignment, verdict = tracked = self._track(image, self._predicted(elapsed_s))
+        T_predicted = self._predicted(self._unseen_s(time_ns))
+        if self._frames.again and self._moves(image, T_predicted, self._reference):
+            return self._estimate(time_ns, self._reference.number, False, None, _AGAIN, watch)
+        keyframe, alignment, verdict = tracked = self._track(image, T_predicted)
         watch.lap("tracking")
         if verdict.status == "lost":
             return self._lost(time_ns, image, depth_of, tracked, watch)
@@ -254,7 +246,7 @@ class DirectOdometry:
         T = se3.compose(self._T, se3.inverse(alignment.T_21))
         depth = depth_from(self.window.keyframes, views.second, self.camera, T, -alignment.brightness[0])
         second = self._keyframe(time_ns, views.second, depth, T, -alignment.brightness[0])
-        self._time_ns = self._seen_ns = time_ns
+        self._seen_ns = time_ns
         self._T, self._covariance, self._reference, self._velocity_s = T, covariance, first, 0.0
         self._log_gain, self._offset = -alignment.brightness[0], alignment.brightness[1]
         if second is not None:
@@ -271,7 +263,6 @@ class DirectOdometry:
     def _begin(self, time_ns: int, image: Image, depth_of: DepthOf, watch: Stopwatch) -> Estimate:
         """The first frame, or the first after the view was lost for good."""
         keyframe = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0)
-        self._time_ns = time_ns
         if keyframe is None:
             verdict = Verdict(
                 "lost", ("fewer than 100 pixels have a depth and a gradient above noise: there is nothing to track",), np.nan
@@ -292,6 +283,11 @@ class DirectOdometry:
             return self._T
         share = min(elapsed_s / self._velocity_s, 2.0)
         return se3.compose(self._T, se3.exp(share * se3.log(self._velocity)))
+
+    def _moves(self, image: Image, T_predicted: Matrix, keyframe: WindowKeyframe) -> bool:
+        """Whether the motion so far, going on, would show in the image: a source without noise has equal images at rest."""
+        T = se3.compose(se3.inverse(T_predicted), self._T)
+        return image_motion(keyframe.tracker, T).flow * sum(image.shape) > _SEEN_PX
 
     def _track(self, image: Image, T_predicted: Matrix) -> Tracked:
         """The frame against the keyframe closest to where the camera should be; with more starts where that fails."""

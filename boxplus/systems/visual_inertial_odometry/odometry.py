@@ -25,15 +25,16 @@ from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
 from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
+from boxplus.systems.visual_inertial_odometry.known_motion import imu_moves, is_motion
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
-from boxplus.systems.visual_inertial_odometry.repeated_images import RepeatedImages, imu_moves, is_motion
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
 from boxplus.systems.visual_inertial_odometry.start.start import Start

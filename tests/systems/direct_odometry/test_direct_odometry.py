@@ -53,6 +53,28 @@ def test_poses_are_true_and_covariances_honest(drives: list[Drive]) -> None:
     assert 0.3 < np.mean(of_end) < 3.0
 
 
+@pytest.mark.parametrize("again", [1, 3])
+def test_an_image_that_comes_again_in_motion_is_no_standstill(drives: list[Drive], again: int) -> None:
+    seen, odometry = drives[0], DirectOdometry(CAMERA)
+    buffer, estimates = np.empty_like(seen.grey[0]), []
+    for k, (t, z) in enumerate(zip(seen.time_ns, seen.depth, strict=True)):
+        buffer[:] = seen.grey[9 if 9 <= k <= 9 + again else k]  # a driver that fills one buffer
+        estimates.append(odometry.push_rgbd(t, buffer, z))
+    frozen = range(10, 10 + again)
+    assert [k for k, e in enumerate(estimates) if e.status == "lost"] == list(frozen)
+    assert all("to the bit" in estimates[k].reasons[0] and nees(estimates[k], seen.T[k]) < 12.0 for k in frozen)
+    assert all(e.status == "ok" for e in estimates[10 + again :])
+    degrees, metres = errors(estimates[-1].T_world_camera, seen.T[-1])
+    assert degrees < 0.4 and metres < 0.02
+
+
+def test_equal_images_at_rest_are_believed(drives: list[Drive]) -> None:
+    odometry, seen = DirectOdometry(CAMERA), drives[0]
+    estimates = [odometry.push_rgbd(k * 33_000_000, seen.grey[0], seen.depth[0]) for k in range(6)]
+    assert [e.status for e in estimates] == ["ok"] * 6
+    assert np.linalg.norm(estimates[-1].p_world_camera) < 1e-3
+
+
 def test_changing_light_costs_little(drives: list[Drive]) -> None:
     """Root mean square over runs, against the same images at their mean brightness."""
     squares = {"unchanged": 0.0, "changing": 0.0}

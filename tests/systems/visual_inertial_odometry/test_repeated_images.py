@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from boxplus import CameraImage
+from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VioEstimate, VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.known_motion import imu_moves, is_motion
 from boxplus.systems.visual_inertial_odometry.odometry import REPEATED
-from boxplus.systems.visual_inertial_odometry.repeated_images import RepeatedImages, imu_moves, is_motion
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 SECOND = 10**9
