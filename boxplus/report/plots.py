@@ -118,12 +118,11 @@ def _timing(data: RunData) -> Figure:
         )
         axes.set_ylim(0.0, highest_ms(data))
         axes.legend(ncols=3, loc="upper left", fontsize=9, frameon=False)
-    scan = data.summary.timing.scan_ms
-    if scan is not None:
-        axes.axhline(scan.median, color=INK, linewidth=0.9, linestyle="--")
+    if data.summary.timing.scan_ms is not None:
+        median, p99, largest = np.percentile(worked_ms(data), [50, 99, 100])
+        axes.axhline(median, color=INK, linewidth=0.9, linestyle="--")
         aside = f", {WAITED} aside" if WAITED in stages else ""
-        largest = float(worked_ms(data).max())
-        text = f"median {scan.median:.1f} ms, 99th percentile {scan.p99:.1f} ms, largest {largest:.1f} ms{aside}"
+        text = f"median {median:.1f} ms, 99th percentile {p99:.1f} ms, largest {largest:.1f} ms{aside}"
         axes.set_title(text, loc="left", fontsize=11)
     axes.set(xlabel="time since the first estimate [s]", ylabel="ms per scan")
     axes.margins(x=0.0)

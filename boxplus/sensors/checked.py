@@ -6,9 +6,11 @@ would then be read as something else, and rows that do not belong together as if
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
@@ -40,11 +42,17 @@ def checked_scan(scan: Scan) -> Scan:
         raise InputError("a Scan", _kind(scan), "build it with Scan.from_arrays(p_lidar, time_ns)")
     points, time, intensity = scan.p_lidar, scan.time_ns, scan.intensity
     whole = _is(points, np.float32, 2) and _is(time, np.int64, 1) and points.shape == (len(time), 3)
-    if not whole or (intensity is not None and np.shape(intensity) != time.shape):
+    if scan.lidar is not None and np.shape(scan.lidar) != np.shape(time):
+        raise InputError(
+            f"lidar of shape {np.shape(time)}, as time_ns", f"shape {np.shape(scan.lidar)}", "give one number a point, or none"
+        )
+    if not whole or not (intensity is None or (_is(intensity, np.float32, 1) and intensity.shape == time.shape)):
         made = Scan.from_arrays(points, time, intensity)
-        scan = replace(made, start_ns=scan.start_ns, end_ns=scan.end_ns)
-    finite = np.asarray(np.isfinite(scan.p_lidar).all(axis=1))
-    if not finite.all():
+        lidar = None if scan.lidar is None else np.asarray(scan.lidar, dtype=np.uint8)[_returns(points)]
+        rejected = dict(Counter(scan.rejected) + Counter(made.rejected))
+        scan = replace(made, start_ns=scan.start_ns, end_ns=scan.end_ns, lidar=lidar, rejected=rejected)
+    if not np.isfinite(scan.p_lidar).all():
+        finite = np.asarray(np.isfinite(scan.p_lidar).all(axis=1))
         dropped = int((~finite).sum()) + scan.rejected.get("not finite", 0)
         scan = replace(scan.where(finite), rejected={**scan.rejected, "not finite": dropped})
     first, last = (int(scan.time_ns.min()), int(scan.time_ns.max())) if len(scan) else (scan.start_ns, scan.end_ns)
@@ -57,8 +65,17 @@ def checked_scan(scan: Scan) -> Scan:
     return scan
 
 
+def _returns(points: ArrayLike) -> NDArray[np.bool_]:
+    """(N,) the points (N, 3) that `Scan.from_arrays` keeps."""
+    xyz = np.asarray(points).astype(np.float32, copy=False)
+    squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
+    kept: NDArray[np.bool_] = np.isfinite(squared) & (squared > 0.0)
+    return kept
+
+
 def _is(array: object, dtype: type, axes: int) -> bool:
-    return isinstance(array, np.ndarray) and array.dtype == dtype and array.ndim == axes
+    """Also whether it lies in one piece: kernels would be compiled anew for any other layout."""
+    return isinstance(array, np.ndarray) and array.dtype == dtype and array.ndim == axes and array.flags.c_contiguous
 
 
 def _kind(value: object) -> str:

@@ -39,6 +39,22 @@ def test_points_that_are_not_finite_are_left_out_and_counted() -> None:
     assert scan.intensity is not None and scan.intensity.tolist() == [0.0, 1.0, 3.0]
 
 
+def test_what_is_converted_keeps_what_belongs_to_it() -> None:
+    """Columns cut from a wider array lie apart in memory; the number of its LiDAR stays with every point."""
+    wide = np.column_stack([SCAN.p_lidar, np.ones(4, np.float32)]).astype(np.float32)
+    apart = wide[:, :3]
+    scan = checked_scan(replace(SCAN, p_lidar=apart))
+    assert scan.p_lidar.flags.c_contiguous and scan.p_lidar.tolist() == SCAN.p_lidar.tolist()
+    numbered = replace(SCAN, p_lidar=np.array(apart, np.float64), lidar=np.arange(4, dtype=np.uint8), rejected={"far": 2})
+    numbered.p_lidar[1] = 0.0
+    scan = checked_scan(numbered)
+    assert scan.lidar is not None and scan.lidar.tolist() == [0, 2, 3]
+    assert dict(scan.rejected) == {"far": 2, "zero (no return)": 1}
+    listed: Any = replace(SCAN, intensity=[1.0, 2.0, 3.0, 4.0])
+    strength = checked_scan(listed).intensity
+    assert strength is not None and strength.dtype == np.float32
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -60,6 +76,7 @@ def test_samples_that_do_not_fit_together(changes: dict[str, Any], told: str) ->
         ({"time_ns": TIMES * 1e-9}, r"time_ns as integer nanoseconds .* got float64"),
         ({"start_ns": SCAN.end_ns, "end_ns": SCAN.start_ns}, r"between start_ns, 10+15000000, and end_ns, 10+ – got points"),
         ({"intensity": np.zeros(3, np.float32)}, r"intensity as numbers of shape \(4,\)"),
+        ({"lidar": np.zeros(5, np.uint8)}, r"lidar of shape \(4,\), as time_ns – got shape \(5,\)"),
         (
             {"time_ns": TIMES - TIMES[0]},
             r"between start_ns, 1\d+, .* got points from 0 to 15000000 – give all of them as absolute",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 
 import numpy as np
 
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
+from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -22,7 +22,7 @@ class RunStatistics(EstimateStatistics):
     def __init__(self) -> None:
         super().__init__("scans")
         self.scans_read = 0
-        self.first_points: str | None = None  # digest of those of the first scan that has any
+        self.first_points: tuple[str | None, ...] | None = None  # digests of those of the first scan that has any
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
         self._position_sigma_m = 0.0
@@ -34,8 +34,9 @@ class RunStatistics(EstimateStatistics):
             self.scans_read += 1
             if len(event):
                 if self.first_points is None:
-                    points = np.ascontiguousarray(event.p_lidar)
-                    self.first_points = hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()
+                    # Of several LiDARs the first: the others may be left out of another run.
+                    first = event.p_lidar if event.lidar is None else event.p_lidar[event.lidar == 0]
+                    self.first_points = first_points_of(first)
                 self._scan_gaps.add(np.array([event.end_ns]))
         else:
             self.add_imu(event.time_ns)

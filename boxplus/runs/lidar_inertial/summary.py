@@ -22,7 +22,9 @@ class RecordingFacts(Part):
     duration_s: float = Field(description="between its first and last message [s]")
     messages: int = Field(description="LiDAR and IMU messages to read")
     progress: float = Field(0.0, description="share of the recording that was read, 0 to 1")
-    first_points: str | None = Field(None, description="digest of the points of its first scan, by which it is known again")
+    first_points: tuple[str | None, ...] | None = Field(
+        None, description="digests of the points of its first scan, by shells of distance: by them it is known again"
+    )
     evidence: list[dict[str, str]] = Field(default=[], description="every reading found from the data: key, value, verdict, text")
 
 

@@ -24,14 +24,14 @@ class RecordingIdentity:
 
     Attributes:
         facts: topic, number of messages, length [s] and time of the last scan [ns]; None where the run does not know them.
-        first_points: digest of the points of the first scan, which simulated recordings do not have in common as they have the
-            rest: their clocks begin alike, and their ways may be as long as each other. None where an older run did not keep it.
+        first_points: digests of the points of the first scan, by shells of distance: simulated recordings have the rest in common,
+            as their clocks begin alike and their ways may be as long as each other. None where an older run did not keep them.
         way_m: length of the way that was found [m].
         maps: of the points of each local map; a copied folder has the same.
     """
 
     facts: _Facts | None
-    first_points: str | None
+    first_points: tuple[str | None, ...] | None
     way_m: float
     maps: frozenset[bytes]
 
@@ -51,8 +51,10 @@ class RecordingIdentity:
 
     def begins_like(self, other: RecordingIdentity) -> bool:
         """Whether two with the same facts begin with the same points; where one does not know, whether they go equally far."""
-        if self.first_points is not None and other.first_points is not None:
-            return self.first_points == other.first_points
+        shells = zip(self.first_points or (), other.first_points or (), strict=False)
+        told = [own == others for own, others in shells if own is not None and others is not None]
+        if told:
+            return any(told)
         return abs(self.way_m - other.way_m) <= _WAY_M + _WAY_SHARE * max(self.way_m, other.way_m)
 
 

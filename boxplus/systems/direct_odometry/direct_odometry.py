@@ -44,6 +44,7 @@ from boxplus.systems.direct_odometry.window import Window
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
+Found = tuple[int, Alignment | None, Verdict]  # the keyframe's number, the alignment to it, what to think of it
 DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its pose and the logarithm of its gain
 
 _STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -178,11 +179,13 @@ class DirectOdometry:
             return self._begin(time_ns, image, depth_of, watch)
         T_predicted = self._predicted(self._unseen_s(time_ns))
         if self._frames.again and self._moves(image, T_predicted, self._reference):
+            if self._unseen_s(time_ns) > self.config.lost_s:
+                return self._lost(time_ns, image, depth_of, (self._reference.number, None, _AGAIN), watch)
             return self._estimate(time_ns, self._reference.number, False, None, _AGAIN, watch)
-        keyframe, alignment, verdict = tracked = self._track(image, T_predicted)
+        keyframe, alignment, verdict = self._track(image, T_predicted)
         watch.lap("tracking")
         if verdict.status == "lost":
-            return self._lost(time_ns, image, depth_of, tracked, watch)
+            return self._lost(time_ns, image, depth_of, (keyframe.number, alignment, verdict), watch)
         T_camera_keyframe = alignment.T_21
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
@@ -361,7 +364,7 @@ class DirectOdometry:
             self._covariance = self._unseen_covariance(time_ns)
             self._watch.begin_anew(self._unseen_s(time_ns))
 
-    def _lost(self, time_ns: int, image: Image, depth_of: DepthOf, tracked: Tracked, watch: Stopwatch) -> Estimate:
+    def _lost(self, time_ns: int, image: Image, depth_of: DepthOf, found: Found, watch: Stopwatch) -> Estimate:
         """No pose: the last one stays; after a while, begin anew from it."""
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
         if self._unseen_s(time_ns) > self.config.lost_s:
@@ -370,7 +373,8 @@ class DirectOdometry:
             if self._start is None:
                 return self._begin(time_ns, image, depth_of, watch)
             self._start = TwoViewStart(self.camera)
-        return self._estimate(time_ns, tracked.keyframe.number, False, tracked.alignment, tracked.verdict, watch)
+        number, alignment, verdict = found
+        return self._estimate(time_ns, number, False, alignment, verdict, watch)
 
     def _estimate(
         self, time_ns: int, keyframe: int, is_keyframe: bool, alignment: Alignment | None, verdict: Verdict, watch: Stopwatch

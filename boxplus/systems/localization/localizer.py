@@ -144,6 +144,8 @@ class Localizer:
         step = _HERE if self._before is None else se3.compose(se3.inverse(self._before[1]), T_odo)
         if seconds > _JUMP_S:
             self._lose(f"no scan for {seconds:.1f} s", is_contradicted=False)
+        if seconds > _JUMP_S or lost:
+            self.stays.jump()
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
         up = as_floats(up_odo, "up_odo")

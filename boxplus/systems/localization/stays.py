@@ -44,6 +44,10 @@ class Stays:
         """The odometry went so far [m]."""
         self._way += way
 
+    def jump(self) -> None:
+        """The odometry does not know how it moved: where it has the last place says nothing any more."""
+        self._lost = None
+
     def begin(self, time_ns: int, T_map_odo: Floats, T_odo: Floats) -> None:
         """A place is found: T_map_odo (7,), where the odometry is at T_odo (7,)."""
         self.is_confirmed, self._began_ns, self._open = False, time_ns, None

@@ -35,6 +35,10 @@ _MOST = 3.0  # times as far as what is known explains
 _SHORT_S = 1.0  # segments that tell lengths
 _FEWEST_SHORT, _LEAST_LENGTH, _LEAST_SIGMAS = 5, 0.02, 4.0  # of them; a share and standard deviations that contradict
 
+# What a segment's d has to be of its own error, squared, to say something of lengths: that error is in `off` with the other
+# sign, and looks like lengths too short by 3 over this, all of them where nothing moves.
+_LEAST_SHOWN = 300.0
+
 Floats = NDArray[np.float64]
 
 
@@ -95,7 +99,7 @@ class InertialWatch:
         self._long, self._short = _Segments(_SEGMENT_S, down), _Segments(_SHORT_S, down)
         self._squares: deque[float] = deque(maxlen=_SEGMENTS)
         self._off = 0.0
-        self._sums = np.zeros(4)  # of dᵀ S⁻¹ d, dᵀ S⁻¹ o, oᵀ S⁻¹ o and 1, over all short segments
+        self._sums = np.zeros(4)  # of dᵀ S⁻¹ d, dᵀ S⁻¹ o, oᵀ S⁻¹ o and 1, over all short segments that show lengths
 
     @property
     def ratio(self) -> float:
@@ -140,7 +144,8 @@ class InertialWatch:
         short = self._short.add(pose, state, covariance, step)
         if short is not None:
             by_d, by_off = np.linalg.solve(short.S, np.stack([short.d, short.off], axis=1)).T
-            self._sums += [short.d @ by_d, short.d @ by_off, short.off @ by_off, 1.0]
+            if short.d @ by_d > _LEAST_SHOWN:
+                self._sums += [short.d @ by_d, short.d @ by_off, short.off @ by_off, 1.0]
         segment = self._long.add(pose, state, covariance, step)
         if segment is not None:
             self._squares.append(float(segment.off @ np.linalg.solve(segment.S, segment.off)) / 3.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_TURN_RAD_S, _FORCE = 0.1, 0.5  # rad/s; m/s², off from gravity: more than at rest, whatever the biases
+_TURN_RAD_S, _FORCE = 0.1, 0.5  # rad/s; m/s², off from gravity: more than at rest, with the biases of a sensor in order
 _SPEED, _WAY, _TURN_PX = 0.05, 0.01, 0.5  # m/s, m, px: of a motion that is known
 
 Floats = NDArray[np.float64]

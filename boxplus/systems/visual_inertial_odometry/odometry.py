@@ -43,6 +43,7 @@ from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 _START_ITERATIONS = 20
 _OUTLIER = 4.0  # standard deviations
 REPEATED = "images that are the one before, while the IMU moved"
+_LONGEST_STALL_NS = 3_000_000_000  # that images which come again are left out
 _GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
 
 
@@ -194,9 +195,13 @@ class VisualInertialOdometry:
         return estimates
 
     def _new_ones(self, time_ns: int, images: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
-        """Images but those that are the ones before, although the IMU moved meanwhile."""
+        """Images but those that are the ones before, although the IMU moved meanwhile.
+
+        No longer than a few seconds: what the IMU says of the motion is worth little then, and a source without noise may have
+        come to rest.
+        """
         repeated = self._repeated.among(images)
-        if repeated and self._moves(time_ns):
+        if repeated and time_ns - self._time_ns < _LONGEST_STALL_NS and self._moves(time_ns):
             self._counters[REPEATED] += len(repeated)
             images = {camera: image for camera, image in images.items() if camera not in repeated}
         self._repeated.keep(images)

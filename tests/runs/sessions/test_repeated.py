@@ -22,7 +22,7 @@ def identity(
     topic: str = "points",
     seed: int = 0,
     count: int = 200,
-    first_points: str | None = None,
+    first_points: tuple[str | None, ...] | None = None,
 ) -> RecordingIdentity:
     recording = RecordingFacts(
         path="a.bag", format="ros1", lidar_topic=topic, imu_topic="imu", duration_s=20.0, messages=4200, first_points=first_points
@@ -48,10 +48,10 @@ def test_simulated_recordings_with_the_same_times_went_other_ways() -> None:
 
 
 def test_simulated_recordings_with_the_same_times_and_ways_as_long_begin_with_other_points() -> None:
-    runs = {"first": identity(seed=1, first_points="a"), "second": identity(seed=2, first_points="b")}
+    runs = {"first": identity(seed=1, first_points=("a", None, "c")), "second": identity(seed=2, first_points=("b", None, "d"))}
     assert not repeated(runs)
-    assert repeated(runs | {"again": identity(50.6, seed=3, first_points="a")}) == {"again": "first"}
-    assert repeated(runs | {"longer": identity(70.0, seed=3, first_points="b")}) == {"longer": "second"}
+    assert repeated(runs | {"again": identity(50.6, seed=3, first_points=("a", None, "c"))}) == {"again": "first"}
+    assert repeated(runs | {"longer": identity(70.0, seed=3, first_points=("b", None, "d"))}) == {"longer": "second"}
 
 
 def test_two_lidars_of_one_recording_are_two() -> None:

@@ -68,6 +68,17 @@ def test_an_image_that_comes_again_in_motion_is_no_standstill(drives: list[Drive
     assert degrees < 0.4 and metres < 0.02
 
 
+def test_a_camera_that_stops_for_good_is_followed_again_and_doubted(drives: list[Drive]) -> None:
+    """Nothing tells a source without noise that stops between two images from one that stalls: after `lost_s` it begins anew."""
+    seen, odometry, estimates = drives[0], DirectOdometry(CAMERA), []
+    for k in range(60):
+        i = min(k, 9)
+        estimates.append(odometry.push_rgbd(int(seen.time_ns[0]) + k * 33_000_000, seen.grey[i], seen.depth[i]))
+    last_lost = max(k for k, e in enumerate(estimates) if e.status == "lost")
+    assert 30 < last_lost < 45 and odometry.gaps == 1
+    assert all(e.status == "weak" and e.reasons for e in estimates[last_lost + 1 :])
+
+
 def test_equal_images_at_rest_are_believed(drives: list[Drive]) -> None:
     odometry, seen = DirectOdometry(CAMERA), drives[0]
     estimates = [odometry.push_rgbd(k * 33_000_000, seen.grey[0], seen.depth[0]) for k in range(6)]

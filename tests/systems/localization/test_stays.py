@@ -56,3 +56,10 @@ def test_where_scans_were_missing_the_odometry_says_nothing() -> None:
     stays = lost(is_contradicted=False)
     stays.begin(9_000_000_000, shifted(50.0), ODOMETRY)
     assert stays.doubt is None
+
+
+def test_where_the_odometry_was_lost_after_the_place_it_says_nothing() -> None:
+    stays = lost(is_contradicted=True, is_confirmed=True)
+    stays.jump()
+    stays.begin(9_000_000_000, shifted(3.0), ODOMETRY)
+    assert stays.doubt is None

@@ -62,6 +62,21 @@ def test_a_few_per_cent_of_length_are_measured_and_named() -> None:
     assert all(watch.contradiction is None and abs(watch.length[0]) < 3.0 * watch.length[1] for watch in sound)
 
 
+@pytest.mark.parametrize(("shaking", "bias"), [(0.05, 0.0), (0.05, 0.006), (0.2, 0.0)])
+def test_standing_still_for_minutes_says_nothing_of_lengths(shaking: float, bias: float) -> None:
+    """What the IMU errs by is all of what it measures there; shaking [m/s²] a sample, as of an engine that idles."""
+    rng, watch, seconds = np.random.default_rng(4), InertialWatch(9.81), 120
+    time_ns = np.arange(200 * seconds + 1) * 5_000_000
+    gyro = 0.002 * rng.normal(size=(len(time_ns), 3))
+    accel = np.array([bias, 0.0, 9.81]) + shaking * rng.normal(size=(len(time_ns), 3))
+    covariance = np.diag(np.repeat([5e-4, 0.005, 0.002, 2e-4, 5e-3], 3) ** 2)
+    for first in range(0, len(time_ns) - 20, 20):
+        ends = time_ns[[first, first + 20]]
+        step = Preintegration.integrate(time_ns, gyro, accel, noise=NOISE, intervals_ns=[ends])
+        watch.add(np.array([1.0, *np.zeros(6)]), np.zeros(9), covariance, step)
+        assert watch.contradiction is None
+
+
 def test_little_time_and_silence_say_nothing() -> None:
     watch = InertialWatch(9.81)
     assert watch.ratio == 0.0 and watch.contradiction is None
