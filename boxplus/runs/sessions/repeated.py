@@ -24,7 +24,7 @@ class RecordingIdentity:
 
     Attributes:
         facts: topic, number of messages, length [s] and time of the last scan [ns]; None where the run does not know them.
-        first_points: digests of the points of the first scan, by shells of distance: simulated recordings have the rest in common,
+        first_points: digests of the points of the first scan, by shells of distance: simulated ones have the rest in common,
             as their clocks begin alike and their ways may be as long as each other. None where an older run did not keep them.
         way_m: length of the way that was found [m].
         maps: of the points of each local map; a copied folder has the same.
