@@ -11,6 +11,10 @@ rotation and translation nor on the number of points. In a weak direction the up
 its prediction. (Errors in variables: Fuller, Measurement Error Models, 1987, section 2.2; for degeneracy of a registration by
 eigenvalues see Zhang, Kaess, Singh, ICRA 2016.)
 
+In the others noise still has its share. A shift moves the residuals by what the true normals see of it, S − N, while the share N
+stays with the sensor wherever it is: the step −S⁻¹b reaches 1 − 1/λ of the shift, scan after scan, and claims too much.
+What the points say of the shift is −(S − N)⁻¹b with the covariance (S − N)⁻¹ S (S − N)⁻¹, and that is what is taken in.
+
 A plane counts in both the less, the less its normal is known (`plane_information`): planes across an edge are as good as
 noise for the question, and would hide how well the others measure.
 """
@@ -54,11 +58,17 @@ class PoseDirections:
 
         At 0 this is the projector Π = V_s V_sᵀ N onto the others, which are conjugate to the weak ones in N.
         """
-        if not self.weak.any():
-            return np.eye(6)
-        # The inverse of V is Vᵀ N.
-        left: NDArray[np.float64] = (self.basis * np.where(self.weak, weight, 1.0)) @ np.linalg.inv(self.basis)
+        return self.scaled(np.where(self.weak, weight, 1.0)) if self.weak.any() else np.eye(6)
+
+    def scaled(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6, 6) what becomes of a small motion [θ, p] when its part along each direction counts by its share (6,)."""
+        left: NDArray[np.float64] = (self.basis * shares) @ np.linalg.inv(self.basis)  # the inverse of V is Vᵀ N
         return left
+
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """(6,) of what the scan says along each direction, the share that noise of the normals has not made; 0 where weak."""
+        return np.where(self.weak, 0.0, 1.0 - 1.0 / np.maximum(self.ratios, 1.0))
 
     def closest_to(self, axis: NDArray[np.float64]) -> int:
         """The direction closest to a shift along a unit `axis` (3,)."""
@@ -139,18 +149,17 @@ def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> Pos
     return replace(directions, weak=weak)
 
 
-def project_out_weak(
+def without_noise(
     A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A and b without what they claim about the weak directions of the pose; what they say of the others stays whole.
+    """A and b without what noise of the normals claims about the pose: nothing along weak directions, its share along the others.
 
-    With the projector Π of `PoseDirections.weakened`: ΠᵀAΠ, Πᵀb.
+    With D = V diag(1 − 1/λ) Vᵀ N, zero for the weak ones: DᵀAD, Dᵀb. For the pose alone this is (S − N) S⁻¹ (S − N) and
+    (S − N) S⁻¹ b, whose step is −(S − N)⁻¹ b.
     """
-    if not directions.weak.any():
-        return A, b
-    projector = np.eye(12)
-    projector[:6, :6] = directions.weakened()
-    return projector.T @ A @ projector, projector.T @ b
+    share = np.eye(12)
+    share[:6, :6] = directions.scaled(directions.measured)
+    return share.T @ A @ share, share.T @ b
 
 
 def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:

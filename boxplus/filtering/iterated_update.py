@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, project_out_weak
+from boxplus.filtering.degeneracy import PoseDirections, without_noise
 from boxplus.filtering.nav_state import TANGENT, boxplus_into
 from boxplus.filtering.update_step import map_step, move_covariance
 
@@ -56,7 +56,7 @@ class Posterior:
     Attributes:
         x: (36,) packed state; cov: (24, 24) its covariance. Both are the prior's where `valid` is false.
         valid: false when fewer parts than wanted took part, or a matrix was not positive definite.
-        A: (12, 12) the information that was taken in, without the weak directions.
+        A: (12, 12) the information that was taken in, without the share of noise.
         last: what the measurement said at the last iterate.
         steps: Gauss-Newton steps taken.
         converged: whether the last one was below 10⁻³ rad and m in every component.
@@ -99,7 +99,7 @@ def iterated_update(
     steps = 0
     while True:
         information = measurement.at(x, rematch=rematch)
-        A, b = project_out_weak(information.A, information.b, information.directions)
+        A, b = without_noise(information.A, information.b, information.directions)
         if information.used < min_used or not map_step(x, x_prior, cov_prior, A, b, delta, cov):
             return Posterior(x_prior.copy(), cov_prior.copy(), False, np.zeros_like(A), information, steps, converged)
         boxplus_into(x, delta, x)

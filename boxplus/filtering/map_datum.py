@@ -14,6 +14,11 @@ of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has th
 Points that lie on one surface share what is wrong with it, and say less than as many independent ones would: v and n can be
 counted several times for that.
 
+The filter's own covariance needs the second equation, too. It follows the pose against the local map, and that moves with every
+scan by f (e + n − d): along directions that scans hardly measure, a map of new points creeps aside by centimetres, and a filter
+that takes it for fixed reads the creeping as velocity and, seconds later, as biases and gravity. What a scan places anew is off
+by its own noise at least: f A⁻¹ is added to the pose's covariance before the next one (`creep`).
+
 What two poses share is in neither of them against the other. Both equations stay as they are when the same motion is taken off e
 and d: with the error e₀ of an earlier pose off both, they give the covariance of e − e₀, beginning with 0 and d − e₀.
 
@@ -104,6 +109,7 @@ class MapDatum:
         self._joint[_FIRST, _POSE, _POSE] = self._filter
         self._p_world_imu = x[P : P + 3].copy()
         self._R_world_imu = x[R : R + 9].reshape(3, 3).copy()
+        self._alone = _NOTHING
         self._local_points = 0.0
         self._new_share = 0.0
 
@@ -135,6 +141,7 @@ class MapDatum:
         _follow(
             x, cov_prior, cov, gain, noise, alone, self._shared, brought, self._p_world_imu, self._filter, self._joint
         )  # fmt: skip
+        self._alone = alone
         if correction is not None:
             self._new_share = 0.0
 
@@ -146,6 +153,14 @@ class MapDatum:
         step[_MAP, _MAP] *= 1.0 - self._new_share
         step[_MAP, _POSE] = self._new_share * np.eye(6)
         self._joint = step @ self._joint @ step.T
+
+    def creep(self, cov: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+        """Widen the filter's `cov` (n, n), in place, by how the last scan has moved the local map against the pose at x (36,).
+
+        Call it after `insert`, with the covariance that goes on to the next scan.
+        """
+        cov[_POSE, _POSE] += self._shared * self._new_share * self._alone
+        self._filter = _along_world(cov[_POSE, _POSE], x)
 
     def widen(self, excess: NDArray[np.float64], x: NDArray[np.float64]) -> None:
         """An error of covariance (6, 6), [θ about the IMU's axes, p along the world's], that pose and map share at x (36,)."""

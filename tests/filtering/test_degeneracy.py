@@ -5,12 +5,14 @@ Derivation: docs/lidar_inertial_odometry.md, section 7.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.filtering.degeneracy import pose_directions, project_out_weak, strong_step, with_weak_axis
+from boxplus.filtering.degeneracy import pose_directions, strong_step, with_weak_axis, without_noise
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.update_step import map_step
 from tests.filtering.random_states import random_covariance, random_state
@@ -137,7 +139,7 @@ def test_ratios_depend_neither_on_the_weight_of_the_points_nor_on_the_unit_of_th
 def test_no_information_is_weak_everywhere() -> None:
     directions = pose_directions(np.zeros((6, 6)), np.zeros((6, 6)), LEVER_ARM, THRESHOLD)
     assert directions.weak.all()
-    A, b = project_out_weak(np.eye(12), np.ones(12), directions)
+    A, b = without_noise(np.eye(12), np.ones(12), directions)
     assert not A[:6].any()
     assert not b[:6].any()
     assert not strong_step(np.eye(12), np.ones(12), directions).any()
@@ -151,27 +153,72 @@ def test_exact_normals_still_have_a_weak_direction() -> None:
 
 
 @given(seeds)
-def test_without_a_weak_direction_nothing_is_changed(seed: int) -> None:
+def test_normals_without_noise_keep_all_they_say(seed: int) -> None:
     random = np.random.default_rng(seed)
     A, b = random_covariance(random, 12), random.normal(size=12)
     directions = pose_directions(A[:6, :6], np.eye(6), 1.0, 0.0)
-    projected = project_out_weak(A, b, directions)
-    assert projected[0] is A
-    assert projected[1] is b
+    left, pulled = without_noise(A, b, replace(directions, ratios=np.full(6, np.inf)))
+    np.testing.assert_allclose(left, A, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(pulled, b, rtol=1e-6, atol=1e-9)
     assert np.allclose(strong_step(A, b, directions), -np.linalg.solve(A[:6, :6], b[:6]), rtol=1e-6)
 
 
 @given(seeds)
-def test_what_is_projected_out_takes_nothing_from_the_other_directions(seed: int) -> None:
+def test_what_noise_has_made_is_left_out_direction_by_direction(seed: int) -> None:
     random = np.random.default_rng(seed)
     A, b = random_covariance(random, 12), random.normal(size=12)
-    directions = pose_directions(A[:6, :6], random_covariance(random, 6), 3.0, 0.0)
-    directions = pose_directions(A[:6, :6], random_covariance(random, 6), 3.0, float(directions.ratios[2:4].mean()))
-    left, pulled = project_out_weak(A, b, directions)
-    V = directions.basis
-    expected = np.where(directions.weak, 0.0, directions.ratios)
-    assert np.allclose(V.T @ left[:6, :6] @ V, np.diag(expected), atol=1e-6 * directions.ratios.max())
-    assert np.allclose(V.T @ pulled[:6], np.where(directions.weak, 0.0, V.T @ b[:6]), atol=1e-7 * np.abs(V.T @ b[:6]).max())
+    N = random_covariance(random, 6)
+    directions = pose_directions(A[:6, :6], N, 3.0, 0.0)
+    directions = pose_directions(A[:6, :6], N, 3.0, float(directions.ratios[2:4].mean()))
+    left, pulled = without_noise(A, b, directions)
+    V, ratios = directions.basis, directions.ratios
+    share = np.where(directions.weak | (ratios < 1.0), 0.0, 1.0 - 1.0 / ratios)
+    assert np.allclose(V.T @ left[:6, :6] @ V, np.diag(share**2 * ratios), atol=1e-6 * ratios.max())
+    assert np.allclose(V.T @ pulled[:6], share * (V.T @ b[:6]), atol=1e-7 * np.abs(V.T @ b[:6]).max())
+
+
+@given(seeds)
+def test_the_step_is_the_one_of_errors_in_variables(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    true, N, b = np.eye(6), np.eye(6), np.zeros(12)
+    for M in (true, N):
+        h = random.normal(size=(30, 6))
+        M += h.T @ h
+    b[:6] = random.normal(size=6)
+    A = np.zeros((12, 12))
+    A[:6, :6] = true + N
+    directions = replace(pose_directions(A[:6, :6], N, 1.0, 0.0), weak=np.zeros(6, dtype=bool))
+    left, pulled = without_noise(A, b, directions)
+    # N is widened by what no normal is better than, a milliradian.
+    np.testing.assert_allclose(left[:6, :6], true @ np.linalg.solve(A[:6, :6], true), rtol=1e-3, atol=1e-3 * true.max())
+    np.testing.assert_allclose(np.linalg.solve(left[:6, :6], pulled[:6]), np.linalg.solve(true, b[:6]), rtol=1e-3, atol=1e-4)
+
+
+def test_a_shift_along_a_tube_with_a_few_bars_across_is_measured_whole() -> None:
+    """Noise of the walls' normals does not see the shift: it must neither hold the estimate back nor make it surer than it is."""
+    random, shift, axis = np.random.default_rng(5), 0.05, np.array([1.0, 0.0, 0.0])
+    plain, steps, variances, ratios = [], [], [], []
+    for seed in range(300):
+        _, normals, p_imu = _tube(seed, axis, 400)
+        normals[:6] = axis
+        x = NavState.identity()
+        noisy = _tilted(random, normals, 0.1)
+        z = -normals @ (shift * axis) + 0.01 * random.normal(size=len(normals))
+        A, b = _information(x, noisy, p_imu, z)
+        directions = pose_directions(A[:6, :6], _noise(x, noisy, p_imu, 0.1), LEVER_ARM, 1.3)
+        if directions.weak.any():
+            continue
+        left, pulled = without_noise(A, b, directions)
+        covariance = np.linalg.inv(left[:6, :6])
+        plain.append(strong_step(A, b, directions)[3])
+        steps.append(-(covariance @ pulled[:6])[3])
+        variances.append(covariance[3, 3])
+        ratios.append(directions.ratios[0])
+    assert len(ratios) > 250
+    assert 2.0 < np.median(ratios) < 4.0
+    assert np.mean(plain) < 0.75 * shift
+    assert np.mean(steps) == pytest.approx(shift, rel=0.1)
+    assert np.std(steps) == pytest.approx(np.sqrt(np.mean(variances)), rel=0.3)
 
 
 @settings(max_examples=30)
@@ -190,14 +237,15 @@ def test_the_update_leaves_the_axis_of_a_noisy_tube_alone(seed: int) -> None:
     prior[:6, :6] = V @ V.T
     delta, cov = np.zeros(TANGENT), np.zeros((TANGENT, TANGENT))
     packed = x.pack()
-    assert map_step(packed, packed, prior, *project_out_weak(A, b, directions), delta, cov)
+    assert map_step(packed, packed, prior, *without_noise(A, b, directions), delta, cov)
     along = np.linalg.solve(V, delta[:6])  # in units of the prior
     weak, strong = directions.weak, ~directions.weak
     assert np.allclose(along[weak], 0, atol=1e-6)
     variances = np.linalg.solve(V, np.linalg.solve(V, cov[:6, :6]).T)
     assert np.allclose(variances[np.ix_(weak, weak)], 1.0)
     # In the strong directions it is the update by what they measure, and nothing else.
-    expected = -(V.T @ b[:6])[strong] / (1.0 + directions.ratios[strong])
+    share = 1.0 - 1.0 / directions.ratios[strong]
+    expected = -share * (V.T @ b[:6])[strong] / (1.0 + share**2 * directions.ratios[strong])
     assert np.abs(expected).max() > 1e-3
     assert np.allclose(along[strong], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
@@ -241,5 +289,5 @@ def test_an_axis_can_be_called_weak_whatever_its_ratio(seed: int) -> None:
     A = np.zeros((12, 12))
     A[:6, :6] = S
     along = np.r_[forced.basis[:, closest], np.zeros(6)]
-    kept, _ = project_out_weak(A, np.zeros(12), forced)
+    kept, _ = without_noise(A, np.zeros(12), forced)
     assert along @ kept @ along < 1e-9 * (along @ A @ along)

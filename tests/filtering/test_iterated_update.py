@@ -23,8 +23,8 @@ IN_TANGENT = [3, 4, 5, 21, 22, 23]
 
 
 def _directions(weak: np.ndarray | None = None) -> PoseDirections:
-    """The axes of the pose, of which some are weak."""
-    return PoseDirections(np.ones(6), np.eye(6), 1.0, np.zeros(6, bool) if weak is None else weak, np.eye(6))
+    """The axes of the pose, of which some are weak, and none has noise."""
+    return PoseDirections(np.full(6, np.inf), np.eye(6), 1.0, np.zeros(6, bool) if weak is None else weak, np.eye(6))
 
 
 @dataclass

@@ -174,6 +174,32 @@ def test_what_all_poses_share_is_not_between_two(seed: int, step: float, turn: f
     assert (np.linalg.eigvalsh(between[0]) > 0.0).all()
 
 
+@pytest.mark.parametrize("creeps", [False, True])
+def test_a_filter_that_knows_that_its_map_creeps_knows_where_it_is_on_it(creeps: bool) -> None:
+    """Sampled errors of the pose against the local map, for a filter that takes it for fixed and one that does not."""
+    random, runs = np.random.default_rng(3), 20000
+    x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
+    datum = MapDatum(x, cov)
+    e, d = 1e-4 * random.normal(size=(runs, 6)), np.zeros((runs, 6))
+    A, too_sure = _information(random), []
+    noise = np.linalg.cholesky(np.linalg.inv(A[:6, :6]))
+    datum.insert(100)
+    for k in range(1, 9):
+        cov_prior = cov + 1e-9 * np.eye(24)
+        cov = _updated(cov_prior, A)
+        datum.follow(x, cov_prior, cov, Correction.of(cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0), ALL_AROUND))
+        G = cov[:6, :6] @ A[:6, :6]
+        w = 10**-4.5 * random.normal(size=(runs, 6))
+        e = (e + w) @ (np.eye(6) - G).T + (d + random.normal(size=(runs, 6)) @ noise.T) @ G.T
+        datum.insert(100)
+        new = 1.0 / (k + 1)
+        d = (1.0 - new) * d + new * e + np.sqrt(new) * random.normal(size=(runs, 6)) @ noise.T
+        if creeps:
+            datum.creep(cov, x)
+        too_sure.append(np.linalg.eigvals(np.linalg.solve(cov[:6, :6], np.cov((e - d).T))).real.max())
+    assert (max(too_sure) < 1.05) == creeps
+
+
 @pytest.mark.parametrize(("facing", "turned_away"), [(0.0, 0.0), (0.8, 0.4)])  # 0.3 rad × 0.8 over a spread of 0.6
 def test_sampled_errors_between_two_poses_spread_as_it_says(facing: float, turned_away: float) -> None:
     """Errors drawn through the equations of `map_datum` on a way that turns, the error of the marked pose moved along."""

@@ -353,6 +353,7 @@ class LidarInertialOdometry(Snapshots):
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
         self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
+        self._datum.creep(self._cov, self._x)
         if self._mounting_drift is not None:
             self._mounting_drift.insert(self._datum.new_share)
 

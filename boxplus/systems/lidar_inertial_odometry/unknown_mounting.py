@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import project_out_weak
+from boxplus.filtering.degeneracy import without_noise
 from boxplus.filtering.iterated_update import Information, Measurement
 from boxplus.filtering.nav_state import PL, RL, T_G, T_P, T_THETA, T_THETA_L, TANGENT, G, P, R
 from boxplus.manifolds import so3
@@ -145,7 +145,7 @@ def moved_sensitivity(B: NDArray[np.float64], cov: NDArray[np.float64], informat
         B: before it; cov: (24, 24) after it, with the mounting known.
         information: what the scan says of pose and mounting.
     """
-    A, _ = project_out_weak(information.A, information.b, information.directions)
+    A, _ = without_noise(information.A, information.b, information.directions)
     moved: NDArray[np.float64] = B - cov[_REST, _POSE] @ (A[:6, :6] @ B[_POSE] + A[:6, 6:])
     return moved
 
