@@ -57,8 +57,8 @@ def alignment_doubts(
     mean = so3.log(_mean_rotation(R)[None])[0]
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
-    told = max(_CONSTANT_DEG, _LOOSE * _loose_deg(alignment, rmse, wide))
-    if constant > told and scatter < min(0.5 * constant, _FAR_DEG) and not (undetermined or about_line):
+    loose = _loose(association.ground_truth, alignment, rmse, wide)
+    if _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
             f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
@@ -68,15 +68,32 @@ def alignment_doubts(
     return doubts
 
 
-def _loose_deg(alignment: Alignment, rmse: float, wide: float) -> float:
-    """Rotation that an alignment by positions may be off by where they are off by `rmse`, as drift is [degrees].
+def _loose(truth: Trajectory, alignment: Alignment, rmse: float, wide: float) -> NDArray[np.float64]:
+    """Rotation that an alignment by positions may be off by where they are off by `rmse`, as drift is.
+
+    About every principal axis of the path it is that error over the spread around the axis: on a straight way much about the way
+    and little about all else.
 
     Args:
         wide: how far the path spreads horizontally [m].
+
+    Returns:
+        (3, 3) whose columns are what that does to the mean rotation between the bodies, in the body's frame [rad].
     """
     if alignment.kind in ("none", "origin"):
-        return 0.0
-    return float(np.degrees(rmse / max(wide if alignment.kind == "yaw" else alignment.spread_m[1], 1e-12)))
+        return np.zeros((3, 3))
+    if alignment.kind == "yaw":
+        axes, around = np.eye(3), np.array([np.inf, np.inf, wide])
+    else:
+        axes = np.linalg.svd(truth.p - truth.p.mean(axis=0), full_matrices=True)[2].T
+        around = np.array([np.hypot(*np.delete(alignment.spread_m, axis)) for axis in range(3)])
+    return np.asarray(truth.R.mean(axis=0).T @ axes * (rmse / np.maximum(around, 1e-12)))
+
+
+def _is_beyond(mean: NDArray[np.float64], loose: NDArray[np.float64]) -> bool:
+    """Whether a mean rotation (3,) is more than what is told and the alignment explain together [rad]."""
+    least = np.radians(_CONSTANT_DEG) / _LOOSE
+    return float(mean @ np.linalg.solve(loose @ loose.T + least**2 * np.eye(3), mean)) > _LOOSE**2
 
 
 def reading_doubts(association: Association, alignment: Alignment, translation: NDArray[np.float64]) -> list[str]:

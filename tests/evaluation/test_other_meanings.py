@@ -77,3 +77,36 @@ def test_another_point_of_the_body_is_told(alignment):
     (text,) = (text for text in result.warnings if "another point of the body" in text)
     numbers = np.array(text.split("(")[1].split(")")[0].split(","), dtype=float)
     np.testing.assert_allclose(numbers, -point, atol=0.05)
+
+
+def _drive(seed: int, turned: np.ndarray) -> tuple[Trajectory, Trajectory]:
+    """A minute on a nearly straight way, and an estimate in another world that drifts, of a body turned by a rotation vector."""
+    rng = np.random.default_rng(seed)
+    t, none = 0.1 * np.arange(600), np.zeros(600)
+    yaw = 0.01 * np.sin(0.1 * t + rng.uniform(0.0, 6.0))
+    p = np.cumsum(np.stack([np.cos(yaw), np.sin(yaw), 0.003 * np.cos(0.2 * t)], 1), axis=0)
+    R = so3.exp(np.stack([none, none, yaw], 1)) @ so3.exp(0.01 * np.sin(np.outer(t, [1.1, 1.7, 0.0])))
+    stamps = (1_700_000_000_000_000_000 + np.round(1e9 * t)).astype(np.int64)
+    drift = np.cumsum(0.01 * rng.standard_normal(p.shape), axis=0)
+    world, body = so3.exp(rng.normal(size=(1, 3)))[0], so3.exp(turned[None])[0]
+    orientations = world @ R @ so3.exp(0.005 * rng.standard_normal(p.shape)) @ body
+    estimate = Trajectory(stamps, (p + drift) @ world.T, quaternion.from_matrix(orientations))
+    return estimate, Trajectory(stamps, p, quaternion.from_matrix(R))
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+@pytest.mark.parametrize("axis", [1, 2])
+def test_another_body_frame_is_told_on_a_straight_way_about_every_axis_that_it_shows(axis, alignment):
+    for seed in range(6):
+        turned = np.radians(10.0) * np.eye(3)[axis]
+        told = [text for text in evaluate(*_drive(seed, turned), alignment=alignment).warnings if "body frames" in text]
+        assert len(told) == 1
+
+
+def test_no_other_body_frame_is_told_on_a_straight_way_where_there_is_none():
+    wrong = 0.0
+    for seed in range(20):
+        result = evaluate(*_drive(seed, np.zeros(3)))
+        wrong = max(wrong, float(result.rotation_error_deg.mean()))
+        assert not any("body frames" in text for text in result.warnings)
+    assert wrong > 2.0  # about the way, which such a path leaves open
