@@ -38,7 +38,7 @@ class Association:
         outside: poses of the estimate before the first or after the last pose of the ground truth.
         overlap_s: duration that both cover [s].
         gaps: (start, end) of stretches without matches within the overlap, in seconds after its start.
-        time_offset: the clock offset that the motions suggest, or None where they do not tell.
+        time_offset: the clock offset that the motions suggest, or None where they do not tell any.
     """
 
     estimate: Trajectory
@@ -87,13 +87,14 @@ class Association:
         else:
             lines.append("no gaps")
         applied = f" (after the {self.offset_s:+.6f} s that were asked for)" if self.offset_s else ""
-        if self.time_offset is None:
-            lines.append(f"clock offset: the motion does not tell{applied}")
+        found = self.time_offset
+        if found is None:
+            lines.append(f"clock offset: the motion does not tell, none would show{applied}")
         else:
+            silent = "" if found.shows else f"none shows, and none up to {found.least_s:.3g} s would; "
             lines.append(
-                f"clock offset: the motions fit best with {round(self.time_offset.offset_s, 3) + 0.0:+.3f} s added to the "
-                f"estimate's stamps, "
-                f"correlation {self.time_offset.correlation:.3f}{applied}"
+                f"clock offset: {silent}the motions fit best with {found} added to the estimate's stamps, correlation "
+                f"{found.correlation:.3f}{applied}"
             )
         return lines
 

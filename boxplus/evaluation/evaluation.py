@@ -36,8 +36,8 @@ _KINDS = {
 }
 _NAMED_TRUTH = re.compile(r"(^|[^a-z])(gt|ground_?-?truth|truth)([^a-z]|$)", re.IGNORECASE)
 _NAMES_OF_RUNS = ("trajectory.tum", "trajectory.csv", "trajectory.kitti.txt")
-_NOTICED_OFFSET_S = 0.02  # between clocks; less is not worth a word
-_SURE, _OF_INTERVAL = 2.0, 0.2  # of its standard deviations, and of the longer interval between poses, that an offset has to be
+# Between clocks, and of the longer interval between poses; less is worth a word only where it makes the errors far smaller.
+_NOTICED_OFFSET_S, _OF_INTERVAL = 0.02, 0.2
 _FAR_BETTER = 0.8  # times the error of now, from which on an offset is told whatever motions say; as much worse refutes it
 _BETTER = 0.99  # times the error of now, what an offset has to reach to be advised
 
@@ -221,7 +221,7 @@ def evaluate(
     warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
     noticed = association.time_offset
-    if noticed is not None and abs(noticed.offset_s) > _NOTICED_OFFSET_S:
+    if noticed is not None and (abs(noticed.offset_s) > _NOTICED_OFFSET_S or noticed.shows):
         rmse_with = None
         with suppress(InputError):
             other = matches(association.offset_s + noticed.offset_s)
@@ -323,16 +323,14 @@ def _is_of_sparse_truth(association: Association, ground_truth: Trajectory) -> b
 
 
 def _is_told(found: TimeOffset, estimate: Trajectory, ground_truth: Trajectory) -> bool:
-    """Whether motions know an offset well enough not to have come by it by noise, or between poses."""
+    """Whether an offset is worth a word even if the errors hardly change with it."""
     interval_s = max(float(np.median(np.diff(poses.times))) * 1e-9 for poses in (estimate, ground_truth))
-    return abs(found.offset_s) > max(_SURE * found.deviation_s, _OF_INTERVAL * interval_s)
+    return found.shows and abs(found.offset_s) > max(_NOTICED_OFFSET_S, _OF_INTERVAL * interval_s)
 
 
 def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:
     """An offset is advised only where the errors do get smaller with it."""
-    motions = (
-        f"the motions fit best with {found.offset_s:+.3f} s added to the estimate's stamps (correlation {found.correlation:.3f})"
-    )
+    motions = f"the motions fit best with {found} added to the estimate's stamps (correlation {found.correlation:.3f})"
     if rmse_with is None:
         return f"{motions}, but the poses cannot be compared with that: no offset is advised"
     if rmse_with < _BETTER * rmse:

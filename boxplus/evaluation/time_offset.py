@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.evaluation.clock_fit import MotionPair
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
 _LEAST_OVERLAP_S = 5.0
 _NEAR, _FAR = (2.0, 0.8), (60.0, 0.9)  # largest offset [s] and the correlation it takes; far ones have more to choose from
 _MOST_SAMPLES = 60_000
+_AROUND_S = 0.5  # of what correlation or a scan found, within which the offset is refined
+_ALIKE = 0.95  # correlation of the places as a whole, from which on an offset is looked for that speeds do not tell
+_SURE = 3.0  # of its standard deviations, that an offset has to be to show
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +27,8 @@ class TimeOffset:
     Attributes:
         offset_s: to be added to the stamps of the estimate [s].
         correlation: normalised correlation of the two motions at that offset, at most 1.
-        signal: `rotation` or `translation`: which speed was compared.
-        deviation_s: standard deviation of the offset, where what does not correlate is noise [s].
+        signal: `rotation` or `translation`: which motion tells it.
+        deviation_s: standard deviation of the offset, as it scatters over the stretches of the path [s].
     """
 
     offset_s: float
@@ -32,26 +36,63 @@ class TimeOffset:
     signal: str
     deviation_s: float
 
+    @property
+    def least_s(self) -> float:
+        """What an offset has to exceed to show: three standard deviations [s]."""
+        return _SURE * self.deviation_s
+
+    @property
+    def shows(self) -> bool:
+        """Whether the motions know it well enough not to have come by it by noise."""
+        return abs(self.offset_s) > self.least_s
+
+    def __str__(self) -> str:
+        digits = 3 if self.deviation_s >= 0.001 else 4
+        return f"{round(self.offset_s, digits) + 0.0:+.{digits}f} ± {self.deviation_s:.{digits}f} s"
+
 
 def estimate_time_offset(
     t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
 ) -> TimeOffset | None:
-    """Correlate the speeds of both trajectories within ±2 s, and where nothing fits there, within ±60 s.
+    """Correlate the speeds of both trajectories within ±2 s, and where nothing fits there, within ±60 s; then refine.
 
     Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation
-    not on their scale. The signal that knows the offset better counts.
+    not on their scale. Where slow motion leaves nothing to correlate, but the places are alike, the offset within ±2 s is taken
+    whose places fit best. From there a regression on the velocities, stretch by stretch, finds offset and deviation. The signal
+    that knows the offset better counts.
 
     Args:
         t_estimate, t_ground_truth: (N,) int64 stamps to use [ns], in the place of the trajectories' own.
         estimate, ground_truth: the trajectories.
 
     Returns:
-        None where the trajectories overlap for less than 5 s, or no offset gives a correlation of 0.8 (beyond 2 s
-        0.9) inside the range; that is a quarter of the overlap at most.
+        None where the trajectories overlap for less than 5 s, or their motions do not tell an offset: none gives a correlation of
+        0.8 (beyond 2 s 0.9) inside the range, that is a quarter of the overlap at most, and places neither.
     """
     begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
     if float(end - begin) * 1e-9 < _LEAST_OVERLAP_S or min(len(estimate), len(ground_truth)) < 20:
         return None
+    coarse = _correlated(t_estimate, estimate, t_ground_truth, ground_truth)
+    pair = MotionPair(t_estimate, estimate, t_ground_truth, ground_truth)
+    if coarse is not None:
+        start = coarse.offset_s
+    else:
+        start = pair.scan("translation", min(_NEAR[0], 0.25e-9 * float(end - begin)))
+        if not pair.are_alike(start, _ALIKE):
+            return None
+    fits = [fit for signal in pair.signals if (fit := pair.fit(signal, start, _AROUND_S)) is not None]
+    if not fits:
+        return coarse
+    best = min(fits, key=lambda fit: fit.deviation_s)
+    correlation = best.correlation if coarse is None else coarse.correlation
+    return TimeOffset(best.offset_s, correlation, best.signal, best.deviation_s)
+
+
+def _correlated(
+    t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
+) -> TimeOffset | None:
+    """The offset at which the speeds correlate best, where they do, with the deviation that white noise would leave it."""
+    begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
     step = max(
         float(np.median(np.diff(t_ground_truth))), 0.2 * float(np.median(np.diff(t_estimate))), float(end - begin) / _MOST_SAMPLES
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
 from boxplus.evaluation.association import associate
@@ -102,6 +103,51 @@ def test_motions_that_do_not_tell_give_no_offset() -> None:
     assert associate(straight, straight).time_offset is None
     other = SmoothPath(5).sample(t, 0)
     assert associate(SmoothPath(6).sample(t, 0), other).time_offset is None
+
+
+def wandering(seed: int, speed: float, late_s: float = 0.0, noise_m: float = 0.01) -> tuple[Trajectory, Trajectory]:
+    """A minute at 20 Hz of slow waves, and an estimate at 10 Hz in another frame with noise, whose clock is late."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0, 0.05)
+    waves = rng.uniform((0.02, 0.0), (0.1, 6.3), (5, 3, 2))
+    p = speed * np.sum(np.sin(2.0 * np.pi * waves[..., 0] * t[:, None, None] + waves[..., 1]) / waves[..., 0], axis=1)
+    start = 1_700_000_000_000_000_000 + np.round(1e9 * t).astype(np.int64)
+    R = Rotation.from_rotvec(0.3 * speed * np.sin(0.4 * t)[:, None] * rng.normal(size=3))
+    truth = Trajectory(start, p, R.as_quat()[:, [3, 0, 1, 2]])
+    turn = Rotation.random(rng=rng)
+    q = (turn * R * Rotation.from_rotvec(0.01 * rng.normal(size=p.shape))).as_quat()[:, [3, 0, 1, 2]]
+    rows = slice(None, None, 2)
+    noisy = turn.apply(p + noise_m * rng.normal(size=p.shape))
+    return Trajectory(start[rows] + round(late_s * 1e9), noisy[rows], q[rows]), truth
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.01, 0.3])
+def test_the_offset_of_a_clock_comes_with_a_deviation_that_holds(late_s: float) -> None:
+    ratios = []
+    for seed in range(20):
+        found = associate(*wandering(seed, 0.1, late_s), "interpolate").time_offset
+        assert found is not None
+        ratios.append((found.offset_s + late_s) / found.deviation_s)
+        assert found.deviation_s < 0.05
+    assert 0.3 < np.median(np.abs(ratios)) < 1.3  # 0.67 of a Gaussian
+    assert np.abs(ratios).max() < 5.0
+
+
+def test_slow_motion_does_not_hide_an_offset_that_places_show() -> None:
+    for seed in range(6):
+        found = associate(*wandering(seed, 0.01, 0.3), "interpolate").time_offset
+        assert found is not None and found.offset_s == pytest.approx(-0.3, abs=4.0 * found.deviation_s)
+
+
+def test_it_is_said_which_offset_would_not_show() -> None:
+    seen = associate(*wandering(0, 0.001, noise_m=0.003), "interpolate")
+    found = seen.time_offset
+    assert found is not None and not found.shows
+    assert found.least_s > 0.02
+    assert f"clock offset: none shows, and none up to {found.least_s:.3g} s would; the motions fit" in seen.lines()[-1]
+    still = associate(*wandering(0, 1e-6), "interpolate")
+    assert still.time_offset is None
+    assert still.lines()[-1] == "clock offset: the motion does not tell, none would show"
 
 
 def shifted(trajectory: Trajectory, start_ns: int, factor: float = 1.0) -> Trajectory:

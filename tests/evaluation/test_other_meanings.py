@@ -110,3 +110,13 @@ def test_no_other_body_frame_is_told_on_a_straight_way_where_there_is_none():
         wrong = max(wrong, float(result.rotation_error_deg.mean()))
         assert not any("body frames" in text for text in result.warnings)
     assert wrong > 2.0  # about the way, which such a path leaves open
+
+
+@pytest.mark.parametrize("late_s", [0.008, 0.015])
+def test_clocks_less_than_20_ms_apart_are_told_where_that_is_most_of_the_error(late_s):
+    estimate = path(1, 0.001)
+    fast = replace(path(), p=20.0 * path().p)
+    late = replace(estimate, p=20.0 * estimate.p, time_ns=estimate.time_ns + round(1e9 * late_s))
+    assert not any("motions" in text for text in evaluate(replace(late, time_ns=estimate.time_ns), fast).warnings)
+    (text,) = (text for text in evaluate(late, fast, method="interpolate").warnings if "motions fit best" in text)
+    assert float(text.split("with --offset ")[1].split()[0]) == pytest.approx(-late_s, abs=0.001)

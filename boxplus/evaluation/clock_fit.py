@@ -1,0 +1,214 @@
+"""How well the motions that two trajectories saw tell the offset between their clocks, and which one fits.
+
+Where stamps of an estimate lack τ it lies, but for its frame and its scale, at p(t + τ) ≈ p(t) + τ v(t) of the ground truth. So τ
+is a regression of what is left after an alignment on the velocity. Both are cut into stretches with an alignment each, which
+takes drift away, and what τ becomes without one of the stretches in turn says how well it is known, whatever the errors are
+(jackknife). Slow motion, noise and drift show in that, where a formula for white noise would promise milliseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import so3
+
+Signal = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Vectors (n, 3) of a motion at times (n,) [s]."""
+
+_STRETCHES, _LEAST_SAMPLES = 10, 12  # at most, and samples in each
+_MOST_SAMPLES = 2000
+_SLOPE_S = 0.1  # shortest time over which a velocity is taken
+_TURN_S = 0.5  # over which rotations are compared
+_GAP_S, _GAP_STEPS = 0.25, 5.0  # and that of median steps: what is farther apart is not interpolated
+_STEPS, _SETTLED_S = 10, 1e-5
+_SCAN_S = 0.05
+_ROUNDING = 1e-9  # of the squared slopes, that an alignment leaves of those it explains
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFit:
+    """An offset that fits, as one signal tells it.
+
+    Attributes:
+        offset_s: to be added to the stamps of the estimate [s].
+        deviation_s: its standard deviation, by the jackknife over stretches [s].
+        correlation: of the aligned motions at that offset, at most 1.
+        signal: `rotation` or `translation`.
+    """
+
+    offset_s: float
+    deviation_s: float
+    correlation: float
+    signal: str
+
+
+class MotionPair:
+    """Two trajectories over the time that both cover, to be compared at any offset.
+
+    Args:
+        t_estimate, t_ground_truth: (N,) int64 stamps to use [ns]. estimate, ground_truth: the poses.
+    """
+
+    def __init__(
+        self, t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
+    ) -> None:
+        begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
+        own, true = ((t - begin) * 1e-9 for t in (t_estimate, t_ground_truth))
+        steps = [float(np.median(np.diff(t))) for t in (own, true)]
+        self._slope_s = max(_SLOPE_S, *(2.0 * step for step in steps))
+        inside = own[(own >= 0.0) & (own <= (end - begin) * 1e-9)]
+        self._t = inside[:: max(1, math.ceil(len(inside) / _MOST_SAMPLES))]
+        turn_s = max(_TURN_S, self._slope_s)
+        # What a signal needs on both sides of an instant, itself and for its slope.
+        self.signals = {
+            "translation": (_places(own, estimate), _places(true, ground_truth), 0.5 * self._slope_s),
+            "rotation": (
+                _turns(own, estimate, turn_s),
+                _turns(true, ground_truth, turn_s),
+                0.5 * (self._slope_s + turn_s),
+            ),
+        }
+        self._covered = [_Covered(t, max(_GAP_S, _GAP_STEPS * step)) for t, step in zip((own, true), steps, strict=True)]
+
+    def are_alike(self, offset_s: float, least: float) -> bool:
+        """Whether the places of both make one shape, as a whole, with at least this correlation."""
+        own, true, _ = self.signals["translation"]
+        t = self._t[self._covered[0](self._t, 0.0) & self._covered[1](self._t + offset_s, 0.0)]
+        if len(t) < _LEAST_SAMPLES:
+            return False
+        x, y = own(t), true(t + offset_s)
+        whole = _Stretch.of(x, y, np.zeros_like(x), np.zeros_like(x))
+        return whole.left < (1.0 - least**2) * whole.size
+
+    def scan(self, name: str, largest_s: float) -> float:
+        """The offset within ± `largest_s` whose motions fit best, on a grid [s]; 0 where there is nothing to compare."""
+        best, found = math.inf, 0.0
+        for offset_s in sorted(np.arange(-largest_s, largest_s + 0.5 * _SCAN_S, _SCAN_S), key=abs):
+            stretches = self._stretches(name, float(offset_s), widest_s=largest_s)
+            left = sum(one.left for one in stretches) / max(sum(one.size for one in stretches), 1e-300)
+            if stretches and left < best:
+                best, found = left, float(offset_s)
+        return found
+
+    def fit(self, name: str, offset_s: float, largest_s: float) -> ClockFit | None:
+        """The offset near `offset_s`, at most `largest_s` from it; None where the motions do not tell one."""
+        at, stretches, step = offset_s, [], 0.0
+        for _ in range(_STEPS):
+            stretches = self._stretches(name, at)
+            told = sum(one.told for one in stretches)
+            if len(stretches) < 3 or not told > _ROUNDING * sum(one.moved for one in stretches):
+                return None
+            step = sum(one.pull for one in stretches) / told
+            at += float(step)
+            if not abs(at - offset_s) < largest_s:
+                return None
+            if abs(step) < _SETTLED_S:
+                break
+        deviation = _jackknife(stretches)
+        if not math.isfinite(deviation) or abs(step) > 0.1 * deviation:
+            return None
+        left, size = sum(one.left for one in stretches), sum(one.size for one in stretches)
+        return ClockFit(at, deviation, math.sqrt(max(1.0 - left / max(size, 1e-300), 0.0)), name)
+
+    def _stretches(self, name: str, offset_s: float, widest_s: float = 0.0) -> list[_Stretch]:
+        """Every stretch compared at an offset; of all offsets up to `widest_s` the same samples."""
+        own, true, around = self.signals[name]
+        t = self._t
+        reach = around + widest_s
+        t = t[self._covered[0](t, around) & self._covered[1](t + (0.0 if widest_s else offset_s), reach)]
+        count = min(_STRETCHES, len(t) // _LEAST_SAMPLES)
+        if count < 3:
+            return []
+        x, y = own(t), true(t + offset_s)
+        half = 0.5 * self._slope_s
+        u = (own(t + half) - own(t - half)) / self._slope_s
+        v = (true(t + offset_s + half) - true(t + offset_s - half)) / self._slope_s
+        edges = np.searchsorted(t, np.linspace(t[0], t[-1], count + 1)[1:-1])
+        parts = zip(*(np.split(array, edges) for array in (x, y, u, v)), strict=True)
+        return [_Stretch.of(*part) for part in parts if len(part[0]) >= _LEAST_SAMPLES]
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Of one stretch, squared: the regression's two sums, the slopes, what the alignment leaves, and the size of the motion."""
+
+    pull: float
+    told: float
+    moved: float
+    left: float
+    size: float
+
+    @classmethod
+    def of(cls, x: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> _Stretch:
+        """From vectors x of the estimate and y of the ground truth and their slopes u and v, all (n, 3)."""
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        U, d, Vt = np.linalg.svd(y.T @ x)
+        sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
+        R = (U * sign) @ Vt
+        scale = float(d @ sign) / max(float((x * x).sum()), 1e-300)
+        x, u = scale * x @ R.T, scale * u @ R.T
+        e = x - y
+        # What place, turn and scale of the stretch explain as well as an offset does is no evidence of it.
+        free = np.stack([*(np.cross(axis, x) for axis in np.eye(3)), x]).reshape(4, -1).T
+        basis = np.linalg.svd(free, full_matrices=False)
+        Q = basis[0][:, basis[1] > 1e-9 * max(basis[1][0], 1e-300)]
+        slopes = []
+        for slope in (u, v):
+            flat = (slope - slope.mean(axis=0)).reshape(-1)
+            slopes.append(flat - Q @ (Q.T @ flat))
+        # The noise of one slope is not that of the other: their product is free of it, where a square would count it as motion.
+        return cls(
+            float(0.5 * (slopes[0] + slopes[1]) @ e.reshape(-1)),
+            float(slopes[0] @ slopes[1]),
+            float((u * u).sum() + (v * v).sum()),
+            float((e * e).sum()),
+            float((y * y).sum()),
+        )
+
+
+def _jackknife(stretches: list[_Stretch]) -> float:
+    """Standard deviation of the offset: how it scatters when each stretch is left out in turn; infinite where one alone tells."""
+    pull, told = np.array([one.pull for one in stretches]), np.array([one.told for one in stretches])
+    without = told.sum() - told
+    if not (without > 0.0).all():
+        return math.inf
+    offsets = (pull.sum() - pull) / without
+    return float(np.sqrt((len(offsets) - 1) / len(offsets) * ((offsets - offsets.mean()) ** 2).sum()))
+
+
+class _Covered:
+    """Whether there are poses all around an instant."""
+
+    def __init__(self, t: NDArray[np.float64], gap_s: float) -> None:
+        self._begin, self._end = float(t[0]), float(t[-1])
+        after = np.flatnonzero(np.diff(t) > gap_s)
+        self._gaps = t[after], t[after + 1]
+
+    def __call__(self, t: NDArray[np.float64], around: float) -> NDArray[np.bool_]:
+        inside = (t - around >= self._begin) & (t + around <= self._end)
+        # The number of gaps that began before the end of the window less those that ended before its begin.
+        begun, ended = (np.searchsorted(edge, at) for edge, at in zip(self._gaps, (t + around, t - around), strict=True))
+        return np.asarray(inside & (begun == ended))
+
+
+def _places(t: NDArray[np.float64], trajectory: Trajectory) -> Signal:
+    return lambda at: np.stack([np.interp(at, t, axis) for axis in trajectory.p.T], axis=1)
+
+
+def _turns(t: NDArray[np.float64], trajectory: Trajectory, over_s: float) -> Signal:
+    """Rotation vectors by which a body turns over a time, in its own frame."""
+    R = trajectory.R
+    steps = so3.log(R[:-1].transpose(0, 2, 1) @ R[1:])
+
+    def orientation(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        share = (at - t[before]) / (t[before + 1] - t[before])
+        return np.asarray(R[before] @ so3.exp(share[:, None] * steps[before]))
+
+    return lambda at: so3.log(orientation(at - 0.5 * over_s).transpose(0, 2, 1) @ orientation(at + 0.5 * over_s))
