@@ -15,11 +15,11 @@ from boxplus.optimization.losses import Huber
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, pixel_errors
 
 _HUBER = 1.345  # of the typical error: 95 % of the efficiency of least squares
 _RAYLEIGH = 1.1774  # median of a distance in two dimensions, in standard deviations
-_STEPS, _SETTLED, _LEAST_S = 25, 1e-3, 1.0
 _BENT = 0.7  # of the typical error: what bends adds as much to it as the noise
 
 
@@ -38,19 +38,18 @@ def bent_doubt(
         used: (k,) observations that were adjusted. dropped: points that were not.
         errors: (k,) at the end [px]; NaN where there is none.
     """
-    time_s, before = solved.history[-1].time_s, float(np.nanmedian(errors))
-    # Who stopped the adjustment does not wait for more of it, and an examination takes no longer than what is examined.
-    limit_s = max(time_s, _LEAST_S) if config.solver.time_limit_s is None else config.solver.time_limit_s - time_s
-    is_at_end = solved.status != "stopped" or solved.reason.startswith("iteration limit")
-    if not (is_at_end and limit_s > 0.0 and before > 0.0):
+    before = float(np.nanmedian(errors))
+    if not before > 0.0:
         return None
     problem = Problem()
     loss = Huber(_HUBER * before / _RAYLEIGH / config.sigma_px)
-    points = add_reconstruction(problem, adjusted, used, config, loss)[1]
+    cameras, points = add_reconstruction(problem, adjusted, used, config, loss)
     problem.fix(points[dropped])
+    options = examination_options(problem, len(cameras), solved, config)
+    if options is None:
+        return None
     try:
-        limits = {"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": limit_s}
-        solution = problem.solve(config.solver.model_copy(update=limits))
+        solution = problem.solve(options)
     except BoxplusError:
         return None
     after = float(np.nanmedian(pixel_errors(problem, list(solution.values))))

@@ -22,6 +22,7 @@ from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behin
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
 from boxplus.systems.bundle_adjustment.lens import lens_finding
+from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
 from boxplus.systems.bundle_adjustment.plausibility import (
     coarse_doubt,
     input_notes,
@@ -170,12 +171,16 @@ def adjust_bundle(
     lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
     if lens is not None and not lens.is_grave:
         notes.append(lens.sentence)
+    origin = pixel_origin(reconstruction, config, loss, solution, left)
+    if origin.note is not None:
+        notes.append(origin.note)
     said = [
         bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution) if gross else None,
         sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
         coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),
         mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
         None if lens is None or not lens.is_grave else lens.sentence,
+        origin.doubt,
     ]
     return BundleAdjustmentResult(
         reconstruction=adjusted,

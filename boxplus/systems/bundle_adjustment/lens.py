@@ -22,10 +22,10 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
-_STEPS, _SETTLED, _LEAST_S = 25, 1e-3, 1.0  # the valley to other intrinsics is bent: the first steps may be rejected
 _CHANCE = 1e-6  # of noise to lower the cost by as much
 _HINT = 0.3  # of the fall of the cost that counts, which the first step that is taken has to show
 _CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
@@ -63,7 +63,7 @@ def lens_finding(
         used: (k,) observations that were adjusted. dropped: points that were not.
         left: measurements less unknowns.
     """
-    cost, time_s = solved.cost, solved.history[-1].time_s
+    cost = solved.cost
     told_by = "--refine-intrinsics"
     if isinstance(adjusted, GbpProblem):
         used, adjusted = used[np.argsort(adjusted.camera_of, kind="stable")], _with_any_lens(adjusted)
@@ -71,14 +71,15 @@ def lens_finding(
     if not isinstance(adjusted, ColmapModel) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
         return None
     is_out = solved.reason.startswith("iteration limit")
-    # Who stopped the adjustment does not wait for more of it, and an examination takes no longer than what is examined.
-    limit_s = max(time_s, _LEAST_S) if config.solver.time_limit_s is None else config.solver.time_limit_s - time_s
-    if not (solved.status == "converged" or is_out) or not limit_s > 0.0:
+    if not (solved.status == "converged" or is_out):
         return None
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
     problem.fix(points[dropped])
+    options = examination_options(problem, len(cameras), solved, config)
+    if options is None:
+        return None
     numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
     # As in an F-test; the noise as the errors have it, not as sigma says.
     share = 0.5 * chi_square_exceeded(_CHANCE, max(numbers, 1)) / left
@@ -89,8 +90,7 @@ def lens_finding(
         return step.number > 0 and step.accepted and not cost - step.cost > _HINT * share * step.cost
 
     try:
-        limits = {"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": limit_s}
-        solution = problem.solve(config.solver.model_copy(update=limits), callback=is_settled)
+        solution = problem.solve(options, callback=is_settled)
     except BoxplusError:
         return None
     if not cost - solution.cost > share * solution.cost:

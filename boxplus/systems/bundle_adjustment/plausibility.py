@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_exceeded, chi_square_quantile, chi_square_sf
-from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solution import Solution
@@ -21,7 +20,6 @@ _OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says:
 _FAR_OFF = 3.0  # the same, of a given sigma, from which on nothing is to be trusted; few wrong matches hardly move a median
 _COARSE = 0.01  # of the focal length, by which half of the observations are off in no image
 _CONTRADICTED, _MISFIT = 25.0, 2.0  # times what a given sigma promises of χ², for a doubt and for a sentence
-_SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from
 _FAR = 4.0  # times the median distance from the middle
 _CLEARLY = 0.3  # times what is left of the points after a rotation, that a mirror image has to leave
 _STRANGE = 1e-4  # chance that a point of a sound reconstruction, the worst of all, stands out
@@ -50,12 +48,6 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
     if not able.any():
         return said
     usual = float(np.median(spread[able]))
-    beyond = [float((x > 0.0).mean()) for x in seen.pixels.T]
-    if isinstance(reconstruction, BalProblem) and all(max(share, 1.0 - share) > _SIDE for share in beyond):
-        said.append(
-            "the pixels lie on one side of the principal point in both directions: are they counted from a corner of the image? "
-            "BAL counts them from its middle"
-        )
     narrow = np.flatnonzero(able & (spread < _NARROW * usual)).astype(np.int64)
     if len(narrow):
         said.append(

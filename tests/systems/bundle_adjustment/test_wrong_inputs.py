@@ -13,6 +13,8 @@ from boxplus.errors import BoxplusError, InputError, NotFiniteError
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import examination_options
+from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
 from tests.small_problems import scene
 from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, perturbed, reconstruction
 
@@ -202,11 +204,30 @@ def test_a_sigma_that_was_meant_is_held_to_more():
     assert adjust_bundle(start, BundleAdjustmentConfig(sigma_px=SIGMA)).doubt is None
 
 
-def test_pixels_counted_from_a_corner_are_asked_about():
-    start = reconstruction(67, "bal")
+@pytest.mark.parametrize("flip", [1.0, -1.0])
+@pytest.mark.parametrize("seed", range(67, 71))
+def test_pixels_counted_from_a_corner_are_not_trusted(seed, flip):
+    start = reconstruction(seed, "bal")
     spread = np.abs(start.pixels).max(axis=0)
-    assert "from a corner" in note_of(replace(start, pixels=start.pixels + spread), "on one side of the principal point")
-    assert not [note for note in adjust_bundle(start).notes if "principal point" in note]
+    told = adjust_bundle(replace(start, pixels=start.pixels * [1.0, flip] + spread)).doubt
+    assert "the pixels are counted from a corner of the image" in told or "mirror image" in told or "bend all" in told
+    if flip > 0.0:
+        middle = re.search(r"from the middle of their range, \((\S+), (\S+)\) px, the cost is", told)
+        assert [float(middle[k]) for k in (1, 2)] == pytest.approx(spread, abs=20.0)
+    sound = adjust_bundle(start)
+    assert sound.doubt is None and not [note for note in sound.notes if "principal point" in note]
+
+
+def test_pixels_on_one_side_of_the_middle_are_asked_about_and_trusted_where_they_fit():
+    asked = 0
+    for seed in range(100, 106):
+        start = reconstruction(seed, "bal", cameras=12, points=300)
+        inside = (start.pixels > -3.0).all(axis=1)
+        inside &= np.bincount(start.point_of[inside], minlength=300)[start.point_of] >= 2
+        result = adjust_bundle(chosen(start, np.flatnonzero(inside)))
+        assert result.doubt is None
+        asked += any("on one side of the principal point" in note for note in result.notes)
+    assert asked
 
 
 def test_pixels_with_a_flipped_axis_give_a_mirror_image_which_is_told():
@@ -282,3 +303,18 @@ def test_few_wrong_matches_without_a_robust_loss_are_told():
     pixels[::40] += 60.0
     told = note_of(replace(start, pixels=pixels), "times the typical error")
     assert "wrong matches" in told
+
+
+def test_an_examination_is_bounded_by_work_and_not_by_the_clock():
+    start = reconstruction(68, "bal")
+    problem = bp.Problem()
+    config = BundleAdjustmentConfig()
+    cameras, _ = add_reconstruction(problem, start, np.ones(len(start.pixels), dtype=bool), config, None)
+    solved = problem.solve(max_iterations=3)
+    options = examination_options(problem, len(cameras), solved, config)
+    assert options.time_limit_s is None and options.max_iterations == 25
+    assert examination_options(problem, 1000, solved, config).max_iterations == 3
+    limited = config.model_copy(update={"solver": config.solver.model_copy(update={"time_limit_s": 1e-9})})
+    assert examination_options(problem, len(cameras), solved, limited) is None
+    stopped = problem.solve(callback=lambda iteration: True)
+    assert examination_options(problem, len(cameras), stopped, config) is None
