@@ -20,7 +20,7 @@ from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-from boxplus.systems.bundle_adjustment.depth import DepthUncertainty, depth_uncertainty
+from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
 from boxplus.systems.bundle_adjustment.lens import lens_finding
 from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
 from boxplus.systems.bundle_adjustment.plausibility import (
@@ -253,7 +253,7 @@ def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, 
     if left <= 0:
         reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:
-        reasons.append("the cameras do not move apart: their rotations are measured, depths and positions are not")
+        reasons.append(NOT_APART)
     if cheirality.bad_share > _BAD_SHARE:
         count = cheirality.behind + cheirality.left_out
         reasons.append(

@@ -23,7 +23,9 @@ from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text
 
 _SINGULAR = 1e-13  # determinant of H, as a share of the product of its diagonal, that is rounding
 _VAGUE = 0.1  # standard deviation over distance that makes it worth asking whether the cameras move apart
-_TURNING = 3.0  # least of `parallax_ratio` for cameras that do; it is 1 to 2 where they only turn
+TURNING = 3.0  # least of `parallax_ratio` for cameras that do; it is 1 to 2 where they only turn
+
+NOT_APART = "the cameras do not move apart: their rotations are measured, depths and positions are not"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,5 +119,5 @@ def depth_uncertainty(
     known = ratio[~np.isnan(ratio)]
     apart = True
     if len(known) and np.median(known) > _VAGUE:
-        apart = parallax_ratio(adjusted, used, config, loss, solution.cost) > _TURNING
+        apart = parallax_ratio(adjusted, used, config, loss, solution.cost) > TURNING
     return DepthUncertainty(ratio, apart)

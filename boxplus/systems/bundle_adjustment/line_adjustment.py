@@ -25,7 +25,11 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.camera.line_reprojection import LineReprojection
 from boxplus.residuals.camera.reprojection import Reprojection
+from boxplus.residuals.prior import Prior
+from boxplus.systems.bundle_adjustment.depth import NOT_APART, TURNING
+from boxplus.systems.bundle_adjustment.line_parallax import in_one_place
 from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, triangulate_lines
+from boxplus.systems.bundle_adjustment.parallax import IN_ONE_PLACE, IN_PLACE, LEAST_NOISE
 
 Floats = NDArray[np.float64]
 
@@ -132,15 +136,9 @@ def adjust_lines(
         why = " ".join(found.notes()) or "no segment"
         raise InputError("segments that determine a line", why, "give views from places beside the lines")
     problem = Problem()
-    cameras = problem.add_variables(SE3Left, data.T_camera_world, name="cameras")
-    world = _start_lines(data, found, used, config.triangulate)
-    lines = problem.add_variables(Line3D, world, name="lines")
-    segments = LineReprojection(data.K[data.view_of[seen]], data.segments[seen], sigma=config.sigma_px)
-    problem.add_residuals(segments, cameras[data.view_of[seen]], lines[data.line_of[seen]], loss=loss, name="segments")
+    ends = _start_ends(data, found, used, config.triangulate)
+    cameras, lines, points = _add_line_set(problem, replace(data, end_points_world=ends), seen, config, loss)
     problem.fix(cameras[0])
-    # What no residual takes is held where it is.
-    problem.fix(lines[np.setdiff1d(np.arange(len(used)), np.unique(data.line_of[seen]))])
-    points = _add_points(problem, cameras, data, config, loss) if config.use_points and len(data.pixels) else None
     start = [block.values for block in problem.blocks]
     solution = problem.solve(config.solver, callback=callback)
     values = list(solution.values)
@@ -150,6 +148,10 @@ def adjust_lines(
     point_errors_start, point_errors = (
         empty if points is None else _point_errors(data, v[cameras.number], v[points.number]) for v in (start, values)
     )
+    said = [_doubt(adjusted, errors, point_errors, seen, config, loss)]
+    is_stopped = solution.status == "stopped" and not solution.reason.startswith("iteration limit")  # who does that does not wait
+    if not is_stopped and not _parallax_ratio(adjusted, seen, config, loss, solution.cost) > TURNING:
+        said.append(NOT_APART)
     # From a start that is off, segments of a line may disagree; what the adjustment makes of given lines decides about these.
     notes = found.notes() if config.triangulate else found.notes(("one view", "along the line"))
     if data.reflected:
@@ -165,7 +167,7 @@ def adjust_lines(
         point_errors=point_errors,
         triangulation=found,
         notes=tuple(notes),
-        doubt=_doubt(adjusted, errors, point_errors, seen, config, loss),
+        doubt="; ".join(text for text in said if text) or None,
         solution=solution,
         cameras=cameras,
         lines=lines,
@@ -174,15 +176,24 @@ def adjust_lines(
     )
 
 
-def _start_lines(data: VggLines, found: LineTriangulation, used: NDArray[np.bool_], triangulated: bool) -> Floats:
-    """(L, 5): those that were triangulated, or those given; a line that stands for nothing where there is none."""
-    lines = np.tile(Line3D.identity(), (len(used), 1))
-    if triangulated:
-        lines[used] = found.lines[used]
-    elif used.any():
-        ends = data.end_points_world[used]
-        lines[used] = line_manifold.from_points(ends[:, :3], ends[:, 3:])
-    return lines
+def _start_ends(data: VggLines, found: LineTriangulation, used: NDArray[np.bool_], triangulated: bool) -> Floats:
+    """(L, 6): those that were triangulated, or those given."""
+    return np.where(used[:, None], found.end_points_world, data.end_points_world) if triangulated else data.end_points_world
+
+
+def _add_line_set(
+    problem: Problem, data: VggLines, seen: NDArray[np.intp], config: LineAdjustmentConfig, loss: Loss | None
+) -> tuple[Variables, Variables, Variables | None]:
+    """Cameras, lines and, where they are used, points, with their residuals; what no residual takes is held where it is."""
+    cameras = problem.add_variables(SE3Left, data.T_camera_world, name="cameras")
+    own = np.unique(data.line_of[seen])
+    world = np.tile(Line3D.identity(), (len(data.end_points_world), 1))
+    world[own] = line_manifold.from_points(data.end_points_world[own, :3], data.end_points_world[own, 3:])
+    lines = problem.add_variables(Line3D, world, name="lines")
+    segments = LineReprojection(data.K[data.view_of[seen]], data.segments[seen], sigma=config.sigma_px)
+    problem.add_residuals(segments, cameras[data.view_of[seen]], lines[data.line_of[seen]], loss=loss, name="segments")
+    problem.fix(lines[np.setdiff1d(np.arange(len(world)), own)])
+    return cameras, lines, _add_points(problem, cameras, data, config, loss) if config.use_points and len(data.pixels) else None
 
 
 def _add_points(
@@ -215,6 +226,31 @@ def _without_skew(K: Floats, pixels: Floats, sigma_px: float) -> tuple[Pinhole, 
     moved[:, 0] += K[0, 1] * K[1, 2] / K[1, 1]
     back = np.linalg.inv(M)
     return Pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), moved, back.T @ back / sigma_px**2
+
+
+def _parallax_ratio(
+    adjusted: VggLines, seen: NDArray[np.intp], config: LineAdjustmentConfig, loss: Loss | None, cost: float
+) -> float:
+    """Cost that distances explain, for each of their numbers, over that of a number that explains noise; see `parallax.py`."""
+    problem = Problem()
+    cameras, _, points = _add_line_set(problem, in_one_place(adjusted, seen), seen, config, loss)
+    shown, view_count = len(np.unique(adjusted.line_of[seen])), len(np.unique(adjusted.view_of[seen]))
+    point_count = 0 if points is None else len(np.unique(adjusted.point_of))
+    numbers = 2 * shown + point_count + 3 * (view_count - 1) - 1  # distance and slant of a line
+    measured = sum(2 * group.residual.count for group in problem.groups)
+    left = measured - numbers - 2 * shown - 2 * point_count - 3 * (view_count - 1)
+    if view_count < 2:
+        return 0.0
+    if left <= 0:
+        return float("inf")
+    held = np.zeros((6, 6))
+    held[3:, 3:] = IN_PLACE * np.eye(3)
+    problem.add_residuals(Prior(cameras.manifold, cameras.values, information=held), cameras[:])
+    without = problem.solve(config.solver.model_copy(update={**IN_ONE_PLACE, "time_limit_s": None}))
+    if any(without.invalid.values()):
+        return float("inf")
+    noise = max(cost / left, 0.5 * (LEAST_NOISE / config.sigma_px) ** 2)
+    return float((without.cost - cost) / numbers / noise)
 
 
 def _line_errors(data: VggLines, poses: Floats, lines: Floats, seen: NDArray[np.intp]) -> Floats:

@@ -21,9 +21,9 @@ from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 
-_LEAST_NOISE = 0.01  # [px] no pixel is measured better
-_IN_PLACE = 1e8  # information that holds the cameras, where points are at distance 1
-_STEPS, _SETTLED = 30, 1e-4
+LEAST_NOISE = 0.01  # [px] no pixel is measured better
+IN_PLACE = 1e8  # information that holds the cameras, where points are at distance 1
+IN_ONE_PLACE = {"max_iterations": 30, "cost_tolerance": 1e-4}
 
 
 def parallax_ratio(
@@ -52,13 +52,13 @@ def parallax_ratio(
     if left <= 0:
         return float("inf")
     information = np.zeros((cameras.manifold.dof, cameras.manifold.dof))
-    information[3:6, 3:6] = _IN_PLACE * np.eye(3)
+    information[3:6, 3:6] = IN_PLACE * np.eye(3)
     problem.add_residuals(Prior(cameras.manifold, cameras.values, information=information), cameras[:])
-    options = config.solver.model_copy(update={"max_iterations": _STEPS, "cost_tolerance": _SETTLED, "time_limit_s": None})
+    options = config.solver.model_copy(update={**IN_ONE_PLACE, "time_limit_s": None})
     without = problem.solve(options)
     if any(without.invalid.values()):
         return float("inf")  # no directions before all cameras explain the images
-    noise = max(cost / left, 0.5 * (_LEAST_NOISE / config.sigma_px) ** 2)
+    noise = max(cost / left, 0.5 * (LEAST_NOISE / config.sigma_px) ** 2)
     return float((without.cost - cost) / (n + 3 * (m - 1) - 1) / noise)
 
 

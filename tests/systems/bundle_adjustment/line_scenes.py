@@ -73,3 +73,14 @@ def perturbed(data: VggLines, seed: int, share: float = 0.01) -> VggLines:
         end_points_world=data.end_points_world + 10.0 * share * random.normal(size=data.end_points_world.shape),
         points_world=data.points_world + 10.0 * share * random.normal(size=data.points_world.shape),
     )
+
+
+def turning(seed: int, baseline: float, noise_px: float = 0.2, views: int = 7) -> VggLines:
+    """The house from cameras `baseline` around one place, 10 m away, that look at different points of it."""
+    random = np.random.default_rng(seed)
+    places = np.array([0.0, -10.0, 2.0]) + baseline * random.normal(size=(views, 3))
+    targets = random.uniform(-1.0, 1.0, (views, 3))
+    poses = np.vstack([looking(place[None], target) for place, target in zip(places, targets, strict=True)])
+    ends = random.uniform(-2.5, 2.5, (15, 6))
+    ends[:, 3:] = ends[:, :3] + random.normal(size=(15, 3)) * 1.5
+    return seen(poses, ends, random.uniform(-2.5, 2.5, (20, 3)), noise_px, seed)

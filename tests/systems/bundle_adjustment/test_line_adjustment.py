@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
 from boxplus.optimization.losses import Huber
 from boxplus.systems.bundle_adjustment import LineAdjustmentConfig, adjust_lines
-from tests.systems.bundle_adjustment.line_scenes import house, looking, perturbed, seen
+from tests.systems.bundle_adjustment.line_scenes import house, looking, perturbed, seen, turning
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -101,3 +101,14 @@ def test_points_that_are_matched_wrongly_are_named_and_not_trusted():
         result = adjust_lines(replace(data, pixels=pixels))
         assert "px from their points" in result.doubt
         assert any("residuals of points of 002 (7" in note for note in result.notes), result.notes
+
+
+@pytest.mark.parametrize("use_points", [True, False])
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_cameras_that_only_turn_are_told_from_those_that_move_apart(seed: int, use_points: bool) -> None:
+    config = LineAdjustmentConfig(use_points=use_points)
+    for baseline in (0.0, 1e-3):
+        told = adjust_lines(perturbed(turning(seed, baseline), seed), config).doubt
+        assert told is not None and told.startswith("the cameras do not move apart")
+    for baseline in (0.15, 1.0):
+        assert adjust_lines(perturbed(turning(seed, baseline), seed), config).doubt is None

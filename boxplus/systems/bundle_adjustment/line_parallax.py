@@ -1,0 +1,53 @@
+"""Whether the cameras of a line set move apart at all, or images that only turn explain everything as well (`parallax.py`).
+
+Between cameras in one place the planes of a line's segments are one plane but for noise, and lines and cameras fit that noise. So
+everything is explained once more from one place; what distances explain beyond that is compared with the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.formats.reconstructions.vgg_lines import VggLines
+from boxplus.manifolds import quaternion
+
+Floats = NDArray[np.float64]
+
+
+def in_one_place(data: VggLines, seen: NDArray[np.intp]) -> VggLines:
+    """All cameras at the origin, and every line and point at distance 1 in the mean plane and direction it is seen in.
+
+    Args:
+        seen: (k,) the segments to go by.
+    """
+    R = quaternion.to_matrix(np.ascontiguousarray(data.T_camera_world[:, :4]))
+    ends = data.end_points_world.copy()
+    views, line_of = data.view_of[seen], data.line_of[seen]
+    first, last = (_rays(data.K, R, views, data.segments[seen, k : k + 2]) for k in (0, 2))
+    normals = np.cross(first, last)
+    for line in np.unique(line_of):
+        own = line_of == line
+        normal = np.linalg.svd(normals[own])[2][0]
+        middle = (first[own] + last[own]).sum(axis=0)
+        middle -= normal * (normal @ middle)
+        middle /= np.linalg.norm(middle)
+        along = 0.5 * np.cross(normal, middle)
+        ends[line] = np.concatenate([middle - along, middle + along])
+    points = data.points_world.copy()
+    rays = _rays(data.K, R, data.point_view_of, data.pixels)
+    for point in np.unique(data.point_of):
+        mean = rays[data.point_of == point].sum(axis=0)
+        points[point] = mean / np.linalg.norm(mean)
+    T = data.T_camera_world.copy()
+    T[:, 4:] = 0.0
+    return replace(data, T_camera_world=T, end_points_world=ends, points_world=points)
+
+
+def _rays(K: Floats, R: Floats, views: NDArray[np.integer], pixels: Floats) -> Floats:
+    """(N, 3) unit vectors in the world."""
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    rays = np.einsum("nji,nj->ni", R[views], np.einsum("nij,nj->ni", np.linalg.inv(K)[views], homogeneous))
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
