@@ -43,7 +43,7 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
             given = {name: words.pop(name) for name in fields}
             given = {name: None if value == [] else value for name, value in given.items()}
             try:
-                options = model(**given)
+                options = model.model_validate(given)
             except ValidationError as error:
                 first = error.errors()[0]
                 cause = first.get("ctx", {}).get("error")

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class RegistrationConfig(BaseModel):
+class RegistrationConfig(Settings):
     """How a scan is thinned, matched to the planes of a map and weighed; lengths in metres.
 
     `LioConfig` has these settings and those of the filter.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> RegistrationConfig(map_cell=0.5).map_cell
         0.5
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
 
     scan_voxel: float = Field(0.15, gt=0, description="side of the voxels that thin a scan before the update, at least [m]")
     map_cell: float = Field(0.25, gt=0, description="side of the map's cells, each keeps one point [m]")

@@ -20,9 +20,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from boxplus._jit import kernel
+from boxplus._settings import Settings
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -33,14 +34,12 @@ _FEWEST = 6  # points a plane is fitted to
 _NEIGHBOURS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int64)
 
 
-class SeenThroughConfig(BaseModel):
+class SeenThroughConfig(Settings):
     """What makes a voxel one that was seen through.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     voxel: float = Field(0.2, gt=0, description="side of the voxels that are kept or removed as a whole [m]")
     max_range: float = Field(40.0, gt=0, description="longer rays are cut here: their ends are not known to a voxel [m]")

@@ -19,7 +19,7 @@ from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.minimizers.minimize import Callback, minimize, strategy_of
 from boxplus.optimization.observability.singularity import explain_singularity, structural_defects
 from boxplus.optimization.solution import Solution, values_at
-from boxplus.optimization.solver_options import SolverOptions, options_from
+from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.connections import check_connections, require_connections, require_manifold
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
 from boxplus.optimization.terms.group import Group, ResidualRows
@@ -340,7 +340,7 @@ class Problem:
         begin = time.perf_counter()
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
-        options = options if options is not None else options_from(SolverOptions, settings)
+        options = options if options is not None else SolverOptions(**settings)
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from boxplus.errors import InputError
-
-OptionsT = TypeVar("OptionsT", bound=BaseModel)
+from boxplus._settings import Settings
 
 Method = Literal["levenberg_marquardt", "gauss_newton", "dogleg"]
 Elimination = Literal["auto", "dense", "sparse", "schur"]
 
 
-class SolverOptions(BaseModel):
+class SolverOptions(Settings):
     """Options of `Problem.solve`.
 
     Example:
         >>> bp.SolverOptions(method="dogleg", max_iterations=20).threads
         1
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: Method = Field("levenberg_marquardt", description="how a step is chosen")
     linear_solver: Elimination = Field("auto", description="how a step is computed; auto says what it chose and why")
@@ -50,18 +46,3 @@ class SolverOptions(BaseModel):
         "window that is solved again and again and known to be sound",
     )
     threads: int = Field(1, ge=1, description="results are the same for any number")
-
-
-def options_from(kind: type[OptionsT], settings: dict[str, Any]) -> OptionsT:
-    """The options that settings given one by one make.
-
-    Raises:
-        InputError: a setting is unknown or out of range; the message names those that there are.
-    """
-    try:
-        return kind(**settings)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(kind.model_fields)
-        raise InputError(f"settings of {kind.__name__} ({known})", f"{where}: {first['msg']}", "correct that setting") from None

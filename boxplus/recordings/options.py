@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError, RecordingError
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -25,7 +26,7 @@ ANY_GNSS, NO_GNSS = "auto", "none"
 """Values of `gnss_topic`: the only one there is, and none."""
 
 
-class OtherLidar(BaseModel):
+class OtherLidar(Settings):
     """A LiDAR beside the first one, to be merged with it (docs/several_lidars.md). Only its topic has to be given.
 
     A text stands for its topic, or, in braces, for all of it in YAML: `{topic: /rear, time_offset_s: 0.05}`.
@@ -36,8 +37,6 @@ class OtherLidar(BaseModel):
         >>> bp.RecordingOptions(lidar_topic="/front", other_lidars=(rear,)).other_lidars[0].topic
         '/rear'
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     topic: str = Field(description="topic of its clouds")
     T_lidar_other: tuple[tuple[float, ...], ...] | None = Field(
@@ -78,7 +77,7 @@ class OtherLidar(BaseModel):
         return tuple(tuple(float(x) for x in row) for row in check_transform("T_lidar_other", np.array(value)))
 
 
-class RecordingOptions(BaseModel):
+class RecordingOptions(Settings):
     """How to read a recording. None means: find it from the data, and refuse when two readings fit.
 
     The command line's options are these fields.
@@ -88,8 +87,6 @@ class RecordingOptions(BaseModel):
         >>> options.min_range, options.lidar_topic
         (1.0, None)
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lidar_topic: str | None = Field(default=None, description="topic of the LiDAR, of several the first one (bags only)")
     other_lidars: tuple[OtherLidar, ...] | None = Field(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from boxplus._settings import suggestion
 from boxplus.errors import InputError
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
@@ -115,7 +115,7 @@ def _read_yaml(path: Path, known: Sections) -> dict[str, dict[str, object]]:
     for section, values in content.items():
         if section not in known:
             home = [name for name, model in known.items() if section in model.model_fields]
-            advice = f"write it below '{home[0]}:'" if home else _suggest(str(section), list(known), "section")
+            advice = f"write it below '{home[0]}:'" if home else suggestion(str(section), list(known), "section")
             raise InputError(f"{sections} in {path}", f"{section!r}", advice)
         if values is not None and not isinstance(values, dict):
             raise InputError(f"keys and values below '{section}:' in {path}", repr(values), "write one 'key: value' a line")
@@ -134,10 +134,10 @@ def _parse_setting(text: str, sections: Sections) -> tuple[str, str, object]:
         homes = [candidate for candidate, model in sections.items() if key in model.model_fields]
         if len(homes) != 1:
             known = sorted(f"{candidate}.{known}" for candidate, model in sections.items() for known in model.model_fields)
-            raise InputError("the name of a setting", repr(key), _suggest(key, known, "setting"))
+            raise InputError("the name of a setting", repr(key), suggestion(key, known, "setting"))
         section = homes[0]
     if section not in sections:
-        raise InputError(f"a section ({', '.join(sections)})", repr(section), _suggest(section, list(sections), "section"))
+        raise InputError(f"a section ({', '.join(sections)})", repr(section), suggestion(section, list(sections), "section"))
     try:
         return section, key, yaml.load(value, _Yaml)
     except yaml.YAMLError as error:
@@ -147,11 +147,4 @@ def _parse_setting(text: str, sections: Sections) -> tuple[str, str, object]:
 def _check_key(section: str, key: str, sections: Sections) -> None:
     known = list(sections[section].model_fields)
     if key not in known:
-        raise InputError(f"a known setting in section '{section}'", repr(key), _suggest(key, known, "setting"))
-
-
-def _suggest(word: str, known: list[str], kind: str) -> str:
-    short = {name.rpartition(".")[2]: name for name in known}
-    near = difflib.get_close_matches(word, list(short), n=1)
-    hint = f"did you mean {short[near[0]]}? " if near else ""
-    return f"{hint}the {kind}s are: {', '.join(known)}"
+        raise InputError(f"a known setting in section '{section}'", repr(key), suggestion(key, known, "setting"))

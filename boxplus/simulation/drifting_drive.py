@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.manifolds import quaternion, se3
 from boxplus.simulation.motions.trajectories import rounded
 from boxplus.simulation.worlds.world import World
@@ -18,14 +19,12 @@ from boxplus.simulation.worlds.world import World
 Floats = NDArray[np.float64]
 
 
-class DriftConfig(BaseModel):
+class DriftConfig(Settings):
     """How the odometry of a simulated drive drifts, and what its sensor sees.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     step_m: float = Field(1.0, gt=0, description="way between scans [m]")
     speed: float = Field(8.0, gt=0, description="[m/s]")

@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.sensors.geodesy import EnuFrame
@@ -16,14 +17,12 @@ from boxplus.sensors.gnss import GnssFixes
 Floats = NDArray[np.float64]
 
 
-class GnssConfig(BaseModel):
+class GnssConfig(Settings):
     """A simulated receiver. Heights are twice as bad as places throughout, as those of satellites are.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rate_hz: float = Field(5.0, gt=0)
     sigma: float = Field(0.5, ge=0, description="white noise of east and north [m]")

@@ -6,8 +6,9 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.motions.spline import Motion, Trajectory
 
@@ -22,14 +23,12 @@ _HARMONICS = np.array([1.0, 2.0, 3.0])
 _WEIGHTS = np.array([0.8, 0.5, 0.33166247903554])  # squares add up to one
 
 
-class ImuModel(BaseModel):
+class ImuModel(Settings):
     """Errors of an IMU; the default is the ADIS16448 as characterised for the EuRoC recordings.
 
     A sample reads a_m = R_world_imuᵀ (a − g) + b_a + n_a and ω_m = ω + b_w + n_w (docs/conventions.md), and is clipped at the
     limits of the sensor. White noise of density σ has standard deviation σ √rate a sample.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rate_hz: float = Field(200.0, gt=0, description="samples per second")
     gyro_noise_density: float = Field(1.7e-4, ge=0, description="[rad/s/√Hz]")

@@ -7,7 +7,9 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
 class Rays(NamedTuple):
@@ -22,9 +24,7 @@ class Rays(NamedTuple):
     directions_lidar: NDArray[np.float64]
 
 
-class _Lidar(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+class _Lidar(Settings):
     rate_hz: float = Field(10.0, gt=0, description="scans per second")
     range_sigma_m: float = Field(0.02, ge=0, description="standard deviation of the range [m]")
     min_range: float = Field(0.5, ge=0, description="nearer returns are not reported [m]")

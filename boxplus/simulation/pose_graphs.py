@@ -14,8 +14,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
@@ -27,10 +28,8 @@ _WOBBLE = (0.03, 0.1)  # rotation [rad] and translation [m] by which poses lie o
 _LEAST_GAP = 20  # steps between two poses that a loop closure may join
 
 
-class GraphSimulationConfig(BaseModel):
+class GraphSimulationConfig(Settings):
     """What `simulate_pose_graph` makes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     dimension: Literal[2, 3] = Field(2, description="a city in the plane, or one with storeys")
     poses: int = Field(1000, ge=30, description="steps of one metre")

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
@@ -26,10 +27,8 @@ _FIRST_SCAN_NS = 7_300_000
 _LAST_MARGIN_NS = 20_000_000
 
 
-class SimulationConfig(BaseModel):
+class SimulationConfig(Settings):
     """What a simulation was made from; together with the version of boxplus it determines every bit of it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     scenario: str = Field(description="name of the scenario")
     seed: int = Field(0, ge=0, description="of the noise, and of a built-in scenario's world and motion")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from boxplus.errors import AmbiguityError, RecordingError
+from boxplus.errors import AmbiguityError, InputError, RecordingError
 from boxplus.manifolds import so3
 from boxplus.recordings import OtherLidar, RecordingOptions, open_recording
 from boxplus.sensors.scan import Scan
@@ -89,9 +89,9 @@ def test_a_text_is_a_topic_or_yaml() -> None:
 
 
 def test_an_unknown_pose_a_foreign_clock_and_a_missing_first_lidar_are_refused(bag: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValidationError, match="--lidar-topic"):
+    with pytest.raises(InputError, match="--lidar-topic"):
         RecordingOptions(other_lidars=(REAR,))
-    with pytest.raises(ValidationError, match="once"):
+    with pytest.raises(InputError, match="once"):
         RecordingOptions(lidar_topic=REAR, other_lidars=(REAR,))
     with pytest.raises(AmbiguityError, match="--other-lidars"):
         open_recording(bag)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class DescriptorConfig(BaseModel):
+class DescriptorConfig(Settings):
     """How a local map is described, and how alike two have to be.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> DescriptorConfig(cell=0.25).cell
         0.25
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cell: float = Field(0.5, gt=0, description="side of a pixel of the density image [m]; 0.25 within buildings")
     features: int = Field(500, ge=8, description="corners of a density image, at most")

@@ -6,23 +6,22 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from boxplus._jit import kernel
+from boxplus._settings import Settings
 from boxplus.maps.floor_plan.raster import Floats, Raster
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 _RAYS = 1440  # of a turn
 
 
-class FloorPlanConfig(BaseModel):
+class FloorPlanConfig(Settings):
     """Settings of a floor plan.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     resolution: float = Field(0.1, gt=0, description="side of a cell; not below the voxels of the map, or walls get holes [m]")
     least_height: float = Field(0.2, gt=0, description="what rises less above the ground is none [m]")

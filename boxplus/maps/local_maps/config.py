@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class LocalMapConfig(BaseModel):
+class LocalMapConfig(Settings):
     """Settings of `LocalMapBuilder`.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> LocalMapConfig(length=50.0).length
         50.0
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     length: float = Field(20.0, gt=0, description="way after which a local map is cut [m]")
     duration: float = Field(5.0, gt=0, description="time after which it is cut, where `least_length` has been travelled [s]")

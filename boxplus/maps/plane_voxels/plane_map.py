@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.maps.plane_voxels.membership import PlaneBlocks, sum_on_planes
 from boxplus.maps.plane_voxels.voxel_sums import (
     COUNT,
@@ -35,10 +36,8 @@ _BESIDE = 0.4  # of a voxel, between the middles of its points and of those of i
 _GATE = 4.0  # standard deviations of a plane's thickness within which a point lies on it
 
 
-class PlaneVoxelConfig(BaseModel):
+class PlaneVoxelConfig(Settings):
     """How planes are found; lengths in metres."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     smallest_voxel: float = Field(0.5, gt=0, description="edge of the smallest voxels, in an eighth of a large one each way [m]")
     plane_ratio: float = Field(25.0, gt=1, description="variance within a plane, in its shorter direction, over that across it")

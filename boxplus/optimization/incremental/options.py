@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class IncrementalOptions(BaseModel):
+class IncrementalOptions(Settings):
     """Options of `IncrementalProblem`.
 
     Example:
         >>> bp.IncrementalProblem(tolerance=0.01).options.max_rounds
         3
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tolerance: float = Field(
         0.04, ge=0, description="[standard deviations] residuals whose linearisation is off by more are linearised anew"

@@ -20,7 +20,6 @@ from boxplus.optimization.incremental.reports import IncrementalSolution, Increm
 from boxplus.optimization.incremental.variables import GrowingVariables, gather_points, scatter_points
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solver_options import options_from
 from boxplus.optimization.terms.connections import check_connections, require_connections
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
 from boxplus.optimization.terms.group import Group, broadcast
@@ -63,7 +62,7 @@ class IncrementalProblem:
     def __init__(self, options: IncrementalOptions | None = None, **settings: Any) -> None:
         if options is not None and settings:
             raise InputError("options or single settings", "both", "put the settings into the options")
-        self.options = options if options is not None else options_from(IncrementalOptions, settings)
+        self.options = options if options is not None else IncrementalOptions(**settings)
         self.blocks: list[GrowingVariables] = []
         self._guard = ThreadGuard("IncrementalProblem")
         self._tree = BayesTree()

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.recordings.options import AccelUnit, GyroUnit
 
 
-class CameraRecordingOptions(BaseModel):
+class CameraRecordingOptions(Settings):
     """How to read a camera recording. None means: as the recording says, and refuse where it does not say.
 
     Example:
         >>> bp.CameraRecordingOptions(start_s=5.0, frame_rate_hz=20.0).frame_rate_hz
         20.0
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     image_topics: tuple[str, ...] | None = Field(
         default=None, description="topics of the images, in the order in which the cameras are numbered (bags only)"

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 
 
-class StreamConfig(BaseModel):
+class StreamConfig(Settings):
     """Which streams of a recording the odometry takes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mono: bool = Field(
         default=False,
@@ -21,10 +20,8 @@ class StreamConfig(BaseModel):
     )
 
 
-class DirectRunConfig(BaseModel):
+class DirectRunConfig(Settings):
     """Settings of a run of direct odometry; this is what `config.yaml` holds. None has to be given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording: CameraRecordingOptions = Field(default_factory=lambda: CameraRecordingOptions())
     streams: StreamConfig = Field(default_factory=lambda: StreamConfig())

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.recordings.info import RecordingInfo
 from boxplus.recordings.options import NO_IMU, NO_POINT_TIME, RecordingOptions
 from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudConfig
@@ -14,10 +15,8 @@ from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 
-class MapConfig(BaseModel):
+class MapConfig(Settings):
     """What is kept of the map on disk. The filter's own map in memory is not affected."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     save: bool = Field(True, description="stream the registered points to map tiles while running")
     voxel: float | None = Field(
@@ -34,10 +33,8 @@ class MapConfig(BaseModel):
         return [path for path, wanted in ((ply, self.ply), (pcd, self.pcd)) if wanted]
 
 
-class RunConfig(BaseModel):
+class RunConfig(Settings):
     """Settings of an odometry run; this is what `config.yaml` holds. None has to be given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording: RecordingOptions = Field(default_factory=lambda: RecordingOptions())
     odometry: LioConfig = Field(default_factory=lambda: LioConfig())  # type: ignore[call-arg]

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import cloud_writer
 from boxplus.formats.output import make_folder
@@ -16,10 +17,8 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 Ending = Literal["pcd", "ply", "las", "laz", "e57"]
 
 
-class ScanCloudConfig(BaseModel):
+class ScanCloudConfig(Settings):
     """Whether the scans are kept as clouds, and how."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     frame: Literal["none", "body", "world"] = Field(
         "none",

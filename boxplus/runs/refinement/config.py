@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.runs.lidar_inertial.config import MapConfig
 from boxplus.runs.settings_file import dump_settings, load_settings
 from boxplus.systems.refinement.config import RefinementConfig
 
 
-class RefineRunConfig(BaseModel):
+class RefineRunConfig(Settings):
     """Settings of `boxplus refine`; this is what its `config.yaml` holds. None has to be given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     refinement: RefinementConfig = Field(default_factory=lambda: RefinementConfig())  # type: ignore[call-arg]
     map: MapConfig = Field(default_factory=lambda: MapConfig())  # type: ignore[call-arg]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.maps.seen_through import SeenThroughConfig
 from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.sessions.config import SessionsConfig
 
 
-class JointMapConfig(BaseModel):
+class JointMapConfig(Settings):
     """What is kept of the joint map."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     voxel: float | None = Field(0.1, ge=0.001, description="keep one point per voxel of this edge [m]; null keeps every point")
     tile_size: float = Field(50.0, gt=0, description="edge of the cubic map tiles [m]")
@@ -20,10 +19,8 @@ class JointMapConfig(BaseModel):
     change_voxels: int = Field(8, ge=1, description="voxels of a change between sessions that is reported, at least")
 
 
-class MergeConfig(BaseModel):
+class MergeConfig(Settings):
     """Settings of `boxplus map merge`. None has to be given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sessions: SessionsConfig = Field(default_factory=lambda: SessionsConfig())  # type: ignore[call-arg]
     seen_through: SeenThroughConfig = Field(default_factory=lambda: SeenThroughConfig())  # type: ignore[call-arg]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.runs.settings_file import dump_settings
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 
 
-class VioRunConfig(BaseModel):
+class VioRunConfig(Settings):
     """Settings of a run with cameras and IMU; this is what `config.yaml` holds. None has to be given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording: CameraRecordingOptions = Field(default_factory=lambda: CameraRecordingOptions())
     odometry: VioConfig = Field(default_factory=lambda: VioConfig())  # type: ignore[call-arg]

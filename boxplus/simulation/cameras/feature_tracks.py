@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.simulation.motions.spline import Trajectory
@@ -18,10 +19,8 @@ _JUMP_PX = (5.0, 40.0)  # of a track that changes to another point
 _OBJECT_SPEED = 0.5  # of what moves on its own [m/s]
 
 
-class TrackModel(BaseModel):
+class TrackModel(Settings):
     """A front end; the default is one of 752×480 pixels with a focal length of 460."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     focal_px: float = Field(460.0, gt=0, description="focal length [px]")
     half_size: tuple[float, float] = Field((0.81, 0.51), description="largest |x|, |y| of a seen ray (x, y, 1)")

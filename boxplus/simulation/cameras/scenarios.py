@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.simulation import scenarios
 from boxplus.simulation.cameras.sensor import CameraRig, make_rig
@@ -22,10 +23,8 @@ Movers = Callable[[float, NDArray[np.float64], NDArray[np.float64]], Sequence[So
 """From the time since the start [s] and the IMU's pose R_world_imu (3, 3), p_world_imu (3,) to what else is in the world then."""
 
 
-class Light(BaseModel):
+class Light(Settings):
     """How bright the world is over time; 1 is day."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     swing: float = Field(0.0, ge=0, lt=1, description="the light rises and falls by this share")
     period_s: float = Field(6.0, gt=0, description="of the swing [s]")

@@ -6,8 +6,9 @@ from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from boxplus._settings import Settings
 from boxplus.cameras import CameraModel, Equidistant, Pinhole, RadialTangential
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
@@ -24,10 +25,8 @@ _AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """R_imu_camera of a camera that looks along x of the IMU, z of the IMU up."""
 
 
-class Lens(BaseModel):
+class Lens(Settings):
     """Projection of a camera: z forward, u to the right, v down, pixel centres at integers."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: LensKind = "radtan"
     intrinsics: tuple[float, float, float, float] = Field(description="fx, fy, cx, cy [px]")
@@ -50,13 +49,11 @@ class Lens(BaseModel):
         return Pinhole(*self.intrinsics, RadialTangential(*self.distortion) if self.kind == "radtan" else None)
 
 
-class Exposure(BaseModel):
+class Exposure(Settings):
     """How long the shutter is open and how much is amplified; it follows the mean brightness of the first camera.
 
     The product of time and gain follows what would give `target` with the delay of a controller; time comes first, then gain.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     auto: bool = Field(True, description="follow the light; else always `shortest_s` · `fixed`")
     target: float = Field(105.0, gt=0, lt=255, description="mean grey value aimed at")
@@ -68,14 +65,12 @@ class Exposure(BaseModel):
     jumps: float = Field(0.0, ge=0, lt=1, description="every second the exposure jumps by a factor up to 1 ± this")
 
 
-class CameraSensor(BaseModel):
+class CameraSensor(Settings):
     """A camera; the default is one of the size and lens of EuRoC's.
 
     The stamp of an image is the middle of the exposure of its middle row; row v is exposed
     `(v − (height − 1) / 2) · line_delay_s` later. Without a delay it is a global shutter.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     width: int = Field(752, ge=16, le=8192, description="[px]")
     height: int = Field(480, ge=16, le=8192, description="[px]")
@@ -96,15 +91,13 @@ class CameraSensor(BaseModel):
         return self.model_copy(update={"lens": lens, **size, "line_delay_s": self.line_delay_s / factor})
 
 
-class MountedCamera(BaseModel):
+class MountedCamera(Settings):
     """A camera on a body.
 
     Attributes:
         sensor: the camera.
         T_imu_camera: 4 × 4, camera coordinates to IMU coordinates.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sensor: CameraSensor
     T_imu_camera: tuple[tuple[float, ...], ...]
@@ -122,7 +115,7 @@ class MountedCamera(BaseModel):
         return np.array(self.T_imu_camera, dtype=np.float64)
 
 
-class CameraRig(BaseModel):
+class CameraRig(Settings):
     """Cameras that are triggered together.
 
     Attributes:
@@ -131,8 +124,6 @@ class CameraRig(BaseModel):
         exposure: common to all.
         depth: exact depth images of the first camera come with its images, as another camera.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: tuple[MountedCamera, ...] = Field(min_length=1)
     rate_hz: float = Field(20.0, gt=0, description="images a second")

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.imu import ImuSamples
@@ -35,10 +36,8 @@ _BLUR_NEAR_M = 2.5
 _STEPS_A_PIXEL = 1.5
 
 
-class CameraSimulationConfig(BaseModel):
+class CameraSimulationConfig(Settings):
     """What a simulation was made from; together with the version of boxplus it determines every bit of a built-in scenario."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     scenario: str = Field(description="name of the scenario")
     seed: int = Field(0, ge=0, description="of the noise, and of a built-in scenario's world and motion")

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.optimization.solver_options import SolverOptions
 
 # Points far away creep on for many steps that change nothing but their distance.
 _COST_TOLERANCE = 1e-8
 
 
-class BundleAdjustmentConfig(BaseModel):
+class BundleAdjustmentConfig(Settings):
     """Options of `adjust_bundle`.
 
     Example:
         >>> bp.BundleAdjustmentConfig(sigma_px=0.5, intrinsics="refined").principal_point
         'held'
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sigma_px: float = Field(1.0, gt=0, description="[px] standard deviation of a pixel measurement")
     intrinsics: Literal["held", "refined"] = Field(

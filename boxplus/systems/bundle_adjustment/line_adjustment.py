@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.vgg_lines import VggLines
@@ -37,7 +38,7 @@ _BAD_SHARE = 0.005  # of the observations that may lie behind their cameras befo
 _MOST_SIGMAS = 5.0  # of the errors' root mean square, in standard deviations
 
 
-class LineAdjustmentConfig(BaseModel):
+class LineAdjustmentConfig(Settings):
     """Options of `adjust_lines`.
 
     Example:
@@ -45,8 +46,6 @@ class LineAdjustmentConfig(BaseModel):
         >>> LineAdjustmentConfig(sigma_px=0.5, triangulate=True).use_points
         True
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sigma_px: float = Field(0.3, gt=0, description="[px] standard deviation of a segment's end across the segment")
     sigma_point_px: float = Field(0.5, gt=0, description="[px] standard deviation of a point's pixel")

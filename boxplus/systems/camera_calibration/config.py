@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.systems.camera_calibration.lens import LensKind
 
 
-class CameraCalibrationConfig(BaseModel):
+class CameraCalibrationConfig(Settings):
     """Settings of `calibrate_cameras`.
 
     Example:
         >>> bp.CameraCalibrationConfig(lens="pinhole-equi").max_views
         80
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lens: Literal["auto"] | LensKind = Field(
         "auto", description="Kalibr's name of the lens; auto takes the simplest of those that leave the smallest residuals"

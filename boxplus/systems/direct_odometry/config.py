@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class DirectOdometryConfig(BaseModel):
+class DirectOdometryConfig(Settings):
     """Settings of `DirectOdometry`; every one has a default that served indoor RGB-D and outdoor stereo alike.
 
     Example:
         >>> bp.DirectOdometryConfig(window=5).keyframe_flow > 0.0
         True
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     levels: int = Field(default=5, ge=1, le=10, description="of the image pyramid, each half the resolution of the one before")
     pixels: int = Field(default=3000, ge=300, le=100_000, description="compared at each level when a frame is tracked")

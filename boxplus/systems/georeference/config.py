@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 
-class GeoreferenceConfig(BaseModel):
+class GeoreferenceConfig(Settings):
     """How positions by satellite are weighed against an odometry, and which are believed.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> GeoreferenceConfig(lever_arm=(0.1, 0.0, 0.85)).lever_arm
         (0.1, 0.0, 0.85)
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lever_arm: tuple[float, float, float] | None = Field(
         None, description="antenna in the IMU's frame [m]; null: the recording's, and where it has none, estimated"

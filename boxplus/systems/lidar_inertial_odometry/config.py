@@ -17,7 +17,7 @@ class LidarOdometryConfig(RegistrationConfig):
     """Settings of `LidarOdometry`, which `LidarInertialOdometry` has as well; lengths in metres.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
         InputError: `box_side` is too small for `detection_range`.
 
     Example:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.systems.slam.config import LocalMapRegistrationConfig
 
 
-class LocalizationConfig(BaseModel):
+class LocalizationConfig(Settings):
     """When a place is believed to be found, and when it is lost again.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> LocalizationConfig(least_fit=0.6).least_fit
         0.6
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     registration: LocalMapRegistrationConfig = Field(
         LocalMapRegistrationConfig(), description="see LocalMapRegistrationConfig of loop closure"

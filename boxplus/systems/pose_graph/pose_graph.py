@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.losses import Loss
@@ -60,15 +61,13 @@ _LOUD = 0.2  # [rad] root mean square of the errors in rotation from which on lo
 _COUNTS = 0.5  # weight from which on an edge is expected to fit its information
 
 
-class PoseGraphConfig(BaseModel):
+class PoseGraphConfig(Settings):
     """Options of `optimize_pose_graph`.
 
     Example:
         >>> bp.PoseGraphConfig(robust="gnc").start
         'auto'
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start: Wanted = Field(
         "auto",

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.systems.slam.config import SlamConfig
 
 
-class SessionsConfig(BaseModel):
+class SessionsConfig(Settings):
     """Which encounters of two sessions are looked for, and how many of them have to agree before the two are joined.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> SessionsConfig(least_encounters=5).least_encounters
         5
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     slam: SlamConfig = Field(
         SlamConfig(least_overlap=0.6, rival_fit=0.85),

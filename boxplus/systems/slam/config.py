@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from boxplus._settings import Settings
 from boxplus.maps.descriptors.config import DescriptorConfig
 
 
-class LocalMapRegistrationConfig(BaseModel):
+class LocalMapRegistrationConfig(Settings):
     """How two local maps are laid over each other, and what their covariance is made of."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     thickness: float = Field(0.15, gt=0, description="a plane's points lie within this of it [m]")
     near: float = Field(0.5, gt=0, description="a point overlaps with a map that has one within this [m]")
@@ -26,18 +25,16 @@ class LocalMapRegistrationConfig(BaseModel):
     threads: int = Field(1, ge=1, description="the result does not depend on it")
 
 
-class SlamConfig(BaseModel):
+class SlamConfig(Settings):
     """Which loops are looked for, and which are believed.
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> SlamConfig(least_overlap=0.6).least_overlap
         0.6
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     descriptor: DescriptorConfig = Field(DescriptorConfig(), description="see DescriptorConfig")
     registration: LocalMapRegistrationConfig = Field(LocalMapRegistrationConfig(), description="see LocalMapRegistrationConfig")

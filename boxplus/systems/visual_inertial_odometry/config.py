@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from boxplus._settings import Settings
 
 # One camera knows depths by its motion alone: with eight, landmarks leave before their depth is known, and simulated flights are
 # off by a sixth to a third more than with twelve.
 _KEYFRAMES, _KEYFRAMES_MONO = 8, 12
 
 
-class VioConfig(BaseModel):
+class VioConfig(Settings):
     """Settings of `VisualInertialOdometry`; lengths in metres, times in seconds, noise as densities (per √Hz).
 
     Raises:
-        pydantic.ValidationError: a setting is unknown or out of range.
+        InputError: a setting is unknown or out of range.
 
     Example:
         >>> bp.VioConfig(keyframes=8).keyframes
         8
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: Literal["all", "first"] = Field("all", description="all cameras of the rig (stereo), or the first one alone (mono)")
     features: int = Field(150, ge=30, le=2000, description="corners followed at most")

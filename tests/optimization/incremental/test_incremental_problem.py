@@ -299,7 +299,7 @@ def test_input_is_checked_at_the_border() -> None:
         problem.add_variables(SE2, [0.0, 0.0, 0.0], name="poses")
     with pytest.raises(InputError, match="at least one selection"):
         problem.joint_covariance()
-    with pytest.raises(InputError, match=r"settings of IncrementalOptions .*– got threshold"):
+    with pytest.raises(InputError, match=r"a setting of IncrementalOptions – got 'threshold'"):
         IncrementalProblem(threshold=0.1)
     with pytest.raises(InputError, match="options or single settings"):
         IncrementalProblem(other.options, tolerance=0.1)

@@ -29,7 +29,7 @@ def test_unknown_keys_are_refused() -> None:
 
 
 def test_it_is_frozen() -> None:
-    with pytest.raises(ValidationError, match="frozen"):
+    with pytest.raises(InputError, match="LioConfig as it was made – got another scan_voxel – make a new one"):
         LioConfig().scan_voxel = 1.0  # type: ignore[misc]
 
 
@@ -58,13 +58,13 @@ def test_an_extrinsic_with_few_digits_becomes_a_rotation() -> None:
     ],
 )
 def test_a_bad_extrinsic_is_explained(T: np.ndarray, message: str) -> None:
-    with pytest.raises(ValidationError) as error:
+    with pytest.raises(InputError) as error:
         LioConfig(T_imu_lidar=_nested(T))
     assert message in str(error.value)
 
 
 def test_a_box_that_would_oscillate_is_refused() -> None:
-    with pytest.raises((InputError, ValidationError)) as error:
+    with pytest.raises(InputError) as error:
         LioConfig(box_side=1000.0, detection_range=450.0)
     assert "expected box_side above 3.5 × detection_range = 1575 m – got 1000 m – enlarge box_side" in str(error.value)
     assert LioConfig(box_side=1576.0, detection_range=450.0).box_side == 1576.0

@@ -1,0 +1,58 @@
+"""Settings by name: what does not fit is refused in the form of every other input, with what was meant."""
+
+from __future__ import annotations
+
+import pytest
+
+import boxplus as bp
+from boxplus._settings import Settings, suggestion
+from boxplus.runs.lidar_inertial.config import RunConfig
+from boxplus.runs.settings_file import load_settings
+
+CONFIGS = [value for name in dir(bp) if isinstance(value := getattr(bp, name), type) and issubclass(value, Settings)]
+
+
+def test_all_public_settings_are_of_one_kind():
+    names = {kind.__name__ for kind in CONFIGS}
+    assert {name for name in dir(bp) if name.endswith(("Config", "Options"))} <= names
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_an_unknown_setting_is_refused_with_those_there_are(kind):
+    known = next(iter(kind.model_fields))
+    with pytest.raises(bp.InputError, match=rf"a setting of {kind.__name__} – got '{known}z' – did you mean .*{known}"):
+        kind(**{f"{known}z": 1})
+    with pytest.raises(bp.InputError, match=rf"expected settings of {kind.__name__} by name – got {{}} – write e.g."):
+        kind({})
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_a_value_of_another_type_is_refused_with_what_the_setting_means(kind):
+    for name, field in kind.model_fields.items():
+        with pytest.raises(bp.InputError, match=rf"value for {name}\S* of {kind.__name__} .*– got <object .*– correct"):
+            kind(**{name: object()})
+        assert field.description
+
+
+def test_settings_in_settings_are_named_with_their_place():
+    with pytest.raises(bp.InputError, match=r"a setting of SolverOptions – got 'methods' – did you mean method\?"):
+        bp.BundleAdjustmentConfig(solver={"methods": "dogleg"})
+    with pytest.raises(bp.InputError, match=r"for solver.method of BundleAdjustmentConfig \(how a step is chosen\)"):
+        bp.BundleAdjustmentConfig(solver={"method": "newton"})
+
+
+def test_settings_stay_as_they_are_made():
+    config = bp.BundleAdjustmentConfig()
+    with pytest.raises(bp.InputError, match="as it was made – got another sigma_px"):
+        config.sigma_px = 3.0
+    assert config.model_copy(update={"sigma_px": 3.0}).sigma_px == 3.0
+
+
+def test_a_name_that_is_part_of_others_brings_them_all():
+    assert suggestion("voxel", ["odometry.scan_voxel", "map.voxel", "odometry.threads"], "setting").startswith(
+        "did you mean map.voxel or odometry.scan_voxel? the settings are: "
+    )
+    with pytest.raises(bp.InputError, match=r"got 'sigma' – did you mean .*map_sigma"):
+        load_settings(RunConfig, settings=["sigma=0.1"])
+    with pytest.raises(bp.InputError, match="got 'voxel' – did you mean scan_voxel"):
+        bp.LioConfig(voxel=0.5)
