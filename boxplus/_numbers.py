@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,19 @@ def as_floats(values: ArrayLike, what: str) -> NDArray[np.float64]:
     if array.dtype.kind == "O":
         try:
             return array.astype(np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{what} as real numbers", f"Python objects: {error}", "convert them to floats first") from None
     return as_numbers(array, what).astype(np.float64, copy=False)
+
+
+def is_finite(value: object) -> bool:
+    """Whether it is one real number, neither NaN nor infinite; text, arrays with axes and None are none."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    try:
+        return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
 
 
 def as_array(values: ArrayLike, what: str) -> NDArray[Any]:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from boxplus._arguments import shown
 from boxplus._jit import kernel
+from boxplus._numbers import is_finite
 from boxplus.errors import InputError
 
 _ITERATIONS = 50
@@ -74,8 +76,8 @@ Distortion = Radial | RadialTangential
 def _check_finite(model: Distortion) -> None:
     for field in fields(model):
         value = getattr(model, field.name)
-        if value is not None and not math.isfinite(value):
-            raise InputError(f"{field.name} finite", f"{value}", "take the coefficients from a calibration")
+        if value is not None and not is_finite(value):
+            raise InputError(f"{field.name} finite", shown(value), "take the coefficients from a calibration")
 
 
 @kernel(inline=True)

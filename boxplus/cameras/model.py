@@ -7,6 +7,7 @@ from boxplus.cameras.wide_angle import DoubleSphere, Equidistant
 from boxplus.errors import InputError
 
 CameraModel = Pinhole | Equidistant | DoubleSphere
+CAMERA_MODELS = (Pinhole, Equidistant, DoubleSphere)
 
 
 def check_pinhole(camera: CameraModel, what: str) -> Pinhole:

@@ -7,15 +7,16 @@ k1, k2, p1, p2, k3. A shorter model is the longer one with zeros, so that one ke
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import require, shown
 from boxplus._jit import kernel
-from boxplus.cameras.distortion import Distortion, distort, undistort
+from boxplus._numbers import is_finite
+from boxplus.cameras.distortion import Distortion, Radial, RadialTangential, distort, undistort
 from boxplus.errors import InputError
 from boxplus.manifolds._batch import as_batch
 
@@ -159,17 +160,23 @@ class Pinhole:
     z_min: float = 0.05
 
     def __post_init__(self) -> None:
+        require(
+            self.distortion,
+            (Radial, RadialTangential, type(None)),
+            "distortion Radial, RadialTangential or None",
+            "give one of them",
+        )
         for name in ("fx", "fy"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
+            if not (is_finite(value) and value > 0.0):
                 raise InputError(
-                    f"{name} positive and finite [px]", f"{value}", "a camera that looks along −z: turn its frame first"
+                    f"{name} positive and finite [px]", shown(value), "a camera that looks along −z: turn its frame first"
                 )
         for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
-                raise InputError(f"{name} finite [px]", f"{getattr(self, name)}", "give the principal point in pixels")
-        if not (math.isfinite(self.z_min) and self.z_min >= 0.0):
-            raise InputError("z_min finite and not negative [m]", f"{self.z_min}", "leave it out for 0.05 m")
+            if not is_finite(getattr(self, name)):
+                raise InputError(f"{name} finite [px]", shown(getattr(self, name)), "give the principal point in pixels")
+        if not (is_finite(self.z_min) and self.z_min >= 0.0):
+            raise InputError("z_min finite and not negative [m]", shown(self.z_min), "leave it out for 0.05 m")
 
     @property
     def parameters(self) -> NDArray[np.float64]:

@@ -13,6 +13,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import shown
+from boxplus._numbers import is_finite
 from boxplus.cameras.pinhole import INTRINSICS
 from boxplus.cameras.projection import DOUBLE_SPHERE, EQUIDISTANT, bearing_batch, project_batch
 from boxplus.errors import InputError
@@ -36,13 +38,13 @@ class _WideAngle(ABC):
     def _check(self) -> None:
         for name in ("fx", "fy"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} positive and finite [px]", f"{value}", "take it from a calibration")
+            if not (is_finite(value) and value > 0.0):
+                raise InputError(f"{name} positive and finite [px]", shown(value), "take it from a calibration")
         for name in self.parameter_names[2:]:
-            if not math.isfinite(getattr(self, name)):
-                raise InputError(f"{name} finite", f"{getattr(self, name)}", "take it from a calibration")
-        if not (math.isfinite(self.nearest) and self.nearest >= 0.0):
-            raise InputError("nearest finite and not negative [m]", f"{self.nearest}", "leave it out for 0.05 m")
+            if not is_finite(getattr(self, name)):
+                raise InputError(f"{name} finite", shown(getattr(self, name)), "take it from a calibration")
+        if not (is_finite(self.nearest) and self.nearest >= 0.0):
+            raise InputError("nearest finite and not negative [m]", shown(self.nearest), "leave it out for 0.05 m")
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import choice, require
+from boxplus._numbers import is_finite
 from boxplus.errors import InputError
 from boxplus.evaluation.time_offset import TimeOffset, estimate_time_offset
 from boxplus.formats.trajectory import Trajectory
@@ -129,7 +131,11 @@ def associate(
         InputError: no overlap in time, too few matches, stamps that look like another unit, one trajectory with stamps and
             one without, or different lengths without stamps.
     """
-    if min_matches < 1 or not max_difference_s > 0 or not max_gap_s > 0 or not np.isfinite(offset_s):
+    for name, poses in (("estimate", estimate), ("ground_truth", ground_truth)):
+        require(poses, Trajectory, f"a Trajectory as {name}", "read it with read_trajectory, or make one from arrays")
+    choice(method, ("nearest", "interpolate"), "method")
+    numbers = (max_difference_s, max_gap_s, min_matches, offset_s)
+    if not (all(map(is_finite, numbers)) and min_matches >= 1 and max_difference_s > 0 and max_gap_s > 0):
         raise InputError(
             "positive max_difference_s, max_gap_s and min_matches and a finite offset_s",
             f"{max_difference_s}, {max_gap_s}, {min_matches} and {offset_s}",

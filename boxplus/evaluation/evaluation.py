@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import choice, shown
+from boxplus._numbers import is_finite
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_origin, principal_spread
 from boxplus.evaluation.association import Association, associate
@@ -205,6 +207,14 @@ def evaluate(
         0.0
     """
 
+    choice(alignment, _KINDS, "alignment")
+    choice(rpe_pairs, ("consecutive", "all"), "rpe_pairs")
+    choice(rpe_path_of, ("estimate", "ground_truth"), "rpe_path_of")
+    if plane is not None:
+        choice(plane, ("xy", "xz", "yz"), "None or a plane")
+    if not (isinstance(deltas, Sequence) and all(isinstance(delta, Delta) for delta in deltas)):
+        raise InputError("deltas as a list of Delta", shown(deltas), 'write e.g. [Delta(10.0, "m")]')
+
     def matches(offset_s: float) -> Association:
         return associate(
             estimate, ground_truth, method, max_difference_s, offset_s=offset_s, max_gap_s=max_gap_s, min_matches=min_matches
@@ -258,9 +268,9 @@ def _find_alignment(association: Association, kind: AlignmentKind, first: int | 
     estimate, truth = association.estimate, association.ground_truth
     if kind == "origin":
         return align_origin(estimate, truth)
-    if first is not None and not 3 <= first <= len(association):
+    if first is not None and not (is_finite(first) and first == int(first) and 3 <= first <= len(association)):
         raise InputError(
-            f"3 to {len(association)} matched poses to align by", f"{first}", "choose another number, or leave --n-to-align out"
+            f"3 to {len(association)} matched poses to align by", shown(first), "choose another number, or leave --n-to-align out"
         )
     return align(estimate.p[:first], truth.p[:first], kind)
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from boxplus._arguments import as_path
 from boxplus.errors import OutputError
 
 TEMPORARY_SUFFIX = ".boxplus-tmp"
@@ -37,7 +38,7 @@ def make_folder(folder: str | Path) -> Path:
     Raises:
         OutputError: it cannot be created.
     """
-    path = Path(folder)
+    path = as_path(folder, "a folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -54,7 +55,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     Raises:
         OutputError: the file cannot be created, written or renamed (full disk, no permission).
     """
-    target = Path(path)
+    target = as_path(path, "a file")
     temporary = target.with_name(target.name + TEMPORARY_SUFFIX)
     try:
         with temporary.open("w+b") as file:
@@ -80,7 +81,7 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
     Raises:
         OutputError: a folder cannot be created, removed or renamed.
     """
-    target = Path(path)
+    target = as_path(path, "a file")
     made, earlier = (target.with_name(target.name + ending) for ending in (TEMPORARY_SUFFIX, EARLIER_SUFFIX))
     try:
         if earlier.exists() and not target.exists():

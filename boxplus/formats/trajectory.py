@@ -10,6 +10,8 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_path, require
+from boxplus._numbers import as_array, as_floats
 from boxplus.errors import InputError
 from boxplus.formats.numbers.lines import refuse_binary
 from boxplus.formats.output import atomic_file
@@ -147,7 +149,7 @@ class Trajectory:
 
 
 def _array(values: ArrayLike, shape: tuple[int | None, ...], name: str, source: str) -> NDArray[np.float64]:
-    array = np.ascontiguousarray(values, dtype=np.float64)
+    array = np.ascontiguousarray(as_floats(values, name))
     if array.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
         expected = "(" + ", ".join("N" if want is None else str(want) for want in shape) + ")"
         raise InputError(f"{name} of shape {expected}", f"shape {array.shape} ({source})", "give one row per pose")
@@ -155,7 +157,7 @@ def _array(values: ArrayLike, shape: tuple[int | None, ...], name: str, source: 
 
 
 def _times(time_ns: ArrayLike, count: int, source: str, where: Callable[[int], str]) -> NDArray[np.int64]:
-    time = np.asarray(time_ns)
+    time = as_array(time_ns, "time_ns")
     if time.shape != (count,) or (time.dtype.kind not in "iu" and count):
         raise InputError(
             f"time_ns as integer nanoseconds of shape ({count},)",
@@ -195,10 +197,11 @@ def read_trajectory(path: str | Path, format: Format | Literal["auto"] = "auto")
         >>> truth.p.shape[1], bool((np.diff(truth.time_ns) > 0).all())
         (3, True)
     """
-    table = read_table(Path(path), format)
+    path = as_path(path, "a trajectory")
+    table = read_table(path, format)
     if table is not None:
         return _of_table(table, str(path))
-    lines, complete = _read_lines(Path(path))
+    lines, complete = _read_lines(path)
     rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if rows and format != "kitti" and is_header(rows[0][1]):
         layout = detect_format(rows[0][1], str(path)) if format == "auto" else format
@@ -328,6 +331,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         >>> bp.read_trajectory("way.tum").time_ns.tolist()
         [0, 1000000000]
     """
+    require(trajectory, Trajectory, "a Trajectory", "make one from arrays")
     times = trajectory.times.tolist()
     with atomic_file(path) as file:
         file.writelines(tum_row(*row).encode() for row in zip(times, trajectory.p, trajectory.q_wxyz, strict=True))
@@ -345,6 +349,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
         >>> bp.read_trajectory("way.txt").time_ns is None  # the format has no times
         True
     """
+    require(trajectory, Trajectory, "a Trajectory", "make one from arrays")
     with atomic_file(path) as file:
         file.writelines(kitti_row(*row).encode() for row in zip(trajectory.R, trajectory.p, strict=True))
 
@@ -362,6 +367,7 @@ def write_csv(path: str | Path, trajectory: Trajectory) -> None:
         >>> bp.read_trajectory("way.csv").p.tolist()
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
+    require(trajectory, Trajectory, "a Trajectory", "make one from arrays")
     times = trajectory.times.tolist()
     covariance = trajectory.covariance
     with atomic_file(path) as file:

@@ -45,12 +45,16 @@ class KernelManifold(Manifold):
         points, tangents, lead = pair_rows("x", x, self.size, "delta", delta, self.dof)
         out = np.empty((len(points), self.size))
         self.boxplus_into(points, tangents, out)
+        if not np.isfinite(out).all():
+            self._refuse_none(x=points)
         return out.reshape((*lead, self.size))
 
     def boxminus(self, x: ArrayLike, base: ArrayLike) -> NDArray[np.float64]:
         points, bases, lead = pair_rows("x", x, self.size, "base", base, self.size)
         out = np.empty((len(points), self.dof))
         self.boxminus_into(points, bases, out)
+        if not np.isfinite(out).all():
+            self._refuse_none(x=points, base=bases)
         return out.reshape((*lead, self.dof))
 
     def boxplus_jacobian(self, x: ArrayLike, delta: ArrayLike) -> NDArray[np.float64]:
@@ -64,6 +68,11 @@ class KernelManifold(Manifold):
         J = np.zeros((len(points), self.dof, self.dof))
         self.boxminus_jacobian_into(points, bases, J)
         return J.reshape((*lead, self.dof, self.dof))
+
+    def _refuse_none(self, **points: NDArray[np.float64]) -> None:
+        """Refuse finite numbers that are no points, such as quaternions of zeros; NaN gives NaN."""
+        for name, rows in points.items():
+            self.check(name, rows[np.isfinite(rows).all(axis=1)])
 
     def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
         return checked_rows(name, x, self.size, self.name)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from boxplus._arguments import as_settings
 from boxplus._jit import kernel
 from boxplus._settings import Settings
 
@@ -64,7 +65,7 @@ class SeenThrough:
     """
 
     def __init__(self, points: Floats, sessions: int = 1, config: SeenThroughConfig | None = None) -> None:
-        self.config = config if config is not None else SeenThroughConfig()
+        self.config = as_settings(SeenThroughConfig, config)
         keys = _keys(points, self.config.voxel)
         self._keys, row, counts = np.unique(keys, return_inverse=True, return_counts=True)
         self.middle = np.stack([np.bincount(row, points[:, a]) for a in range(3)], axis=1) / counts[:, None]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import require
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangents.change import tangent_change
@@ -141,6 +142,7 @@ def check_jacobian(
         >>> report.passed
         True
     """
+    require(residual, Residual, "a residual", "give one of boxplus.residuals, or a subclass of boxplus.residuals.Residual")
     moved = tuple(residual.manifolds if manifolds is None else manifolds)
     if len(moved) != len(residual.manifolds):
         raise InputError(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
@@ -338,9 +339,7 @@ class Problem:
             SingularProblemError: Gauss-Newton met a problem that does not determine its variables.
         """
         begin = time.perf_counter()
-        if options is not None and settings:
-            raise InputError("options or single settings", "both", "put the settings into the options")
-        options = options if options is not None else SolverOptions(**settings)
+        options = as_settings(SolverOptions, options, settings)
         model, notes, analysis = self._analyse(options)
         for stage in model.timing_s:
             model.timing_s[stage] = 0.0

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import require
 from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
@@ -244,6 +245,7 @@ def values_at(blocks: Sequence[Variables], given: Solution | Sequence[NDArray[np
     if given is None:
         return [block.values.copy() for block in blocks]
     values = given.values_of(blocks) if isinstance(given, Solution) else given
+    require(values, Sequence, "a Solution, or a list with an array for each block", "give what `solve` returned")
     if len(values) != len(blocks):
         raise InputError(f"values of {len(blocks)} blocks", f"{len(values)}", "give one array for each block")
     if isinstance(given, Solution):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from boxplus._arguments import as_path, as_settings
 from boxplus.errors import RecordingError
 from boxplus.recordings.bags.bag import open_bag
 from boxplus.recordings.kitti import open_kitti
@@ -31,8 +32,8 @@ def open_recording(path: str | Path, options: RecordingOptions | None = None) ->
         ...     print(recording.info.format, recording.info.point_time.unit, scans)
         ROS 1 bag s 19
     """
-    options = options or RecordingOptions()
-    recording = _open(Path(path), options)
+    options = as_settings(RecordingOptions, options)
+    recording = _open(as_path(path, "a recording"), options)
     if options.lidar_time_offset_s:
         recording.shift_lidar(options.lidar_time_offset_s)
     return recording

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from numpy.typing import ArrayLike
 
+from boxplus._arguments import require
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
 from boxplus.residuals.whitening import Whitening
@@ -35,6 +36,7 @@ class Prior(Residual):
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
+        require(manifold, Manifold, "a manifold", "give one such as boxplus.SE3 or boxplus.Euclidean(3)")
         self.mean = manifold.check("mean", mean)
         count = len(self.mean)
         super().__init__(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.maps.floor_plan.occupancy import FloorPlanConfig, Occupancy
@@ -41,7 +42,7 @@ class MapFromAbove:
 
     def __init__(self, folder: str | Path, config: FloorPlanConfig | None = None, z: tuple[float, float] | None = None) -> None:
         run = RunFolder(Path(folder))
-        self._config = config if config is not None else FloorPlanConfig()
+        self._config = as_settings(FloorPlanConfig, config)
         self.store = TileStore.open(run.tiles)
         self.frame = read_origin(run.path)
         p = read_trajectory(run.trajectory).p

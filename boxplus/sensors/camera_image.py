@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import require
 from boxplus.errors import InputError
 
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
@@ -43,6 +44,10 @@ class CameraImage:
     depth_unit_m: float | None = None
 
     def __post_init__(self) -> None:
+        require(self.pixels, np.ndarray, "pixels as an array", "convert the image with np.asarray")
+        for name in ("camera", "time_ns"):
+            require(getattr(self, name), (int, np.integer), f"{name} as an integer", "times are nanoseconds, cameras numbers")
+        require(self.name, str, "name as text", "give that of the topic, the folder or the sensor")
         pixels, kind = self.pixels, np.dtype(self.pixels.dtype)
         if self.depth_unit_m is not None:
             if not 0.0 < self.depth_unit_m < np.inf:

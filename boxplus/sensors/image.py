@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus._numbers import as_array
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.residuals.camera.photometric_sampling import checked_image
@@ -37,7 +38,7 @@ class Image:
         Raises:
             InputError: another shape, fewer than 2×2 pixels, or values that are not finite.
         """
-        array = np.asarray(values)
+        array = as_array(values, "image")
         if array.ndim == 3 and array.shape[2] in (3, 4):
             array = array[..., :3].astype(np.float32) @ _LUMA
         return cls(checked_image("image", array))

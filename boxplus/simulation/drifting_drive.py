@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from boxplus._arguments import as_settings
 from boxplus._settings import Settings
 from boxplus.manifolds import quaternion, se3
 from boxplus.simulation.motions.trajectories import rounded
@@ -70,7 +71,7 @@ def simulate_drifting_drive(world: World, route: ArrayLike, config: DriftConfig 
     Example:
         `simulate_drifting_drive(city(), [[0, 0], [60, 0], [60, 60], [0, 60], [0, 0], [60, 0]])`
     """
-    config = config if config is not None else DriftConfig()
+    config = as_settings(DriftConfig, config)
     random = np.random.Generator(np.random.PCG64([seed, 700]))
     time_ns, truth, odometry, covariance = _driven(route, config, random)
     scans = [_scan(world, T, config, random) for T in truth]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from boxplus._arguments import as_settings
 from boxplus._settings import Settings
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
@@ -59,7 +60,7 @@ def simulate_gnss(
     Raises:
         InputError: poses whose quaternions are not of unit length.
     """
-    config = config if config is not None else GnssConfig()
+    config = as_settings(GnssConfig, config)
     random = np.random.Generator(np.random.PCG64([seed, 900]))
     t, T = np.asarray(time_ns, dtype=np.int64), SE3.check("T_enu_imu", T_enu_imu)
     step = round(1e9 / config.rate_hz)

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from boxplus._arguments import require, shown
+from boxplus._numbers import as_floats, is_finite
 from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
@@ -171,11 +173,16 @@ def simulate(
     """
     from dataclasses import replace
 
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError("seed as an integer from 0", shown(seed), "leave it out for 0")
     chosen = make_scenario(scenario, seed) if isinstance(scenario, str) else scenario
+    require(chosen, Scenario, "the name of a scenario, or a Scenario", "choose one of boxplus.simulation.SCENARIOS")
+    if duration_s is not None and not is_finite(duration_s):
+        raise InputError("duration_s as a number [s]", shown(duration_s), "leave it out for all of the motion")
     if lidar is not None:
         chosen = replace(chosen, lidar=lidar)
     if imu is not None:
         chosen = replace(chosen, imu=imu)
     if T_imu_lidar is not None:
-        chosen = replace(chosen, T_imu_lidar=np.asarray(T_imu_lidar, dtype=np.float64))
+        chosen = replace(chosen, T_imu_lidar=as_floats(T_imu_lidar, "T_imu_lidar"))
     return Simulation(chosen, seed, duration_s)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.formats.graphs.graph_builder import GraphBuilder
 from boxplus.formats.graphs.information_matrix import INDEFINITE, examine, triangle_index
@@ -71,7 +72,7 @@ def read_g2o(
     ):
         if value not in known:
             raise InputError(f"{name} as one of {', '.join(known)}", repr(value), "choose one of them")
-    source = Path(path)
+    source = as_path(path, "a pose graph")
     builder = GraphBuilder(source, _TAGS, ignore_unknown)
     for chunk in read_number_lines(source, _TAGS):
         builder.note_unknown(chunk)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.formats.graphs.g2o import CrossBlock, RotationError, read_g2o, write_g2o
 from boxplus.formats.graphs.pose_graph import PoseGraph
@@ -22,7 +23,7 @@ def graph_format(path: str | Path) -> GraphFormat:
     Raises:
         InputError: the file cannot be read.
     """
-    source = Path(path)
+    source = as_path(path, "a pose graph")
     try:
         with source.open("rb") as file:
             for line in file:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_path
 from boxplus.formats.graphs.graph_builder import GraphBuilder
 from boxplus.formats.graphs.information_matrix import triangle_index
 from boxplus.formats.graphs.pose_graph import PoseGraph
@@ -52,7 +53,7 @@ def read_toro(path: str | Path, *, ignore_unknown: bool = False) -> PoseGraph:
         >>> bp.formats.read_toro("loop.graph").measurements.round(3).tolist()
         [[1.571, 1.0, 0.0], [-1.571, 0.0, 1.0]]
     """
-    source = Path(path)
+    source = as_path(path, "a pose graph")
     builder = GraphBuilder(source, _TAGS, ignore_unknown)
     for chunk in read_number_lines(source, _TAGS):
         builder.note_unknown(chunk)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.formats.numbers.lines import NumberLines, read_number_lines
 from boxplus.formats.numbers.parser import OTHER
@@ -39,7 +40,7 @@ def read_bal_text(path: str | Path, camera_size: int, header: str = "", header_s
         InputError: a malformed line, an index out of range, a value that is not finite, fewer or more numbers than the
             first line promises; the message names file and line.
     """
-    source = Path(path)
+    source = as_path(path, "a reconstruction")
     state = _State(source, camera_size, header, header_size)
     for chunk in read_number_lines(source):
         state.read(chunk)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.formats.output import make_folder
 from boxplus.formats.reconstructions import colmap_binary, colmap_text
@@ -27,7 +28,7 @@ def read_colmap(path: str | Path) -> ColmapModel:
         >>> model.format, model.T_camera_world.shape
         ('text', (6, 7))
     """
-    folder = Path(path)
+    folder = as_path(path, "a reconstruction")
     if folder.is_file():
         if folder.name in colmap_text.FILES:
             return colmap_text.read_colmap_text(folder.parent)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.formats.numbers.lines import first_text
 from boxplus.formats.reconstructions.bal import BalProblem, read_bal, write_bal
@@ -35,7 +36,7 @@ def read_reconstruction(path: str | Path, format: ReconstructionFormat = "auto")
         >>> type(scene).__name__, scene.cameras.shape, scene.points.shape
         ('BalProblem', (6, 9), (40, 3))
     """
-    source = Path(path)
+    source = as_path(path, "a reconstruction")
     if not source.exists():
         raise InputError("a bundle adjustment file or the folder of a COLMAP model", f"{source}: no such file", "check the path")
     if format == "auto":

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_path
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion
 
@@ -76,7 +77,7 @@ def read_vgg_lines(folder: str | Path) -> VggLines:
         >>> len(lines.names), len(lines.end_points_world), lines.segments.shape
         (6, 12, (72, 4))
     """
-    root = Path(folder)
+    root = as_path(folder, "a line set")
     if not root.is_dir():
         raise InputError("a folder with *.P, *.lines, *l3d and *nview-lines", f"{root}", "check the path")
     cameras = sorted(root.glob("*.P"))

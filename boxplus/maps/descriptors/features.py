@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._extras import require
 from boxplus._jit import kernel
 from boxplus.maps.descriptors.config import DescriptorConfig
@@ -47,7 +48,7 @@ def describe(points: ArrayLike, config: DescriptorConfig | None = None) -> Featu
     Raises:
         InputError: OpenCV, the extra `vision`, is not installed; what `density_image` refuses.
     """
-    config = config if config is not None else DescriptorConfig()
+    config = as_settings(DescriptorConfig, config)
     cv2 = require("cv2", "which describes density images")
     image = density_image(points, config.cell)
     # A margin of empty ground: corners at the rim of what was seen are described too.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.maps.descriptors.config import DescriptorConfig
@@ -85,7 +86,7 @@ class PlaceIndex:
     """
 
     def __init__(self, config: DescriptorConfig | None = None) -> None:
-        self.config = config if config is not None else DescriptorConfig()
+        self.config = as_settings(DescriptorConfig, config)
         self._places: list[Features] = []
         self._count = 0
         self._bits = np.zeros((_FIRST, WORDS), dtype=np.uint64)

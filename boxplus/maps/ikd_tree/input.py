@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus._numbers import as_array, as_floats
+from boxplus._numbers import as_array, as_floats, is_finite
 from boxplus.errors import InputError
 
 
@@ -41,6 +41,11 @@ def round_up(values: NDArray[np.float64]) -> NDArray[np.float32]:
     """The smallest float32 not less than each value."""
     rounded = values.astype(np.float32)
     return np.where(rounded < values, np.nextafter(rounded, np.float32(np.inf)), rounded)
+
+
+def is_length(value: object) -> bool:
+    """Whether it is a positive finite number [m]."""
+    return is_finite(value) and float(value) > 0.0  # type: ignore[arg-type]
 
 
 def round_down(value: float) -> np.float32:

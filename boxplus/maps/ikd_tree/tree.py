@@ -14,7 +14,7 @@ from boxplus.errors import InputError
 from boxplus.maps.ikd_tree.batch import fill_operations, keep_near, update_batch
 from boxplus.maps.ikd_tree.check import check_tree
 from boxplus.maps.ikd_tree.collect import collect, nearest_batch
-from boxplus.maps.ikd_tree.input import as_corner, as_points, round_down, round_up
+from boxplus.maps.ikd_tree.input import as_corner, as_points, is_length, round_down, round_up
 from boxplus.maps.ikd_tree.job import Rebuilder, build_pool, new_work
 from boxplus.maps.ikd_tree.leaf import BUCKET
 from boxplus.maps.ikd_tree.pool import LEFT, ROOT, new_pool, pool_bytes, reserve, slot_counts
@@ -95,8 +95,8 @@ class IkdTree:
             raise InputError("balance_ratio in (0.5, 1)", str(balance_ratio), "take 0.6")
         if not 0.0 < delete_ratio < 1.0:
             raise InputError("delete_ratio in (0, 1)", str(delete_ratio), "take 0.5")
-        if cell_size is not None and not (np.isfinite(cell_size) and cell_size > 0):
-            raise InputError("cell_size above 0 m", str(cell_size), "give the side of a downsampling cell in metres")
+        if cell_size is not None and not is_length(cell_size):
+            raise InputError("cell_size above 0 m", repr(cell_size), "give the side of a downsampling cell in metres")
         if threads < 1:
             raise InputError("threads of at least 1", str(threads), "take 1")
         self._guard = ThreadGuard("IkdTree")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
@@ -44,7 +45,7 @@ class LocalMapBuilder:
     """
 
     def __init__(self, config: LocalMapConfig | None = None) -> None:
-        self.config = config if config is not None else LocalMapConfig()
+        self.config = as_settings(LocalMapConfig, config)
         self._seen: list[_Seen] = []
         self._last: _Seen | None = None  # the scan that the frame of the last map stands at
         self._T_odo_before: Floats | None = None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._thread_guard import ThreadGuard, changes
 from boxplus.errors import InputError, NotFiniteError, SingularProblemError
 from boxplus.manifolds.manifold import Manifold
@@ -20,7 +21,7 @@ from boxplus.optimization.incremental.reports import IncrementalSolution, Increm
 from boxplus.optimization.incremental.variables import GrowingVariables, gather_points, scatter_points
 from boxplus.optimization.losses import Loss, Squared
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.terms.connections import check_connections, require_connections
+from boxplus.optimization.terms.connections import check_connections, require_connections, require_manifold
 from boxplus.optimization.terms.faded import faded_notes, faded_shares
 from boxplus.optimization.terms.group import Group, broadcast
 from boxplus.optimization.terms.jacobian_notes import wrong_jacobians
@@ -60,9 +61,7 @@ class IncrementalProblem:
     """
 
     def __init__(self, options: IncrementalOptions | None = None, **settings: Any) -> None:
-        if options is not None and settings:
-            raise InputError("options or single settings", "both", "put the settings into the options")
-        self.options = options if options is not None else IncrementalOptions(**settings)
+        self.options = as_settings(IncrementalOptions, options, settings)
         self.blocks: list[GrowingVariables] = []
         self._guard = ThreadGuard("IncrementalProblem")
         self._tree = BayesTree()
@@ -91,6 +90,7 @@ class IncrementalProblem:
         Raises:
             InputError: wrong shape, not finite, off the manifold; a name that is taken.
         """
+        require_manifold(manifold)
         label = name if name is not None else f"{manifold.name}_{len(self.blocks)}"
         if any(block.name == label for block in self.blocks):
             raise InputError("a new name", f"{label!r}, which another block has", "choose another name, or extend that block")

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import require
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
@@ -98,6 +99,7 @@ def world_gauge(
         >>> gauge.names
         ('translation x', 'translation y', 'translation z', 'yaw')
     """
+    require(blocks, Mapping, "the meaning of every block, by block", 'write e.g. world_gauge({poses: "world_from_body"})')
     axis = as_floats(up, "up")
     if axis.shape != (3,) or not 0.0 < float(np.linalg.norm(axis)) < math.inf:
         raise InputError("up as an axis (3,)", repr(up), "give (0, 0, 1) in a world with z up")
@@ -118,6 +120,7 @@ def world_gauge(
         columns.append(np.eye(7)[:, 6])
     motions = np.stack(columns, axis=1)
     for block, kind in blocks.items():
+        require(block, Variables, "blocks of variables", 'write e.g. world_gauge({poses: "world_from_body"})')
         if kind not in kinds_of(block.manifold):
             raise InputError(f"for {block.name!r} one of {', '.join(kinds_of(block.manifold))}", repr(kind), "choose one of them")
     tangents = {block.name: _tangents(block.manifold, kind, motions) for block, kind in blocks.items()}

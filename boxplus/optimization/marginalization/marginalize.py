@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import require, shown
 from boxplus.errors import InputError
 from boxplus.optimization.marginalization.leak import Gauge, Leak, leak_of
 from boxplus.optimization.marginalization.rows import Columns, prior_of, triangle_of
@@ -82,7 +83,11 @@ def marginalize(
         >>> np.allclose(problem.solve().standard_deviations(poses[1]), sigma)
         True
     """
-    chosen = [leaving] if isinstance(leaving, (VariableRows, Variables)) else list(leaving)
+    require(problem, Problem, "a Problem", "make one with boxplus.Problem()")
+    require(gauge, (Gauge, type(None)), "a Gauge or None", "make one with world_gauge")
+    chosen = [leaving] if isinstance(leaving, (VariableRows, Variables)) else leaving
+    if not (isinstance(chosen, Sequence) and all(isinstance(part, (VariableRows, Variables)) for part in chosen)):
+        raise InputError("variables to marginalise", shown(leaving), "select rows of a block, such as poses[[0]]")
     if not any(len(part) for part in chosen):
         raise InputError("variables to marginalise", "none", "select rows of a block, such as poses[[0]]")
     if isinstance(at, Solution) and not at.is_of(problem.blocks):

@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.optimization.losses import Huber
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
@@ -77,7 +78,7 @@ def solve_from_convex(
     Example:
         `solution = solve_from_convex(problem)` after `problem.add_residuals(..., loss=bp.losses.Tukey(4.685))`
     """
-    options = options if options is not None else SolverOptions()
+    options = as_settings(SolverOptions, options)
     begin = time.perf_counter()
     stopped = False
 

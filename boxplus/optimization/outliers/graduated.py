@@ -14,14 +14,16 @@ up again instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings, choice, require, shown
 from boxplus._chi_square import chi_square_quantile
+from boxplus._numbers import as_floats, is_finite
 from boxplus.errors import InputError
 from boxplus.optimization.losses import GemanMcClure, Squared, Truncated
 from boxplus.optimization.minimizers.minimize import Callback
@@ -124,16 +126,14 @@ def graduate(
         >>> np.flatnonzero(~bp.graduate(problem, group).inliers["x"])
         array([20, 21])
     """
-    chosen = [groups] if isinstance(groups, Group) else list(groups)
+    require(problem, Problem, "a Problem", "make one with boxplus.Problem()")
+    chosen = [groups] if isinstance(groups, Group) else list(groups) if isinstance(groups, Iterable) else []
     if not chosen or not all(any(group is own for own in problem.groups) for group in chosen):
-        raise InputError("groups of this problem", f"{chosen}", "give what `add_residuals` returned")
-    if not (math.isfinite(narrowing) and narrowing > 1.0):
-        raise InputError("a narrowing above 1", f"{narrowing}", "leave it at 1.4")
-    if options is not None and settings:
-        raise InputError("options or single settings", "both", "put the settings into the options")
-    if loss not in ("geman_mcclure", "truncated"):
-        raise InputError("the loss geman_mcclure or truncated", repr(loss), "choose one of them")
-    last = options if options is not None else SolverOptions(**settings)
+        raise InputError("groups of this problem", shown(groups), "give what `add_residuals` returned")
+    if not (is_finite(narrowing) and narrowing > 1.0):
+        raise InputError("a narrowing above 1", shown(narrowing), "leave it at 1.4")
+    choice(loss, ("geman_mcclure", "truncated"), "the loss")
+    last = as_settings(SolverOptions, options, settings)
     first = _first_weights(chosen, weights)
     widths = _Widths(problem, chosen, inlier_threshold, last, problem.values_at(start), callback)
     try:
@@ -233,12 +233,13 @@ class _Widths:
 
 def _first_weights(groups: list[Group], given: Mapping[str, ArrayLike] | None) -> NDArray[np.float64]:
     given = given if given is not None else {}
+    require(given, Mapping, "weights by the name of their group", 'write e.g. {"loops": np.zeros(12)}')
     foreign = set(given) - {group.name for group in groups}
     if foreign:
         raise InputError("weights of graduated groups", f"{sorted(foreign)}", "name groups that are graduated")
     parts = []
     for group in groups:
-        own = np.asarray(given.get(group.name, np.ones(group.residual.count)), dtype=np.float64)
+        own = as_floats(given.get(group.name, np.ones(group.residual.count)), f"weights of {group.name}")
         if own.shape != (group.residual.count,) or not ((own >= 0.0) & (own <= 1.0)).all():
             raise InputError(f"weights ({group.residual.count},) from 0 to 1 of {group.name}", f"shape {own.shape}", "scale them")
         parts.append(own)
@@ -248,6 +249,8 @@ def _first_weights(groups: list[Group], given: Mapping[str, ArrayLike] | None) -
 def _threshold(group: Group, given: float | None) -> float:
     if given is None:
         return math.sqrt(chi_square_quantile(_PROBABILITY, group.residual.dim))
-    if not (math.isfinite(given) and given > 0.0):
-        raise InputError("a positive inlier threshold", f"{given}", "give it in standard deviations of the residual, such as 3.0")
+    if not (is_finite(given) and given > 0.0):
+        raise InputError(
+            "a positive inlier threshold", shown(given), "give it in standard deviations of the residual, such as 3.0"
+        )
     return float(given)

@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from boxplus._arguments import require
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangents.change import POSES
@@ -52,6 +53,7 @@ def require_connections(residual: Residual, connections: Sequence[object]) -> No
     Raises:
         InputError: so many others.
     """
+    require(residual, Residual, "a residual", "give one of boxplus.residuals, or a subclass of boxplus.residuals.Residual")
     if len(connections) != len(residual.manifolds):
         raise InputError(
             f"{len(residual.manifolds)} connections ({', '.join(residual.roles)})",

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import require
 from boxplus._jit import kernel
+from boxplus._numbers import as_array
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 
@@ -59,6 +61,7 @@ class Variables:
     """
 
     def __init__(self, number: int, name: str, manifold: Manifold, values: NDArray[np.float64]) -> None:
+        require(name, str, "a name as text", "leave it out for one that is made up")
         self.number, self.name, self.manifold, self.values = number, name, manifold, values
         self.ids = np.arange(len(values))
         self.set_fixed(np.zeros(len(values), dtype=np.bool_))
@@ -172,7 +175,7 @@ class VariableRows:
             self.ids = np.array([selected], dtype=np.int64)
             self._rows, self._revision = block.rows_of(self.ids), block.revision
             return
-        given = np.asarray(selected)
+        given = as_array(selected, f"rows of {block.name!r}")
         if given.dtype == np.int64 and given.ndim == 1 and self._is_there(given):
             return
         if given.dtype == np.bool_ and given.shape == (len(block),):

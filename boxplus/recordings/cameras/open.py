@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from boxplus._arguments import as_path, as_settings
 from boxplus.errors import RecordingError
 from boxplus.recordings.bags.open_container import open_container
 from boxplus.recordings.bags.probe import CLOUD_PARSERS
@@ -52,8 +53,8 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         ...     print(len(recording.info.cameras), len(images), images[0].grey().dtype)
         2 8 uint8
     """
-    options = options or CameraRecordingOptions()
-    path = Path(path)
+    options = as_settings(CameraRecordingOptions, options)
+    path = as_path(path, "a recording")
     if not path.exists():
         raise RecordingError("a recording", f"no file or folder {path}", "check the path")
     if path.is_dir() and is_euroc(path):

@@ -20,9 +20,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import require
 from boxplus._jit import kernel
 from boxplus._numbers import as_floats
-from boxplus.cameras.model import CameraModel
+from boxplus.cameras.model import CAMERA_MODELS, CameraModel
 from boxplus.cameras.projection import project_any
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
@@ -158,6 +159,7 @@ class Reprojection(PixelResidual):
         covariance: ArrayLike | None = None,
         information: ArrayLike | None = None,
     ) -> None:
+        require(camera, CAMERA_MODELS, "a camera", "give boxplus.Pinhole, Equidistant or DoubleSphere")
         self.camera, self.pixels = camera, check_pixels("pixels", pixels)
         count = len(self.pixels)
         super().__init__(

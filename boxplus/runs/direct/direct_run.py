@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
@@ -75,7 +76,7 @@ def run_direct_odometry(
         ...     run_direct_odometry(recording, "out").status
         {'ok': 595}
     """
-    config = config or DirectRunConfig()
+    config = as_settings(DirectRunConfig, config)
     run = folder if isinstance(folder, DirectFolder) else DirectFolder(Path(folder))
     claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite, resume=resume)
     with claimed as direct_folder:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_path, as_settings
 from boxplus.errors import RecordingError
 from boxplus.recordings.bags.gnss import NAV_SAT_FIX
 from boxplus.recordings.cameras.open import has_cameras_only, open_camera_recording
@@ -114,10 +115,10 @@ def diagnose(
         >>> sorted({finding.verdict for finding in diagnosis.evidence})
         ['ok']
     """
-    path = Path(path)
+    path = as_path(path, "a recording")
     diagnosis = Diagnosis(path)
     report = on_progress or (lambda _: None)
-    options = options or RecordingOptions()
+    options = as_settings(RecordingOptions, options)
     if options.lidar_topic is None and T_imu_lidar is None and path.exists() and has_cameras_only(path):
         _examine_cameras(path, options, camchain, frame_rate_hz, diagnosis, report)
         report(1.0)

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.store import TileStore, merge
@@ -96,7 +97,7 @@ def run_odometry(
         OutputError: the folder cannot be written or the disk is full; what was written before is intact.
         RecordingError: nothing could be read.
     """
-    config = config or RunConfig()
+    config = as_settings(RunConfig, config)
     claimed = (
         nullcontext(folder) if isinstance(folder, RunFolder) else claim_run_folder(folder, overwrite=overwrite, resume=resume)
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
@@ -75,7 +76,7 @@ def run_localization(
             "a recording with an IMU, which tells where down is", f"a LiDAR alone in {recording.info.path.name}",
             "localise recordings with an IMU",
         )  # fmt: skip
-    config = config or LocalizationRunConfig()
+    config = as_settings(LocalizationRunConfig, config)
     claimed = (
         nullcontext(folder) if isinstance(folder, LocalizationFolder) else claim_localization_folder(folder, overwrite=overwrite)
     )

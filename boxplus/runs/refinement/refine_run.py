@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import BoxplusError, InputError, printable
 from boxplus.filtering.nav_state import NavState
 from boxplus.formats.output import atomic_file
@@ -155,7 +156,7 @@ def refine_run(
         InputError: the recording is not there, or another one.
         OutputError: the folder cannot be written or the disk is full.
     """
-    return _RefineRun(run, folder, config or RefineRunConfig(), recording, progress, should_stop).execute()
+    return _RefineRun(run, folder, as_settings(RefineRunConfig, config), recording, progress, should_stop).execute()
 
 
 class _RefineRun:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
 from boxplus.formats.clouds.las import read_survey
@@ -72,7 +73,7 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     Example:
         `saved = open_saved_map("run1_slam"); saved.points_near([0.0, 0.0, 0.0], 30.0)`
     """
-    config = config if config is not None else LocalMapConfig()  # type: ignore[call-arg]
+    config = as_settings(LocalMapConfig, config)
     base = Path(path)
     if not base.exists():
         raise InputError(_WHAT, f"nothing at {base}", "check the path")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.formats.clouds.ply import PlyWriter
 from boxplus.formats.output import atomic_file
@@ -69,7 +70,7 @@ def merge_runs(
         OutputError: the disk is full or the folder cannot be written; what was there before stays whole.
     """
     began = time.perf_counter()
-    config = config if config is not None else MergeConfig()
+    config = as_settings(MergeConfig, config)
     paths = [Path(folder) for folder in folders]
     if len({path.resolve() for path in paths}) < max(len(paths), 2):
         raise InputError("two runs at least, each given once", ", ".join(map(str, paths)) or "none", "name their output folders")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from boxplus._arguments import as_settings
 from boxplus.errors import BoxplusError, InputError, OutputError, printable
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.maps.local_maps.folder import LocalMapFolder
@@ -88,7 +89,7 @@ def run_slam(
             "a recording with an IMU, which tells where down is", f"a LiDAR alone in {recording.info.path.name}",
             "run 'boxplus lio': it closes no loops, and needs no IMU",
         )  # fmt: skip
-    config = config or SlamRunConfig()
+    config = as_settings(SlamRunConfig, config)
     if config.gnss.utm:
         require_utm()
     Slam(config.slam, forbidden=forbidden or (), forced=forced or ())  # refuses what it refuses before the odometry has run

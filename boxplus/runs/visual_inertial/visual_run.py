@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
@@ -93,7 +94,7 @@ def run_visual_odometry(
         ...     run_visual_odometry(recording, "out").status
         {'ok': 3638}
     """
-    config = config or VioRunConfig()
+    config = as_settings(VioRunConfig, config)
     run = folder if isinstance(folder, VioFolder) else VioFolder(Path(folder))
     claimed = nullcontext(run) if run is folder else claim_camera_folder(run, overwrite=overwrite, resume=resume)
     with claimed as vio_folder:

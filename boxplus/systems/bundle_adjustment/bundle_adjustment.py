@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings, require
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
@@ -109,7 +111,8 @@ def adjust_bundle(
         >>> result.solution.status, bool(np.median(result.errors) < np.median(result.errors_start))
         ('converged', True)
     """
-    config = config if config is not None else BundleAdjustmentConfig()
+    require(reconstruction, get_args(Reconstruction), "a reconstruction", "read one with read_reconstruction")
+    config = as_settings(BundleAdjustmentConfig, config)
     if config.solver.method == "gauss_newton":
         raise InputError(
             "a method that damps its steps",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from boxplus._arguments import as_settings
 from boxplus._settings import Settings
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
@@ -119,7 +120,7 @@ def adjust_lines(
         >>> bool(np.nanmedian(result.errors) < np.nanmedian(result.errors_start))
         True
     """
-    config = config if config is not None else LineAdjustmentConfig()
+    config = as_settings(LineAdjustmentConfig, config)
     if config.solver.method == "gauss_newton":
         raise InputError(
             "a method that damps its steps", "gauss_newton, though the size of the world is not determined", "use another"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings, require
 from boxplus.errors import BoxplusError, InputError
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
@@ -122,7 +123,9 @@ def calibrate_cameras(
         >>> bool(abs(found.singles[0].rig.models[0].fx - 460.0) < 3.0)
         True
     """
-    config = config if config is not None else CameraCalibrationConfig()  # type: ignore[call-arg]
+    require(corners, TargetCorners, "TargetCorners", "detect them, or make them from arrays")
+    require(target, AprilGrid, "an AprilGrid", "give rows, columns, tag_size and spacing")
+    config = as_settings(CameraCalibrationConfig, config)
     report = on_progress or (lambda _: None)
     if len(corners.pixels) == 0 or int(corners.corner_of.max()) >= target.count or int(corners.corner_of.min()) < 0:
         got = "none" if not len(corners.pixels) else f"{int(corners.corner_of.min())} to {int(corners.corner_of.max())}"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import shown
+from boxplus._numbers import is_finite
 from boxplus.errors import InputError
 
 
@@ -38,12 +39,12 @@ class AprilGrid:
     spacing: float
 
     def __post_init__(self) -> None:
-        if self.rows < 1 or self.columns < 1:
+        if not all(is_finite(n) and int(n) == n and n >= 1 for n in (self.rows, self.columns)):
             raise InputError("at least one row and column of tags", f"{self.rows} x {self.columns}", "check tagRows and tagCols")
-        if not (math.isfinite(self.tag_size) and self.tag_size > 0.0):
-            raise InputError("tag_size positive [m]", f"{self.tag_size}", "measure the edge of a tag, in metres")
-        if not (math.isfinite(self.spacing) and self.spacing >= 0.0):
-            raise InputError("spacing not negative", f"{self.spacing}", "give the gap between tags divided by their size")
+        if not (is_finite(self.tag_size) and self.tag_size > 0.0):
+            raise InputError("tag_size positive [m]", shown(self.tag_size), "measure the edge of a tag, in metres")
+        if not (is_finite(self.spacing) and self.spacing >= 0.0):
+            raise InputError("spacing not negative", shown(self.spacing), "give the gap between tags divided by their size")
 
     @property
     def count(self) -> int:

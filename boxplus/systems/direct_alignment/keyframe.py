@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._numbers import as_floats
 from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
@@ -175,7 +176,7 @@ def image_noise(grey: NDArray[np.float32]) -> float:
 
 
 def _checked_depth(depth_1: ArrayLike, image: Image) -> NDArray[np.float32]:
-    depth = np.array(depth_1, dtype=np.float32)
+    depth = np.array(as_floats(depth_1, "depth_1"), dtype=np.float32)
     if depth.shape != image.shape:
         raise InputError(f"depth_1 of shape {image.shape}, as image 1", f"shape {depth.shape}", "register the depth to the image")
     depth[~np.isfinite(depth)] = 0.0

@@ -20,6 +20,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
 from boxplus.cameras.model import CameraModel, check_pinhole
 from boxplus.errors import InputError
@@ -88,9 +89,8 @@ class DirectOdometry:
         T_world_camera: ArrayLike = _STANDSTILL,
     ) -> None:
         self.camera = check_pinhole(camera, "direct odometry")
-        self.config = config or DirectOdometryConfig()
-        self.stereo = stereo
-        self.window = Window(self.camera, self.config.window)
+        self.config = as_settings(DirectOdometryConfig, config)
+        self.stereo, self.window = stereo, Window(self.camera, self.config.window)
         self.gaps = 0  # how often the view was lost for so long that the poses since are a guess
         self._T: Matrix = SE3.check("T_world_camera", T_world_camera)[0].copy()
         self._covariance: Matrix = _WORLD

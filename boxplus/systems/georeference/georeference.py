@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.geodesy import EnuFrame
@@ -83,7 +84,7 @@ def georeference(
 
     Example: docs/gnss.md.
     """
-    config = config if config is not None else GeoreferenceConfig()
+    config = as_settings(GeoreferenceConfig, config)
     lever = p_imu_antenna if config.lever_arm is None else np.array(config.lever_arm)
     attached = attach(fixes, graph.time_ns, graph.T_odo, time_ns, T_odo_imu, config)
     none = Georeference(None, None, None, attached, dict(attached.left_out), [], [])

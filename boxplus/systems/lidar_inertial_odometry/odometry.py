@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import RL, TANGENT, NavState, P, V
@@ -71,7 +72,7 @@ class LidarInertialOdometry(Snapshots):
     """
 
     def __init__(self, config: LioConfig | None = None, *, live: bool = False) -> None:
-        self.config, self._live = config or LioConfig(), live
+        self.config, self._live = as_settings(LioConfig, config), live
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self.start: Start | None = None
         self.start_problem: str | None = None

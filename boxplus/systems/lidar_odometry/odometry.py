@@ -14,11 +14,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import T_V, TANGENT
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
+from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
@@ -69,7 +71,7 @@ class LidarOdometry(Snapshots):
     """
 
     def __init__(self, config: LidarOdometryConfig | None = None) -> None:
-        config = config or LidarOdometryConfig()
+        config = as_settings(LidarOdometryConfig, config)
         self.config = config.of_lidar_alone() if isinstance(config, LioConfig) else config
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self.start: LidarStart | None = None
@@ -116,7 +118,7 @@ class LidarOdometry(Snapshots):
 
     def push_imu(self, samples: ImuSamples) -> list[Estimate]:
         """Samples take no part; they are counted."""
-        self._sequencer.rejected["IMU sample, which takes no part"] += len(samples)
+        self._sequencer.rejected["IMU sample, which takes no part"] += len(checked_imu(samples))
         return []
 
     def push_scan(self, scan: Scan) -> list[Estimate]:

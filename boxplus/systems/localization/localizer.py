@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
@@ -98,7 +99,7 @@ class Localizer:
     """
 
     def __init__(self, place_map: PlaceMap, config: LocalizationConfig | None = None) -> None:
-        self.config = config if config is not None else LocalizationConfig()
+        self.config = as_settings(LocalizationConfig, config)
         self.last_search: Search | None = None
         self.lost_because: str | None = None
         self.losses = 0

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from boxplus._arguments import as_settings, require
 from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
@@ -166,7 +167,8 @@ def optimize_pose_graph(
         >>> result.solution.status, result.graph.poses.shape
         ('converged', (24, 7))
     """
-    config = config if config is not None else PoseGraphConfig()
+    require(graph, PoseGraph, "a PoseGraph", "read one with read_pose_graph, or make one from arrays")
+    config = as_settings(PoseGraphConfig, config)
     _check(graph, config, loss)
     options = config.solver
     if "initial_damping" not in options.model_fields_set:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.plane_voxels.thickness import Sharpness
 from boxplus.systems.refinement.calibrated import Calibrated, CalibrationFound
@@ -87,7 +88,7 @@ def refine(
     Raises:
         InputError: hardly any plane is seen by two keyframes.
     """
-    config = config or RefinementConfig()
+    config = as_settings(RefinementConfig, config)
     tell = progress or (lambda stage, share: None)
     g = run.gravity_world / np.linalg.norm(run.gravity_world)
     before = state = RefinedState(run.T_world_imu, run.velocity_bias, g, run.T_imu_lidar)

@@ -13,6 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
+from boxplus._arguments import as_settings
 from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
@@ -91,7 +92,7 @@ def align_sessions(
 
     Example: docs/sessions.md.
     """
-    config = config if config is not None else SessionsConfig()
+    config = as_settings(SessionsConfig, config)
     names = [session.name for session in sessions]
     if len(sessions) < 2 or len(set(names)) < len(names):
         raise InputError("two sessions at least, of different names", f"{names}", "name each of them once")

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus._jit import kernel, run_chunks
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, IkdView, copy_found, knn
@@ -92,7 +93,7 @@ def register(
 
     Example: docs/slam.md.
     """
-    config = config if config is not None else LocalMapRegistrationConfig()
+    config = as_settings(LocalMapRegistrationConfig, config)
     T = _staged(source, target, T_start, config, _STAGES[-1:] if is_close else _STAGES)
     if T is None:
         return None

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import LocalMap
@@ -64,7 +65,7 @@ class Slam:
         forced: Iterable[Pair] = (),
         stored: Callable[[int], LocalMap] | None = None,
     ) -> None:
-        self.config = config if config is not None else SlamConfig()
+        self.config = as_settings(SlamConfig, config)
         self._forbidden, self._forced = _checked_pairs(forbidden, forced)
         self._stored = stored
         self._maps: list[LocalMap] = []

@@ -17,6 +17,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus._arguments import as_settings, shown
 from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
@@ -78,7 +79,9 @@ class VisualInertialOdometry:
     def __init__(
         self, config: VioConfig | None, rig: Rig, tracker: Tracker | None = None, line_tracker: LineFollower | None = None
     ) -> None:
-        self.config = config or VioConfig()
+        self.config = as_settings(VioConfig, config)
+        if not isinstance(rig, Rig):
+            raise InputError("a Rig", shown(rig), "make one with Rig.of(models, mountings, sizes)")
         self.rig = rig if self.config.cameras == "all" else replace(rig, cameras=rig.cameras[:1], mountings=rig.mountings[:1])
         self.start: Start | None = None
         self.window = Window(self.config, self.rig)
