@@ -1,6 +1,7 @@
 """Ctrl-C (or SIGTERM) while a command runs: the first asks to come to an end, the second stops at once.
 
-What may be left out without harm is left at once.
+What may be left out without harm is left at once. What was ignored at the start stays ignored, as Ctrl-C is for what a shell
+runs in the background.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def stop_on_interrupt(announce: Callable[[], None]) -> Iterator[Callable[[], boo
         stop.set()
         announce()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in _heeded()}
     try:
         yield stop.is_set
     finally:
@@ -40,7 +41,7 @@ def left_at_once() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    around = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    around = {number: signal.getsignal(number) for number in _heeded()}
 
     def leave(number: int, frame: FrameType | None) -> None:
         asked = around[signal.Signals(number)]
@@ -55,3 +56,8 @@ def left_at_once() -> Iterator[None]:
     finally:
         for number, handler in around.items():
             signal.signal(number, handler)
+
+
+def _heeded() -> list[signal.Signals]:
+    """The signals that ask to stop, but for those that whoever started this had it ignore."""
+    return [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) not in (signal.SIG_IGN, None)]

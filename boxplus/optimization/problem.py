@@ -352,6 +352,7 @@ class Problem:
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(model, error)) from error
         faded = faded_shares(self.groups, None if model.is_linearized and callback is None else model.values)
+        silenced = faded_notes(self.groups, faded, model.values, options.threads)
         return Solution(
             status=status,
             reason=reason,
@@ -366,7 +367,7 @@ class Problem:
                 for group in self.groups
             },
             faded=faded,
-            notes=(*notes, *jacobian_notes(self.groups, began, model.values), *faded_notes(self.groups, faded, model.values)),
+            notes=(*notes, *jacobian_notes(self.groups, began, model.values), *silenced),
             timing_s={"analysis": analysis, **model.timing_s, "total": time.perf_counter() - begin},
             _problem=model,
         )

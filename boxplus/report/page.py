@@ -7,11 +7,11 @@ from html import escape
 from pathlib import Path
 
 from boxplus.report import figures
-from boxplus.report.palette import WAITED
 from boxplus.report.run_data import RunData
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.runs.lidar_inertial.summary import Matrix
 from boxplus.runs.run_facts import Gap, RunFacts, WarningFacts, WeakInterval
+from boxplus.systems.lidar_inertial_odometry.estimate import WAITED
 
 
 def write_page(data: RunData) -> Path:

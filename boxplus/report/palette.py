@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.report.timeline import Timeline
+from boxplus.systems.lidar_inertial_odometry.estimate import WAITED
 
 # Chosen by search so that they differ for every kind of colour vision and show on white as on the dark page: see the tests.
 STATUS = {"ok": "#3aa3e3", "weak": "#dd9000", "lost": "#a03070"}
@@ -22,8 +23,6 @@ REJECTED = (SERIES[1], SERIES[4], SERIES[6], SERIES[5], SERIES[2], SERIES[7])
 """Of what was not used, beside SERIES[0] for what was."""
 INK, FAINT, GRID = "#22303c", "#6b7a8f", "#e4e8ec"
 
-WAITED = "sensors compared"
-"""The stage of a scan in which a run over a recording waits for what goes on beside it."""
 _MOST_ROWS = 1500  # more than a page is wide
 
 

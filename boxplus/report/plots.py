@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from boxplus.formats.output import atomic_file, make_folder
-from boxplus.report.palette import FAINT, GRID, INK, MARKS, SERIES, STATUS, WAITED, XYZ, highest_ms, shown_rows, worked_ms
+from boxplus.report.palette import FAINT, GRID, INK, MARKS, SERIES, STATUS, XYZ, highest_ms, shown_rows, worked_ms
 from boxplus.report.run_data import RunData
 from boxplus.report.timeline import Timeline
 from boxplus.runs.lidar_inertial.scan_log import SHARES
 from boxplus.runs.run_folder import PLOTS
-from boxplus.systems.lidar_inertial_odometry.estimate import AXES
+from boxplus.systems.lidar_inertial_odometry.estimate import AXES, WAITED
 
 _DPI = 130
 _HEADROOM_M = 1.0

@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
@@ -47,10 +46,9 @@ def checked_scan(scan: Scan) -> Scan:
             f"lidar of shape {np.shape(time)}, as time_ns", f"shape {np.shape(scan.lidar)}", "give one number a point, or none"
         )
     if not whole or not (intensity is None or (_is(intensity, np.float32, 1) and intensity.shape == time.shape)):
-        made = Scan.from_arrays(points, time, intensity)
-        lidar = None if scan.lidar is None else np.asarray(scan.lidar, dtype=np.uint8)[_returns(points)]
+        made = Scan.from_arrays(points, time, intensity, lidar=scan.lidar)
         rejected = dict(Counter(scan.rejected) + Counter(made.rejected))
-        scan = replace(made, start_ns=scan.start_ns, end_ns=scan.end_ns, lidar=lidar, rejected=rejected)
+        scan = replace(made, start_ns=scan.start_ns, end_ns=scan.end_ns, rejected=rejected)
     if not np.isfinite(scan.p_lidar).all():
         finite = np.asarray(np.isfinite(scan.p_lidar).all(axis=1))
         dropped = int((~finite).sum()) + scan.rejected.get("not finite", 0)
@@ -63,14 +61,6 @@ def checked_scan(scan: Scan) -> Scan:
             "give all of them as absolute nanoseconds; Scan.from_arrays takes start and end from the points",
         )
     return scan
-
-
-def _returns(points: ArrayLike) -> NDArray[np.bool_]:
-    """(N,) the points (N, 3) that `Scan.from_arrays` keeps."""
-    xyz = np.asarray(points).astype(np.float32, copy=False)
-    squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
-    kept: NDArray[np.bool_] = np.isfinite(squared) & (squared > 0.0)
-    return kept
 
 
 def _is(array: object, dtype: type, axes: int) -> bool:

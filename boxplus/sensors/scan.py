@@ -47,8 +47,9 @@ class Scan:
         *,
         min_range: float = 0.0,
         max_range: float = np.inf,
+        lidar: ArrayLike | None = None,
     ) -> Scan:
-        """Build a scan from arrays and drop, together with their times and intensities, the points that are not returns.
+        """Build a scan from arrays and drop, together with all that belongs to them, the points that are not returns.
 
         Args:
             p_lidar: (N, 3), LiDAR frame, metres.
@@ -56,6 +57,7 @@ class Scan:
             intensity: (N,) or None.
             min_range: points nearer than this are dropped (the robot itself) [m].
             max_range: points farther than this are dropped [m].
+            lidar: (N,) which of several LiDARs saw each point, 0 to 255, or None.
 
         Raises:
             InputError: wrong shape, counts that do not match, or times that are not integers.
@@ -83,6 +85,12 @@ class Scan:
                     "give one value per point or None",
                 )
             strength = given.astype(np.float32)
+        numbers = None if lidar is None else as_array(lidar, "lidar")
+        if numbers is not None and (numbers.shape != time.shape or numbers.dtype.kind not in "iu"):
+            got = f"{numbers.dtype} of shape {numbers.shape}"
+            raise InputError(f"lidar as integers of shape {time.shape}, as time_ns", got, "give one number a point, or none")
+        if numbers is not None and len(numbers) and not (numbers.min() >= 0 and numbers.max() <= 255):
+            raise InputError("numbers of LiDARs from 0 to 255", f"{numbers.min()} to {numbers.max()}", "count them from 0")
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is counted so
             xyz = points.astype(np.float32, copy=False)
         squared = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64)
@@ -105,7 +113,9 @@ class Scan:
         if rejected:
             xyz, time = xyz[keep], time[keep]
             strength = None if strength is None else strength[keep]
-        return cls(np.ascontiguousarray(xyz), np.ascontiguousarray(time), strength, start, end, rejected)
+            numbers = None if numbers is None else numbers[keep]
+        seen_by = None if numbers is None else np.ascontiguousarray(numbers, dtype=np.uint8)
+        return cls(np.ascontiguousarray(xyz), np.ascontiguousarray(time), strength, start, end, rejected, seen_by)
 
     def shifted(self, offset_ns: int) -> Scan:
         """The same scan, this much later [ns]."""

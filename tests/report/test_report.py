@@ -25,6 +25,7 @@ from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.runs.run_folder import PLOTS
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
+from boxplus.systems.lidar_inertial_odometry.estimate import WAITED
 from tests.report.unpacked import figures_of
 
 LIDAR = SpinningLidar(azimuth_steps=200)
@@ -169,7 +170,7 @@ def test_seconds_of_waiting_leave_the_rest_to_be_seen(folder: Path) -> None:
     stages = {name: values.copy() for name, values in data.log.pairs("timing_ms").items()}
     waiting, total = np.zeros(len(data.seconds)), data.log.column("total_ms").copy()
     waiting[::5] = 3000.0
-    stages[palette.WAITED] = stages[palette.WAITED] + waiting
+    stages[WAITED] = stages[WAITED] + waiting
 
     class Log:
         def pairs(self, name: str) -> dict[str, NDArray[np.float64]]:
@@ -181,7 +182,7 @@ def test_seconds_of_waiting_leave_the_rest_to_be_seen(folder: Path) -> None:
     waited: Any = types.SimpleNamespace(seconds=data.seconds, log=Log())
     assert palette.highest_ms(waited) == pytest.approx(highest)
     write_report(folder)
-    assert f"a scan waits for the verdict ({palette.WAITED})" in (folder / "report.html").read_text(encoding="utf-8")
+    assert f"a scan waits for the verdict ({WAITED})" in (folder / "report.html").read_text(encoding="utf-8")
 
 
 def test_long_runs_show_their_worst_scans(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,3 +79,13 @@ def test_wrong_shapes_are_explained(points: object, time: object, intensity: obj
     with pytest.raises(InputError) as error:
         Scan.from_arrays(points, time, intensity)  # type: ignore[arg-type]
     assert message in str(error.value)
+
+
+def test_the_numbers_of_lidars_stay_with_their_points() -> None:
+    points = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [30.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    scan = Scan.from_arrays(points, np.arange(5), max_range=10.0, lidar=[7, 1, 2, 3, 255])
+    assert scan.lidar is not None and scan.lidar.dtype == np.uint8 and scan.lidar.tolist() == [7, 255]
+    assert Scan.from_arrays(points, np.arange(5)).lidar is None
+    for wrong in ([1, 2], [0.5] * 5, [0, 1, 2, 3, 256], [-1, 0, 0, 0, 0]):
+        with pytest.raises(InputError, match=r"lidar as integers of shape \(5,\)|numbers of LiDARs from 0 to 255"):
+            Scan.from_arrays(points, np.arange(5), lidar=wrong)

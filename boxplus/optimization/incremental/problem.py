@@ -349,7 +349,7 @@ class IncrementalProblem:
         values = tuple(block.values for block in problem.blocks)
         cost = problem.cost() if problem.groups else 0.0
         dof = sum(int(np.count_nonzero(~block.is_fixed)) * block.manifold.dof for block in problem.blocks)
-        shares = faded_notes(problem.groups, faded_shares(problem.groups, values), values)
+        shares = faded_notes(problem.groups, faded_shares(problem.groups, values), values, 1)
         doubts = (*misfit_notes(problem.groups, values, dof), *shares, *wrong_jacobians(problem.groups, values))
         return IncrementalSolution(values, cost, len(self._off), doubts)
 

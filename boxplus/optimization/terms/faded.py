@@ -34,13 +34,13 @@ def faded_shares(groups: Sequence[Group], values: Sequence[NDArray[np.float64]] 
 
 
 def faded_notes(
-    groups: Sequence[Group], shares: dict[str, float], values: Sequence[NDArray[np.float64]], threads: int = 1
+    groups: Sequence[Group], shares: dict[str, float], values: Sequence[NDArray[np.float64]], threads: int
 ) -> tuple[str, ...]:
     """A sentence for every group of which a large share hardly counts, and is larger than noise as sigmas promise it.
 
     Args:
         shares: as `faded_shares` has them.
-        values: the point.
+        values: the point. threads: the result is the same for any number.
     """
     return tuple(
         f"{100.0 * shares[group.name]:.2g} % of the residuals of {group.name} have weight below {FADED:g} under {group.loss!r} "

@@ -16,6 +16,8 @@ Status = Literal["ok", "weak", "lost"]
 
 # The six axes of a pose, in the order of its covariance: rotation about the IMU's axes, then position along the world's.
 AXES = ("rotation x", "rotation y", "rotation z", "position x", "position y", "position z")
+WAITED = "sensors compared"
+"""The stage of a scan in which a run over a recording waits for what goes on beside it."""
 
 
 @dataclass(frozen=True, slots=True)

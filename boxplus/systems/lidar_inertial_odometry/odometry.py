@@ -25,7 +25,7 @@ from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.lidar_inertial_agreement.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
-from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Prediction
+from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
 from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_baseline import LongBaseline
@@ -241,7 +241,7 @@ class LidarInertialOdometry(Snapshots):
         directions = posterior.last.directions if posterior.valid else None
         clock.lap("update")
         self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
-        clock.lap("sensors compared")
+        clock.lap(WAITED)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
