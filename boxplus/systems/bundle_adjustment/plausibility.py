@@ -77,6 +77,8 @@ def mirror_doubt(before: NDArray[np.float64], after: NDArray[np.float64]) -> str
     U, d, Vt = np.linalg.svd(y.T @ x)
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     total = float((x * x).sum())
+    if not (total > 0.0 and (y * y).any()):  # all in one place
+        return None
     rotated, mirrored = (max(1.0 - (float(d[:2].sum()) + s * float(d[2])) / total, 0.0) for s in (sign, -sign))
     if not mirrored < _CLEARLY * rotated:
         return None

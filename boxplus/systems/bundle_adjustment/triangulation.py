@@ -45,7 +45,7 @@ def intersect_rays(
         points[~solvable] = np.nan
         points[solvable] = np.linalg.solve(A[solvable], b[solvable][:, :, None])[:, :, 0]
         length = np.linalg.norm(points[of] - c, axis=1)
-        weight = np.where(np.isfinite(length) & (length > 0.0), 1.0 / np.maximum(length, 1e-300) ** 2, weight)
+        weight = np.where(np.isfinite(length) & (length > 0.0), 1.0 / np.maximum(length, 1e-150) ** 2, weight)
     return np.asarray(points + middle)
 
 

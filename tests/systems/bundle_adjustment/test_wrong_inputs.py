@@ -318,3 +318,21 @@ def test_an_examination_is_bounded_by_work_and_not_by_the_clock():
     assert examination_options(problem, len(cameras), solved, limited) is None
     stopped = problem.solve(callback=lambda iteration: True)
     assert examination_options(problem, len(cameras), stopped, config) is None
+
+
+@pytest.mark.parametrize("place", [0.0, 1.0])
+def test_points_that_all_start_in_one_place_are_no_mirror_image(place):
+    start = reconstruction(69, "bal", cameras=10)
+    with np.errstate(all="raise", under="ignore"):
+        result = adjust_bundle(replace(start, points=np.full_like(start.points, place)))
+    assert "mirror" not in (result.doubt or "")
+
+
+def test_wrong_matches_are_triangulated_without_a_warning_of_numpy():
+    start = reconstruction(69, "bal", cameras=10, points=200)
+    rng = np.random.default_rng(0)
+    wrong = rng.random(len(start.point_of)) < 0.3
+    of = start.point_of.copy()
+    of[wrong] = rng.permutation(of[wrong])
+    with np.errstate(divide="raise"):
+        assert adjust_bundle(replace(start, point_of=of)).doubt is not None
