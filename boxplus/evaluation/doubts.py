@@ -85,7 +85,7 @@ def _loose(truth: Trajectory, alignment: Alignment, rmse: float, wide: float) ->
     if alignment.kind == "yaw":
         axes, around = np.eye(3), np.array([np.inf, np.inf, wide])
     else:
-        axes = np.linalg.svd(truth.p - truth.p.mean(axis=0), full_matrices=True)[2].T
+        axes = np.linalg.svd(truth.p - truth.p.mean(axis=0), full_matrices=False)[2].T
         around = np.array([np.hypot(*np.delete(alignment.spread_m, axis)) for axis in range(3)])
     return np.asarray(truth.R.mean(axis=0).T @ axes * (rmse / np.maximum(around, 1e-12)))
 

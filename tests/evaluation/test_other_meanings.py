@@ -120,3 +120,13 @@ def test_clocks_less_than_20_ms_apart_are_told_where_that_is_most_of_the_error(l
     assert not any("motions" in text for text in evaluate(replace(late, time_ns=estimate.time_ns), fast).warnings)
     (text,) = (text for text in evaluate(late, fast, method="interpolate").warnings if "motions fit best" in text)
     assert float(text.split("with --offset ")[1].split()[0]) == pytest.approx(-late_s, abs=0.001)
+
+
+def test_many_poses_take_no_square_of_memory():
+    count = 60_000
+    t = 0.01 * np.arange(count)
+    p = np.stack([10 * np.cos(0.1 * t), 10 * np.sin(0.13 * t), np.sin(0.2 * t)], 1)
+    stamps = (1_700_000_000_000_000_000 + np.round(1e9 * t)).astype(np.int64)
+    R = so3.exp(np.stack([0.0 * t, 0.1 * np.sin(t), 0.1 * t], 1))
+    way = Trajectory(stamps, p, quaternion.from_matrix(R))
+    assert evaluate(way, way, deltas=()).warnings == ()
