@@ -159,7 +159,7 @@ class MapDatum:
 
         Call it after `insert`, with the covariance that goes on to the next scan.
         """
-        cov[_POSE, _POSE] += self._shared * self._new_share * self._alone
+        cov[_POSE, _POSE] += 0.5 * self._shared * self._new_share * (self._alone + self._alone.T)
         self._filter = _along_world(cov[_POSE, _POSE], x)
 
     def widen(self, excess: NDArray[np.float64], x: NDArray[np.float64]) -> None:
