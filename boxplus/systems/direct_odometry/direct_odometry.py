@@ -29,7 +29,6 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.sensors.image import Image, as_image
 from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth_of_two
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
@@ -37,8 +36,8 @@ from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion
 from boxplus.systems.direct_odometry.patches import choose_patches
-from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
 from boxplus.systems.direct_odometry.search_starts import starts_around
+from boxplus.systems.direct_odometry.sensor_watch import SensorWatch
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -99,7 +98,7 @@ class DirectOdometry:
         self._reference: WindowKeyframe | None = None
         self._frames = FrameOrder()
         self._seen_ns: int | None = None
-        self._watch, self._calibration, self._registration = Watch(self.config), CalibrationWatch(), RegistrationWatch()
+        self._watch, self._sensor = Watch(self.config), SensorWatch()
         self._start: TwoViewStart | None = None
 
     @property
@@ -109,7 +108,7 @@ class DirectOdometry:
 
     @property
     def contradiction(self) -> str:
-        """Why no pose is to be trusted, whatever the status: grey values contradict intrinsics, or where depths lie."""
+        """Why no pose is to be trusted, whatever the status: grey values contradict intrinsics or depths."""
         return self._watch.contradiction
 
     @property
@@ -194,7 +193,9 @@ class DirectOdometry:
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            self._watch_sensor(keyframe, image, depth, alignment)
+            if self._is_sensed:
+                self._sensor.frame(keyframe, image, depth, alignment)
+                self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
             if added is not None:
@@ -202,6 +203,9 @@ class DirectOdometry:
                 self.window.add(added, covariance)
                 if self.config.adjustments:
                     self.window.adjust(self.config.adjustments)
+                if self._is_sensed:
+                    moved = se3.compose(se3.inverse(self._T), T)
+                    self._sensor.keyframe(self.window.keyframes, depth, moved, self._unseen_s(time_ns))
                 T, covariance = added.T_world_camera, self.window.covariance(added)
                 self._reference = added
                 watch.lap("adjustment")
@@ -213,13 +217,9 @@ class DirectOdometry:
             self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
 
-    def _watch_sensor(self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment) -> None:
-        """What a new keyframe says of the intrinsics, and of where depths lie."""
-        if self.stereo is not None or self._start is not None:  # other depths change with the intrinsics
-            return
-        self._calibration.add(keyframe, image.grey, alignment)
-        self._registration.add(image, np.where(depth.is_measured, depth.z, np.float32(0.0)))
-        self._watch.contradiction = self._calibration.contradiction or self._registration.contradiction
+    @property
+    def _is_sensed(self) -> bool:  # depths of a stereo pair or by the motion change with the intrinsics
+        return self.stereo is None and self._start is None
 
     def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
         """Where a sensor measures little, with depths by the motion."""

@@ -14,6 +14,7 @@ from boxplus.systems.direct_alignment.tracking import track
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
 from boxplus.systems.direct_odometry.depth.sensed_depth import rgbd_depth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
+from boxplus.systems.direct_odometry.leftover import Leftover
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 
@@ -30,7 +31,7 @@ def watched(camera: Pinhole, seed: int) -> CalibrationWatch:
         assert keyframe is not None
         alignment = track(keyframe.tracker, images[1], T_21=se3.inverse(T))
         assert alignment.status == "converged"
-        watch.add(keyframe, images[1].grey, alignment)
+        watch.add(Leftover(keyframe, images[1].grey, alignment), camera)
     return watch
 
 
