@@ -16,19 +16,21 @@ from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.camera_calibration.target import AprilGrid
 
+_SMALLEST_TAG_M, _LARGEST_TAG_M = 0.004, 2.0
+
 
 def read_target(path: str | Path) -> AprilGrid:
     """A target in Kalibr's form: target_type aprilgrid, tagCols, tagRows, tagSize [m], tagSpacing.
 
     Raises:
-        InputError: no such file, another kind of target, numbers that make none.
+        InputError: no such file, another kind of target, numbers that make none, tags of no size in metres.
     """
     content = read_yaml(Path(path))
     kind = str(content.get("target_type", ""))
     if kind != "aprilgrid":
         raise InputError("target_type: 'aprilgrid'", f"{kind or 'none'!r} in {Path(path).name}", "boxplus knows no other target")
     try:
-        return AprilGrid(
+        target = AprilGrid(
             rows=int(content["tagRows"]),
             columns=int(content["tagCols"]),
             tag_size=float(content["tagSize"]),
@@ -40,6 +42,13 @@ def read_target(path: str | Path) -> AprilGrid:
         raise InputError(
             "tagRows, tagCols, tagSize [m] and tagSpacing", f"{type(error).__name__} {error} in {Path(path).name}", "complete it"
         ) from None
+    if not _SMALLEST_TAG_M <= target.tag_size <= _LARGEST_TAG_M:
+        raise InputError(
+            f"tagSize from {_SMALLEST_TAG_M:g} to {_LARGEST_TAG_M:g} m",
+            f"{target.tag_size:g} in {Path(path).name}",
+            "give the edge of a tag in metres: 88 mm are 0.088; every length of the calibration scales with it",
+        )
+    return target
 
 
 @dataclass(frozen=True, slots=True, eq=False)

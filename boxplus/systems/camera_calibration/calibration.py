@@ -22,9 +22,11 @@ from boxplus.systems.camera_calibration.stereo import PairAgreement, join
 from boxplus.systems.camera_calibration.structure import (
     ImageStructure,
     TargetStructure,
+    ViewScatter,
     halves_disagree,
     image_structure,
     target_structure,
+    view_scatter,
 )
 from boxplus.systems.camera_calibration.target import AprilGrid
 
@@ -46,6 +48,7 @@ class CameraCalibration:
         sigma_by_lens: standard deviation of a corner [px] that each lens leaves, pooled over the cameras; lenses that were
             not tried, or do not fit at all, are missing.
         halves: for every camera how far both halves of the views disagree, in standard deviations; NaN with too few views.
+        views: for every camera how differently its single views would have the lens; None with too few.
         images, on_target: patterns in the residuals.
         pairs: how the cameras keep their places to each other.
         imu: mounting on the IMU, or None without one.
@@ -69,6 +72,7 @@ class CameraCalibration:
     singles: tuple[Adjustment, ...]
     sigma_by_lens: dict[str, float]
     halves: tuple[float, ...]
+    views: tuple[ViewScatter | None, ...]
     images: tuple[ImageStructure, ...]
     on_target: TargetStructure
     pairs: tuple[PairAgreement, ...]
@@ -175,6 +179,7 @@ def calibrate_cameras(
         singles=tuple(singles),
         sigma_by_lens={str(kind): value for kind, value in sigma.items()},
         halves=halves,
+        views=tuple(view_scatter(single, places) for single in singles),
         images=tuple(image_structure(single, 0) for single in singles),
         on_target=target_structure(singles, places),
         pairs=tuple(pairs),

@@ -36,6 +36,12 @@ _MOST_OF_SESSION = 0.95
 _TWIN_CHI2 = 25.0
 
 
+_VIEWS_RATIO = 4.0
+_VIEWS_FOCAL, _VIEWS_CENTRE = 0.012, 0.014
+"""By the focal length. EuRoC's target bends by 0.2 mm: its views differ by 0.6 % and 1.1 %."""
+_QUARTER, _CENTRE_OF_QUARTER = 0.6, 0.35
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """One of them.
@@ -148,6 +154,8 @@ def _views(found: CameraCalibration, camera: int) -> list[Finding]:
             "target in the corners of the image, too"
         )
         result.append(Finding("coverage", "remark", text))
+    result += _views_differ(found, camera)
+    result += _resolution(found, camera)
     if found.halves[camera] > _HALVES:
         text = (
             f"cam{camera}: even and odd views disagree by {found.halves[camera]:.1f} times the standard deviations: multiply "
@@ -155,6 +163,37 @@ def _views(found: CameraCalibration, camera: int) -> list[Finding]:
         )
         result.append(Finding("halves", "remark", text))
     return result
+
+
+def _views_differ(found: CameraCalibration, camera: int) -> list[Finding]:
+    scatter, f = found.views[camera], float(found.singles[camera].rig.models[0].parameters[0])
+    if scatter is None or scatter.ratio < _VIEWS_RATIO:
+        return []
+    if scatter.focal < _VIEWS_FOCAL and scatter.centre_px < _VIEWS_CENTRE * f:
+        return []
+    text = (
+        f"cam{camera}: views differ by {scatter.focal:.1%} in focal length and {scatter.centre_px:.1f} px in the centre "
+        f"(standard deviations between views, beyond noise; χ² is {scatter.ratio:.0f} times what one lens gives): images of "
+        "several cameras in one, a zoom or focus that changes, sheared images, or a target that bends; what is found is a mean "
+        "of them, and its standard deviations do not hold"
+    )
+    return [Finding("views_differ", "doubt", text)]
+
+
+def _resolution(found: CameraCalibration, camera: int) -> list[Finding]:
+    """Corners of images of half the size all lie in one quarter of those that were stated, and the centre in the middle of it."""
+    corners = found.singles[camera].corners
+    size = np.array(corners.sizes[0], dtype=np.float64)
+    centre = found.singles[camera].rig.models[0].parameters[2:4] / size
+    reach = corners.pixels.max(axis=0) / size
+    if not ((reach < _QUARTER).all() and (np.abs(centre) < _CENTRE_OF_QUARTER).all()):
+        return []
+    text = (
+        f"cam{camera}: all corners lie in the first {reach[0]:.0%} of the width and {reach[1]:.0%} of the height, and the centre "
+        f"at {centre[0]:.0%} and {centre[1]:.0%}: the images are smaller than {size[0]:.0f}x{size[1]:.0f}; give --resolution of "
+        "those in which the corners were found"
+    )
+    return [Finding("resolution", "doubt", text)]
 
 
 def _pattern(found: CameraCalibration, camera: int) -> list[Finding]:

@@ -234,6 +234,12 @@ def test_other_targets_and_noise_that_is_missing_are_refused(tmp_path: Path) -> 
     (tmp_path / "target.yaml").write_text("target_type: aprilgrid\ntagRows: 6\n")
     with pytest.raises(InputError, match=r"tagRows, tagCols, tagSize \[m\] and tagSpacing"):
         read_target(tmp_path / "target.yaml")
+    for size in ("88", "0.0022"):  # in millimetres; in no unit at all
+        (tmp_path / "target.yaml").write_text(
+            f"target_type: aprilgrid\ntagRows: 6\ntagCols: 6\ntagSize: {size}\ntagSpacing: 0.3\n"
+        )
+        with pytest.raises(InputError, match=r"tagSize from 0\.004 to 2 m"):
+            read_target(tmp_path / "target.yaml")
     (tmp_path / "imu.csv").write_text("".join(f"{k * 5_000_000 + 10**18},0,0,0,0,0,9.81\n" for k in range(10)))
     (tmp_path / "imu.yaml").write_text("update_rate: 200\n")
     with pytest.raises(RecordingError, match="accelerometer_random_walk"):
