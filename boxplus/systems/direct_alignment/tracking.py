@@ -14,6 +14,7 @@ Years On, IJCV 2004; the covariance: Liang and Zeger, Longitudinal Data Analysis
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -50,6 +51,9 @@ _CELLS = 48  # of the image, whose errors are taken for independent of each othe
 _LEAST_SLOPE = 0.1  # of the influence, by the weights
 _NOISE_ALONE = 1.3  # signal up to which next to nothing is left of H without noise
 _SAME_LIGHT = 0.1  # of the spread of grey values: nearer starts of gain and offset are one
+_ELSEWHERE = 0.005  # of width + height, from all starts, from which on they are followed once more
+_RECONSIDERED = 2  # octave from which on they are
+_FAR_MORE, _CLEARLY_LESS = 3.0, 0.8  # of σ: a start that leaves more is not followed, an end that leaves less is taken
 _SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
 
 Status = Literal["converged", "iteration limit", "little overlap", "unobservable", "large residual"]
@@ -162,6 +166,8 @@ def track(
         is_free = brightness and (level.octave < _BRIGHTNESS_BELOW or level is keyframe.levels[-1])
         code = descent.refine(level, pyramid[level.octave], max_iterations, tolerance * 2.0**level.octave, is_free)
         iterations.append(int(descent.figures[5]))
+    if level.octave == 0 and len(keyframe.levels) > 1 and _is_elsewhere(descent.T_21, starts, keyframe):
+        code, iterations[-1] = descent.reconsider(keyframe.levels, pyramid, starts, light, max_iterations, tolerance, code)
     return _judged(descent, level, pyramid[level.octave], code, tuple(iterations), tolerance)
 
 
@@ -186,6 +192,37 @@ class _Descent:
             self.H, self.figures,
         )  # fmt: skip
         return code
+
+    def reconsider(
+        self,
+        levels: Sequence[Level],
+        pyramid: Sequence[Image],
+        starts: Matrix,
+        light: tuple[float, float] | None,
+        max_iterations: int,
+        tolerance: float,
+        code: int,
+    ) -> tuple[int, int]:
+        """Go back to a start from which the fine levels alone leave clearly less; returns the code, and the iterations.
+
+        A small thing of high contrast that moves on its own leads the coarse levels astray, where it is much of the texture; at
+        full resolution most of the image knows better, if it is asked from close by.
+        """
+        best = self.T_21, self.light, self.H.copy(), self.figures.copy(), code
+        fine = [level for level in levels if level.octave <= _RECONSIDERED]
+        for start in starts:
+            self.T_21 = start.copy()
+            self.light = best[1].copy() if light is None else np.array([np.exp(light[0]), light[1]])
+            found = self.refine(fine[-1], pyramid[0], 0, tolerance, False)
+            if found == LITTLE_OVERLAP or self.figures[4] > _FAR_MORE * best[3][4]:
+                continue
+            for level in fine:
+                found = self.refine(level, pyramid[level.octave], max_iterations, tolerance * 2.0**level.octave, self.brightness)
+            if found in (CONVERGED, ITERATION_LIMIT) and self.figures[4] < _CLEARLY_LESS * best[3][4]:
+                best = self.T_21, self.light, self.H.copy(), self.figures.copy(), found
+        self.T_21, self.light = best[:2]
+        self.H[:], self.figures[:] = best[2:4]
+        return best[4], int(self.figures[5])
 
     def motion_of_seen(self, level: Level, image: Image) -> Matrix:
         """(6, 6), see the kernel."""
@@ -233,6 +270,13 @@ class _Descent:
                 if code in (CONVERGED, ITERATION_LIMIT) and total < least * count:
                     best, least = (self.T_21, self.light), total / count
         self.T_21, self.light = best
+
+
+def _is_elsewhere(T_21: Matrix, starts: Matrix, keyframe: Keyframe) -> bool:
+    """Whether the search ended where none of the starts had been, by pixels."""
+    off = se3.log(se3.compose(np.tile(T_21, (len(starts), 1)), se3.inverse(starts)))
+    turned, moved = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1) / keyframe.median_depth
+    return float((turned + moved).min()) * keyframe.camera.fx > _ELSEWHERE * sum(keyframe.shape)
 
 
 def _lights(grey_1: Matrix, grey_2: NDArray[np.float32], before: tuple[float, float] | None) -> list[Matrix]:
