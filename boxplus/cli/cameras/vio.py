@@ -104,6 +104,8 @@ def _rows(summary: VioSummary) -> list[tuple[str, str]]:
     if summary.frames_before_start:
         rows.append(("before the start", f"{summary.frames_before_start} frames without a state"))
     rows += timing_rows(summary.timing)
+    if summary.lengths is not None:
+        rows.append(("lengths", summary.lengths.text))
     rows.append(("landmarks", f"{summary.landmarks:,} of {summary.keyframes} keyframes"))
     if summary.lines:
         rows.append(("lines", f"{summary.lines:,}"))

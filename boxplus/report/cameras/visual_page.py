@@ -79,9 +79,19 @@ def _head(data: VisualData[VioSummary]) -> str:
         (f"{summary.status.get('ok', 0) / max(summary.frames, 1):.1%}", "of the frames ok"),
         *timing_tiles(frame),
         (f"{summary.landmarks:,}", f"landmarks, and {summary.lines:,} lines" if summary.lines else "landmarks"),
+        *_length_tile(summary),
         *accuracy_tiles(data.evaluation),
     ]
     return headline(summary, summary.recording.path, summary.recording.format, numbers)
+
+
+def _length_tile(summary: VioSummary) -> list[tuple[str, str]]:
+    if summary.lengths is None:
+        return []
+    sigma = summary.lengths.sigma
+    if sigma is None:
+        return [("lengths?", "the IMU does not tell them: too little acceleration")]
+    return [(f"{summary.lengths.longer:+.1%} ± {sigma:.1%}", "lengths by the cameras, against the IMU's")]
 
 
 def _map(data: VisualData[VioSummary]) -> go.Figure:

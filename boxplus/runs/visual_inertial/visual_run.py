@@ -23,7 +23,7 @@ from boxplus.runs.visual_inertial.causes import likely_causes
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
-from boxplus.runs.visual_inertial.summary import CameraFacts, VioSummary
+from boxplus.runs.visual_inertial.summary import CameraFacts, LengthFacts, VioSummary
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.odometry import REPEATED, VisualInertialOdometry
@@ -256,6 +256,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             imu_gaps=counts.imu_gaps(),
             time_offset_s=self._time_offset_s,
             landmarks=len(self._landmarks),
+            lengths=None if start is None else _length_facts(*self._odometry.lengths),
             lines=len(self._lines),
         )
 
@@ -287,6 +288,10 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 )
             )
         return facts
+
+
+def _length_facts(longer: float, sigma: float) -> LengthFacts:
+    return LengthFacts(longer=longer, sigma=sigma if np.isfinite(sigma) else None)
 
 
 def _start_facts(start: Start) -> StartFacts:

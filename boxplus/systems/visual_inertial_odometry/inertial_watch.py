@@ -33,11 +33,14 @@ _SEGMENTS, _FEWEST = 3, 2  # that are averaged, and at least
 _LEAST_WAY = 0.005  # m, of what is not known of the cameras' way
 _MOST = 3.0  # times as far as what is known explains
 _SHORT_S = 1.0  # segments that tell lengths
-_FEWEST_SHORT, _LEAST_LENGTH, _LEAST_SIGMAS = 5, 0.02, 4.0  # of them; a share and standard deviations that contradict
+_FEWEST_SHORT = 5  # of them
 
 # What a segment's d has to be of its own error, squared, to say something of lengths: that error is in `off` with the other
 # sign, and looks like lengths too short by 3 over this, all of them where nothing moves.
 _LEAST_SHOWN = 300.0
+
+LEAST_LENGTH, LEAST_SIGMAS = 0.02, 4.0
+"""A share of lengths and its standard deviations, both of which a contradiction of the lengths takes."""
 
 Floats = NDArray[np.float64]
 
@@ -119,7 +122,7 @@ class InertialWatch:
     def contradiction(self) -> str | None:
         """What contradicts, in a sentence; None where nothing does."""
         share, sigma = self.length
-        if abs(share) > max(_LEAST_LENGTH, _LEAST_SIGMAS * sigma):
+        if abs(share) > max(LEAST_LENGTH, LEAST_SIGMAS * sigma):
             are = "longer" if share > 0.0 else "shorter"
             return (
                 f"lengths by the cameras are {100.0 * abs(share):.1f} % {are} than by the IMU, "

@@ -175,6 +175,11 @@ class VisualInertialOdometry:
         """What makes the estimates not to be trusted, whatever their status: cameras and IMU that contradict each other."""
         return self._health.contradiction
 
+    @property
+    def lengths(self) -> tuple[float, float]:
+        """By what share lengths of the cameras exceed the IMU's, and its standard deviation, infinite where nothing tells."""
+        return self._watch.length
+
     def _advance(self, *, final: bool) -> list[VioEstimate]:
         """The frames that are complete, and covered by IMU samples."""
         estimates = []

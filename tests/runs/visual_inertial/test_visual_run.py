@@ -30,7 +30,7 @@ from boxplus.runs.settings_file import load_settings
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.frame_log import read_frame_log
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
-from boxplus.runs.visual_inertial.summary import VioSummary, read_vio_summary
+from boxplus.runs.visual_inertial.summary import LengthFacts, VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
@@ -98,6 +98,14 @@ def test_the_trajectory_is_that_of_the_simulation(finished: tuple[VioFolder, Vio
     truth = read_trajectory(recorded.with_name("room.gt.tum"))
     evaluation = evaluate(read_trajectory(folder.trajectory), truth, alignment="yaw", method="interpolate")
     assert summary.path_length_m > 0.2 and evaluation.ate.rmse < 0.01
+
+
+def test_what_the_imu_says_of_lengths_is_kept_and_said(finished: tuple[VioFolder, VioSummary]) -> None:
+    folder, summary = finished
+    assert summary.lengths is not None and read_vio_summary(folder.summary).lengths == summary.lengths
+    assert "errors of less than 5.2% are not noticed" in LengthFacts(longer=0.027, sigma=0.013).text
+    assert "errors of less than 2.0% are not noticed" in LengthFacts(longer=-0.001, sigma=0.004).text
+    assert "a wrong baseline would not be noticed" in LengthFacts(longer=0.0, sigma=None).text
 
 
 def test_the_report_says_what_the_run_was(finished: tuple[VioFolder, VioSummary]) -> None:
