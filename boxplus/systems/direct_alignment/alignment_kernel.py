@@ -60,6 +60,7 @@ def linearize(
     inverse_depth_1: NDArray[np.float64],
     grey_1: NDArray[np.float64],
     J_1: NDArray[np.float64],
+    share_1: NDArray[np.float64],
     image_2: NDArray[np.float32],
     c: NDArray[np.float64],
     z_min: float,
@@ -70,10 +71,11 @@ def linearize(
     H: NDArray[np.float64],
     g: NDArray[np.float64],
 ) -> tuple[int, float, float, float]:
-    """Residuals e (n,) = I₁ − (gain I₂ + offset), those that count first; H = Σ ρ' JᵀJ/σ² (8, 8), g = Σ ρ' Jᵀe/σ² (8,).
+    """Residuals e (n,) = I₁ − (gain I₂ + offset), those that count first; H = Σ s ρ' JᵀJ/σ² (8, 8), g = Σ s ρ' Jᵀe/σ² (8,),
+    with s (n,) of the keyframe, see `Level.share`.
 
     Returns:
-        number of pixels that count, Σ ρ((e/σ)²), Σ |e|, Σ ρ'.
+        number of pixels that count, Σ s ρ((e/σ)²), Σ |e|, Σ s ρ'.
     """
     R = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
     H[:] = 0.0
@@ -90,10 +92,11 @@ def linearize(
         e[count] = error
         count += np.uint64(1)
         loss, slope, _ = loss_at(loss_code, loss_scale, error * error * information)
-        cost += loss
+        share = share_1[n]
+        cost += share * loss
         total += abs(error)
-        weights += slope
-        weight = slope * information
+        weights += share * slope
+        weight = share * slope * information
         for i in range(6):
             row[i] = J_1[n, i]
         row[6], row[7] = grey, 1.0
@@ -118,6 +121,7 @@ def cell_scores(
     inverse_depth_1: NDArray[np.float64],
     grey_1: NDArray[np.float64],
     J_1: NDArray[np.float64],
+    share_1: NDArray[np.float64],
     image_2: NDArray[np.float32],
     c: NDArray[np.float64],
     z_min: float,
@@ -128,10 +132,10 @@ def cell_scores(
     across: int,
     scores: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """scores (cells, 8): Σ ρ' Jᵀe/σ² over the pixels of each square cell of the keyframe, row by row, `across` of them in one.
+    """scores (cells, 8): Σ s ρ' Jᵀe/σ² over the pixels of each square cell of the keyframe, row by row, `across` of them in one.
 
     Returns:
-        Σ ρ' and Σ (ρ' + 2 ρ'' e²/σ²), whose ratio is that of the weights to the slope of the influence ρ' e.
+        Σ s ρ' and Σ s (ρ' + 2 ρ'' e²/σ²), whose ratio is that of the weights to the slope of the influence ρ' e.
     """
     R = rotation_entries(T_21[0], T_21[1], T_21[2], T_21[3])
     scores[:] = 0.0
@@ -144,10 +148,11 @@ def cell_scores(
         error = grey - gain * value - offset
         square = error * error * information
         _, slope, curvature = loss_at(loss_code, loss_scale, square)
-        weights += slope
-        slopes += slope + 2.0 * curvature * square
+        share = share_1[n]
+        weights += share * slope
+        slopes += share * (slope + 2.0 * curvature * square)
         row = np.uint64(pixels_1[n, 1] / cell) * np.uint64(across) + np.uint64(pixels_1[n, 0] / cell)
-        pull = slope * information * error
+        pull = share * slope * information * error
         for i in range(6):
             scores[row, i] += pull * J_1[n, i]
         scores[row, 6] += pull * grey
@@ -204,6 +209,7 @@ def align_level(
     inverse_depth_1: NDArray[np.float64],
     grey_1: NDArray[np.float64],
     J_1: NDArray[np.float64],
+    share_1: NDArray[np.float64],
     image_2: NDArray[np.float32],
     c: NDArray[np.float64],
     z_min: float,
@@ -220,7 +226,7 @@ def align_level(
 ) -> int:
     """Levenberg-Marquardt at one level; moves `T_21` (7,) and `light` (2,), gain and offset, in place.
 
-    `H` (8, 8) and `figures` (6,), count, Σ ρ, Σ |e|, Σ ρ', σ and iterations, are those at the pose that is left.
+    `H` (8, 8) and `figures` (6,), count, Σ s ρ, Σ |e|, Σ s ρ', σ and iterations, are those at the pose that is left.
     """
     e, H_trial, g, g_trial = np.empty(len(grey_1)), np.empty((_DOF, _DOF)), np.empty(_DOF), np.empty(_DOF)
     L, x, step, trial = np.zeros((_DOF, _DOF)), np.empty(_DOF), np.empty(7), np.empty(7)
@@ -228,7 +234,23 @@ def align_level(
     gain, offset, damping, iterations = light[0], light[1], _FIRST_DAMPING, 0
     sigma, status = 1.0, ITERATION_LIMIT
     count, cost, total, weights = linearize(
-        T_21, gain, offset, rays_1, inverse_depth_1, grey_1, J_1, image_2, c, z_min, loss_code, loss_scale, sigma, e, H, g
+        T_21,
+        gain,
+        offset,
+        rays_1,
+        inverse_depth_1,
+        grey_1,
+        J_1,
+        share_1,
+        image_2,
+        c,
+        z_min,
+        loss_code,
+        loss_scale,
+        sigma,
+        e,
+        H,
+        g,
     )
     stale = True
     while True:
@@ -239,7 +261,8 @@ def align_level(
         if stale or abs(new_sigma - sigma) > _SCALE_MOVED * sigma:
             sigma, stale = new_sigma, False
             count, cost, total, weights = linearize(
-                T_21, gain, offset, rays_1, inverse_depth_1, grey_1, J_1, image_2, c, z_min, loss_code, loss_scale, sigma, e, H, g
+                T_21, gain, offset, rays_1, inverse_depth_1, grey_1, J_1, share_1, image_2, c, z_min, loss_code, loss_scale,
+                sigma, e, H, g,
             )  # fmt: skip
         if status == CONVERGED or iterations >= max_iterations:
             break
@@ -257,8 +280,8 @@ def align_level(
             scale = max(1.0 + x[6], _SHORTEST_GAIN)
             new_gain, new_offset = gain / scale, (offset - x[7]) / scale
             new_count, new_cost, new_total, new_weights = linearize(
-                trial, new_gain, new_offset, rays_1, inverse_depth_1, grey_1, J_1, image_2, c, z_min, loss_code, loss_scale,
-                sigma, e, H_trial, g_trial,
+                trial, new_gain, new_offset, rays_1, inverse_depth_1, grey_1, J_1, share_1, image_2, c, z_min, loss_code,
+                loss_scale, sigma, e, H_trial, g_trial,
             )  # fmt: skip
             # Means, as pixels enter and leave the image; at least half must stay, as an empty sum is no success.
             is_better = 2 * new_count > count and new_cost * count < cost * new_count

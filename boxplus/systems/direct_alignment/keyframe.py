@@ -42,6 +42,7 @@ class Level:
     Attributes:
         octave: how often the image was halved.
         pixels: (n, 2) u, v; rays: (n, 2) of z = 1; inverse_depth: (n,) [1/m]; grey: (n,) of the keyframe.
+        share: (n,) by which a pixel counts, less the steeper its gradient is, so that a few edges do not outweigh all others.
         J: (n, 6) of the keyframe's grey values by ξ = [w, v] [grey values/rad, grey values/m].
         intrinsics: (9,) of the camera at this level.
         gradient_noise: variance that noise of the image gives to a component of the gradients, chosen as they are [1/px²].
@@ -54,6 +55,7 @@ class Level:
     inverse_depth: NDArray[np.float64]
     grey: NDArray[np.float64]
     J: NDArray[np.float64]
+    share: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
     gradient_noise: float
     above_noise: int
@@ -155,7 +157,17 @@ def _level(
     inner = np.all((pixels[:count] > 0) & (pixels[:count] < np.array(grey.shape[::-1]) - 1), axis=1) & seen
     above_noise = int(np.count_nonzero(np.sum(gradients[:count][inner] ** 2, axis=1) > limit))
     grey_1 = np.ascontiguousarray(values[:count][seen, 0])
-    return Level(octave, pixels[:count][seen], rays, inverse_depth, grey_1, J, c, gradient_noise, above_noise)
+    return Level(
+        octave, pixels[:count][seen], rays, inverse_depth, grey_1, J, _share(gradients[:count][seen]), c, gradient_noise,
+        above_noise,
+    )  # fmt: skip
+
+
+def _share(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) by which pixels with these gradients (n, 2) count: c²/(c² + |∇I|²) with c² the mean of |∇I|²."""
+    square = np.sum(gradients**2, axis=1)
+    mean = max(float(square.mean()), 1e-30) if len(square) else 1.0
+    return np.asarray(mean / (mean + square), dtype=np.float64)
 
 
 def _step(grey: NDArray[np.float32]) -> float:

@@ -1,12 +1,13 @@
 """An image aligned to a keyframe, from coarse to fine, with a verdict on whether to believe it.
 
-    T* = argmin_T Σ ρ(e(T)/σ),   e = I₁(p₁) − (eᵃ I₂(π(T X₁)) + b)
+    T* = argmin_T Σ s ρ(e(T)/σ),   e = I₁(p₁) − (eᵃ I₂(π(T X₁)) + b)
 
 by Levenberg-Marquardt, inverse compositional (see `keyframe.py`). σ is estimated anew by the median of the residuals, so that ρ
 sees occlusions and reflections as outliers at every stage. A loss that turns outliers off altogether is for the finest level
 only: far from the solution it would turn off what has to move, so that the levels above have `Huber(1.345)`. At the coarsest
 levels the brightness stands still, as otherwise it takes a share of what motion has to explain; it is either none or that which
-makes medians and spreads of the two images the same, whichever leaves less.
+makes medians and spreads of the two images the same, whichever leaves less. Steep pixels count less, s = c²/(c² + |∇I|²): a
+thing of high contrast that moves on its own would outweigh the rest of the image.
 
 Source: Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Baker and Matthews, Lucas-Kanade 20
 Years On, IJCV 2004; the covariance: Liang and Zeger, Longitudinal Data Analysis using Generalized Linear Models, Biometrika 1986.
@@ -36,6 +37,7 @@ from boxplus.systems.direct_alignment.alignment_kernel import (
 )
 from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe, Level
 from boxplus.systems.direct_alignment.keyframe_kernel import motion_of_seen
+from boxplus.systems.direct_alignment.starts import is_elsewhere, lights_to_try
 
 _FAR_LOSS = Huber(1.345)
 _BRIGHTNESS_BELOW = 3  # octaves that estimate it
@@ -50,8 +52,6 @@ _FEWEST_ABOVE = 40  # pixels at levels above the finest, which only bring the po
 _CELLS = 48  # of the image, whose errors are taken for independent of each other
 _LEAST_SLOPE = 0.1  # of the influence, by the weights
 _NOISE_ALONE = 1.3  # signal up to which next to nothing is left of H without noise
-_SAME_LIGHT = 0.1  # of the spread of grey values: nearer starts of gain and offset are one
-_ELSEWHERE = 0.005  # of width + height, from all starts, from which on they are followed once more
 _RECONSIDERED = 2  # octave from which on they are
 _FAR_MORE, _CLEARLY_LESS = 3.0, 0.8  # of σ: a start that leaves more is not followed, an end that leaves less is taken
 _SEARCH_STEP_DEG, _SEARCH_ITERATIONS, _SEARCH_TOLERANCE = 10.0, 15, 1e-3
@@ -166,7 +166,7 @@ def track(
         is_free = brightness and (level.octave < _BRIGHTNESS_BELOW or level is keyframe.levels[-1])
         code = descent.refine(level, pyramid[level.octave], max_iterations, tolerance * 2.0**level.octave, is_free)
         iterations.append(int(descent.figures[5]))
-    if level.octave == 0 and len(keyframe.levels) > 1 and _is_elsewhere(descent.T_21, starts, keyframe):
+    if level.octave == 0 and len(keyframe.levels) > 1 and is_elsewhere(descent.T_21, starts, keyframe):
         code, iterations[-1] = descent.reconsider(keyframe.levels, pyramid, starts, light, max_iterations, tolerance, code)
     return _judged(descent, level, pyramid[level.octave], code, tuple(iterations), tolerance)
 
@@ -187,9 +187,9 @@ class _Descent:
         loss = _FAR_LOSS if is_far else self.loss
         fewest = int(np.ceil(max(FEWEST_PIXELS if level.octave == 0 else _FEWEST_ABOVE, _LEAST_OVERLAP * len(level.grey))))
         code: int = align_level(
-            self.T_21, self.light, level.rays, level.inverse_depth, level.grey, level.J, image.grey, level.intrinsics,
-            self.z_min, loss.code, loss.scale, is_free, max_iterations, tolerance, self.reach, self.least_sigma, fewest,
-            self.H, self.figures,
+            self.T_21, self.light, level.rays, level.inverse_depth, level.grey, level.J, level.share, image.grey,
+            level.intrinsics, self.z_min, loss.code, loss.scale, is_free, max_iterations, tolerance, self.reach,
+            self.least_sigma, fewest, self.H, self.figures,
         )  # fmt: skip
         return code
 
@@ -230,6 +230,16 @@ class _Descent:
         motion_of_seen(self.T_21, level.rays, level.inverse_depth, level.intrinsics, self.z_min, *image.shape, N)
         return N
 
+    def with_equal_shares(self, level: Level, image: Image) -> tuple[Matrix, float]:
+        """(8, 8) H and Σ ρ' were steep pixels to count like others: what the image has to say, not what is made of it."""
+        H, figures = np.zeros((8, 8)), np.zeros(6)
+        align_level(
+            self.T_21.copy(), self.light.copy(), level.rays, level.inverse_depth, level.grey, level.J, np.ones(len(level.grey)),
+            image.grey, level.intrinsics, self.z_min, self.loss.code, self.loss.scale, False, 0, 0.0, self.reach,
+            self.least_sigma, 1, H, figures,
+        )  # fmt: skip
+        return H, float(figures[3])
+
     def spread_of_score(self, level: Level, image: Image) -> Matrix:
         """(8, 8) covariance of Jᵀe/σ² as the cells of the keyframe scatter it, in units in which H is that of its mean slope."""
         height, width = image.shape
@@ -237,7 +247,7 @@ class _Descent:
         across, down = int(np.ceil(width / cell)), int(np.ceil(height / cell))
         scores = np.empty((across * down, 8))
         weights, slopes = cell_scores(
-            self.T_21, *self.light, level.pixels, level.rays, level.inverse_depth, level.grey, level.J, image.grey,
+            self.T_21, *self.light, level.pixels, level.rays, level.inverse_depth, level.grey, level.J, level.share, image.grey,
             level.intrinsics, self.z_min, self.loss.code, self.loss.scale, self.figures[4], cell, across, scores,
         )  # fmt: skip
         seen = int(scores.any(axis=1).sum())
@@ -261,7 +271,7 @@ class _Descent:
         grid = grid[np.linalg.norm(grid, axis=1) <= np.radians(search_deg) + 1e-12]
         turns = se3.exp(np.concatenate([grid, np.zeros_like(grid)], axis=1))
         best, least = (self.T_21, self.light), np.inf
-        lights = _lights(level.grey, image.grey, light) if self.brightness else [self.light]
+        lights = lights_to_try(level.grey, image.grey, light) if self.brightness else [self.light]
         for gain_and_offset in lights:
             for start in (se3.compose(turn, start) for start in starts for turn in turns):
                 self.T_21, self.light = start, gain_and_offset.copy()
@@ -270,34 +280,6 @@ class _Descent:
                 if code in (CONVERGED, ITERATION_LIMIT) and total < least * count:
                     best, least = (self.T_21, self.light), total / count
         self.T_21, self.light = best
-
-
-def _is_elsewhere(T_21: Matrix, starts: Matrix, keyframe: Keyframe) -> bool:
-    """Whether the search ended where none of the starts had been, by pixels."""
-    off = se3.log(se3.compose(np.tile(T_21, (len(starts), 1)), se3.inverse(starts)))
-    turned, moved = np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1) / keyframe.median_depth
-    return float((turned + moved).min()) * keyframe.camera.fx > _ELSEWHERE * sum(keyframe.shape)
-
-
-def _lights(grey_1: Matrix, grey_2: NDArray[np.float32], before: tuple[float, float] | None) -> list[Matrix]:
-    """Gain and offset of image 2: of the image before; none; what makes its median and its spread those of image 1.
-
-    Those that are next to the same as an earlier one are left out.
-    """
-    median_1, median_2 = float(np.median(grey_1)), float(np.median(grey_2))
-    spread_1, spread_2 = float(np.median(np.abs(grey_1 - median_1))), float(np.median(np.abs(grey_2 - median_2)))
-    lights = [] if before is None else [np.array([np.exp(before[0]), before[1]])]
-    lights.append(np.array([1.0, 0.0]))
-    if spread_1 > 0.0 and spread_2 > 0.0:
-        gain = spread_1 / spread_2
-        lights.append(np.array([gain, median_1 - gain * median_2]))
-    greys = np.array([median_2 - 2.0 * spread_2, median_2 + 2.0 * spread_2])
-    distinct: list[Matrix] = []
-    for light in lights:
-        off = [float(np.abs((light[0] - other[0]) * greys + light[1] - other[1]).max()) for other in distinct]
-        if not any(each < _SAME_LIGHT * spread_1 for each in off):
-            distinct.append(light)
-    return distinct
 
 
 def _without_brightness(H: Matrix) -> Matrix:
@@ -327,9 +309,11 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
     status: Status = "converged"
     reason = ""
     unit = np.array([1.0, 1.0, 1.0, descent.reach, descent.reach, descent.reach])
-    information = (_without_brightness(descent.H) if descent.brightness else descent.H[:6, :6]) * unit[:, None] * unit
-    motion = descent.motion_of_seen(level, image) * unit[:, None] * unit * (weights / count)
-    noise, image_noise = 0.25 * motion, level.gradient_noise / sigma**2 * motion
+    H, all_weights = descent.with_equal_shares(level, image)
+    information = (_without_brightness(H) if descent.brightness else H[:6, :6]) * unit[:, None] * unit
+    seen = descent.motion_of_seen(level, image) * unit[:, None] * unit / count
+    motion, of_image = all_weights * seen, level.gradient_noise / sigma**2
+    noise, image_noise = 0.25 * motion, of_image * motion
     if code == LITTLE_OVERLAP:
         status = "little overlap"
         reason = (
@@ -360,7 +344,7 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
                 f"({_LEAST_SIGNAL:g} at least): the image has no texture along it, or the residuals are too large"
             )
         if is_right_place and signal[0] > 1.0 and above_image > _NOISE_ALONE:
-            covariance = _covariance(descent, level, image, unit, image_noise)
+            covariance = _covariance(descent, level, image, unit, of_image * weights * seen)
     return Alignment(
         T_21=descent.T_21,
         covariance=covariance,

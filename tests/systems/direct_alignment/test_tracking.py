@@ -66,8 +66,8 @@ def test_kernel_is_the_weighted_sum_it_should_be() -> None:
     gain, offset, sigma, loss = 1.1, -3.0, 20.0, Huber(1.345)
     e, H, g = np.empty(len(level.grey)), np.empty((8, 8)), np.empty(8)
     count, cost, total, weights = linearize(
-        T_21, gain, offset, level.rays, level.inverse_depth, level.grey, level.J, second, level.intrinsics, 0.0,
-        loss.code, loss.scale, sigma, e, H, g,
+        T_21, gain, offset, level.rays, level.inverse_depth, level.grey, level.J, level.share, second,
+        level.intrinsics, 0.0, loss.code, loss.scale, sigma, e, H, g,
     )  # fmt: skip
     pixels, _ = CAMERA.project(se3.act(T_21, points_of(level)))
     value, _, seen = sample(second, pixels)
@@ -76,10 +76,20 @@ def test_kernel_is_the_weighted_sum_it_should_be() -> None:
     np.testing.assert_allclose(e[:count], r, atol=1e-9)
     w = np.minimum(1.0, loss.scale * sigma / np.abs(r))
     assert 0.1 < (w < 1.0).mean() < 0.9
+    w *= level.share[seen]
     rows = np.column_stack([level.J, level.grey, np.ones(len(level.grey))])[seen]
     np.testing.assert_allclose(H, rows.T @ (w[:, None] * rows) / sigma**2, rtol=1e-9, atol=1e-9 * H.max())
     np.testing.assert_allclose(g, rows.T @ (w * r) / sigma**2, rtol=1e-9, atol=1e-9 * np.abs(g).max())
     assert total == pytest.approx(np.abs(r).sum()) and weights == pytest.approx(w.sum()) and cost > 0.0
+
+
+def test_steep_pixels_count_less() -> None:
+    first, level = level_at(3)
+    steepness = np.hypot(*np.gradient(first.astype(np.float64)))
+    u, v = level.pixels.astype(int).T
+    square = steepness[v, u] ** 2
+    np.testing.assert_allclose(level.share, square.mean() / (square.mean() + square), rtol=1e-4)
+    assert (level.share * square).max() < square.mean()  # what a pixel can outweigh
 
 
 def test_selected_pixels_are_spread_and_steep() -> None:
