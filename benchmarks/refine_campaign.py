@@ -26,7 +26,7 @@ from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdomet
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.refinement import refine
-from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
+from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown, moved_unshown
 
 Floats = NDArray[np.float64]
 
@@ -69,11 +69,12 @@ def run(seed: int, config: RefinementConfig) -> tuple[str, float, float]:
     errors = [_ate(T[:, 4:], truth[:, 4:]) for T in (before, after)]
     of_run = np.stack([estimates[k].pose_covariance for k in at.tolist()])
     unshown = after_unshown(rows.status)[at]
+    refusal = found.refusal or moved_unshown(rows.status[at], before[:, 4:], after[:, 4:], of_run)
     own = [
         _nees(before, truth, of_run),
         _nees(after, truth, np.where(unshown[:, None, None], of_run, found.pose_covariance[ends])),
     ]
-    accepted = found.refusal is None
+    accepted = refusal is None
     ratio, said = (errors[1] / errors[0], own[1]) if accepted else (1.0, own[0])
     thickness = [1e3 * s.thickness for s in found.sharpness]
     text = (

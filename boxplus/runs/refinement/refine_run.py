@@ -41,7 +41,7 @@ from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
 from boxplus.systems.refinement.state import RefinedState
-from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
+from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown, moved_unshown
 
 Floats = NDArray[np.float64]
 
@@ -199,8 +199,8 @@ class _RefineRun:
                 finished = self._collected(store)
             with self._timed("refining"):
                 found = refine(finished, self._config.refinement, self._tell)
-            refusal = found.refusal
             scans = np.flatnonzero(finished.is_end)
+            refusal = found.refusal or self._moved_unshown(finished, found, scans)
             with self._timed("writing"):
                 self._write_trajectory(finished, found, scans, refusal is None)
                 self._write_place()
@@ -279,11 +279,8 @@ class _RefineRun:
         shift = np.linalg.norm(after.T_world_imu[scans, 4:] - before.T_world_imu[scans, 4:], axis=1)
         cosine = np.abs(np.einsum("ni,ni->n", after.T_world_imu[scans, :4], before.T_world_imu[scans, :4]))
         tilt = np.arccos(np.clip(before.gravity_direction @ after.gravity_direction, -1.0, 1.0))
-        warnings: list[str] = []
-        if refusal is not None:
-            warnings.insert(0, f"not accepted, the trajectory is that of the run and no map was written: {refusal}")
-        if refusal is None:
-            warnings += found.calibration.doubts + self._notes()
+        refused = f"not accepted, the trajectory is that of the run and no map was written: {refusal}"
+        warnings = [*found.calibration.doubts, *self._notes()] if refusal is None else [refused]
         far = contradicted(found.loop_errors)
         if far.any() and finished.loops is not None:
             worst = int(np.argmax(found.loop_errors))
@@ -336,6 +333,15 @@ class _RefineRun:
                 "first of them on covariances are those of the run"
             )
         return notes
+
+    def _moved_unshown(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
+        """Positions by satellite tell what the surroundings did not show."""
+        trajectory = self._run.trajectory
+        if finished.fixes is not None or trajectory.covariance is None:
+            return None
+        rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
+        before, after = (state.T_world_imu[scans, 4:] for state in (found.before, found.after))
+        return moved_unshown(self._run.rows.status[rows], before, after, trajectory.covariance[rows])
 
     def _doubt(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
         """What the run claimed, against where refining has put its poses."""
