@@ -11,7 +11,9 @@
 5. *Support*: enough encounters, of different local maps, along a way.
 6. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well; where
    nothing does, nothing tells them apart.
-7. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
+7. *Directions*: each is measured by an encounter. Along a street of equal fronts all of them may leave open how far, and lie
+   wherever their likeness put them.
+8. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from boxplus.manifolds import se3
+from boxplus.manifolds import quaternion, se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
@@ -44,6 +46,7 @@ _BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: 
 _PREDICTED = 2  # places that are looked at for each local map of the query session
 _AS_WELL = "the maps fit as well"  # begins what is said of a rival
 _FEWEST_STANDING = 100  # points, of all encounters together
+_WORTH_OF_ONE = 0.99  # encounter that measures a direction, but for rounding
 _FIRST = 2  # encounters that agree make a hypothesis
 
 
@@ -98,16 +101,19 @@ class _Meeting:
         return self._as_wholes(joined, kept, predicted, confirmed)
 
     def _as_wholes(self, joined: JoinedGraph, kept: set[int], predicted: int, confirmed: int) -> Meeting:
-        """Steps 6 and 7, of encounters whose alignment nothing else speaks against."""
-        share, least = (
-            self._standing_share([loop for loop in self.loops.values() if id(loop) in kept]),
-            self.config.least_standing,
-        )
+        """Steps 6 to 8, of encounters whose alignment nothing else speaks against."""
+        encounters, least = [loop for loop in self.loops.values() if id(loop) in kept], self.config.least_standing
+        share = self._standing_share(encounters)
         if math.isnan(share):
             return self._refused("nothing stands upright where they lie over each other that could tell", predicted, confirmed)
         if share < least:
             why = f"{100.0 * share:.0f} % of what stands upright in one stands at the same place in the other"
             return self._refused(f"{why}, {100.0 * least:.0f} % are asked for", predicted, confirmed, share)
+        if (axis := self._left_open(encounters)) is not None:
+            x, y, z = axis.tolist()
+            where = f"({x:+.2f}, {y:+.2f}, {z:+.2f}) in the frame of {self.query.session.name}"
+            why = f"{len(encounters)} encounters agree, but the surfaces of all of them leave open how far along {where} it lies"
+            return self._refused(why, predicted, confirmed, share)
         if otherwise := fits_otherwise(self.place, self.query, joined.T_world_session[1], self.config):
             return self._refused(otherwise, predicted, confirmed, share)
         against = "contradicts the encounters that agree with each other"
@@ -304,6 +310,22 @@ class _Meeting:
         if spread < c.least_spread:
             return f"the encounters that agree lie within {spread:.0f} m of way, {c.least_spread:.0f} m are asked for"
         return None
+
+    def _left_open(self, loops: list[Loop]) -> Floats | None:
+        """The direction (3,) in the query session's frame that no encounter measures; None where each is measured.
+
+        Each encounter has the projector on the directions that it measures. Their sum is at least one along what one of them
+        measures, or several in part; the slightly different directions that all leave open add up to nearly nothing, while in
+        the graph, weighed by millimetres across the street, they would pass for decimetres along it.
+        """
+        measured = np.zeros((3, 3))
+        for loop in loops:
+            variance, axes = np.linalg.eigh(loop.covariance[3:, 3:])
+            R = quaternion.to_matrix(self.query.session.T_session_map[loop.query, :4])
+            known = R @ axes[:, variance < self.config.slam.registration.weak_sigma**2]
+            measured += known @ known.T
+        worth, axes = np.linalg.eigh(measured)
+        return None if worth[0] >= _WORTH_OF_ONE else np.asarray(axes[:, 0])
 
 
 def _rival_of(loop: Loop) -> str | None:
