@@ -54,6 +54,7 @@ CASES = {
     "swapped": Case({"swapped": True}, "refusal"),
     "radians": Case({"unit": "rad"}, "refusal"),
     "datum jumps 5 m": Case({"jump": (4.0, 3.0, 0.0)}, "said"),
+    "RTK, datum jumps 1.5 m": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02, "jump": (1.2, 0.9, 0.0)}, "said"),
     "datum jumps 50 m": Case({"jump": (40.0, 30.0, 0.0)}, "said"),
     "other vehicle": Case({}, "refusal"),
 }
@@ -101,10 +102,11 @@ def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
     off = (p - found.frame.to_enu(ORIGIN.to_geodetic(T_enu_imu[at, 4:])))[:, :2]
     after, sigma = _rms(off), _rms(found.fit.sigma[:, None] * [1.0, 1.0])
     is_off = bool((np.linalg.norm(off, axis=1) > SIGMAS * np.sqrt(2.0) * found.fit.sigma).any()) or case.expected == "refusal"
-    verdict = "map" if not is_off else "off, said" if _serious(found.warnings) else "SILENT"
+    told = [*found.warnings, *([found.contradiction] if found.contradiction is not None else [])]
+    verdict = "map" if not is_off else "off, said" if _serious(told) else "SILENT"
     gated = 1.0 - found.used / len(found.attached)
     line = f"sigma {sigma:.2f} gated {100 * gated:.0f} % delay {found.fit.delay:+.2f}"
-    return verdict, " | ".join([line, *found.warnings]), before, after, seconds
+    return verdict, " | ".join([line, *told]), before, after, seconds
 
 
 def _serious(warnings: list[str]) -> bool:
@@ -127,12 +129,12 @@ def main() -> None:
         rows = [run(name, seed) for seed in seeds]
         if options.verbose:
             for seed, (verdict, line, before, after, _) in zip(seeds, rows, strict=True):
-                print(f"  {name:16s} {seed:3d} {verdict:9s} {before:6.2f} -> {after:6.2f} m  {line}")
+                print(f"  {name:22s} {seed:3d} {verdict:9s} {before:6.2f} -> {after:6.2f} m  {line}")
         verdicts = [verdict for verdict, *_ in rows]
         counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts)))
         laid = [(before, after) for _, _, before, after, _ in rows if np.isfinite(after)]
         medians = f"{np.median([b for b, _ in laid]):.2f} -> {np.median([a for _, a in laid]):.2f} m" if laid else "-"
-        print(f"{name:16s} {counts:28s} {medians:18s} {np.mean([row[-1] for row in rows]):.1f} s", flush=True)
+        print(f"{name:22s} {counts:28s} {medians:18s} {np.mean([row[-1] for row in rows]):.1f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -172,19 +172,22 @@ class _Run:
         began = time.perf_counter()
         outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
         correction, gnss, told = outcome.correction, None, [] if outcome.accepted else [LEFT_IN_PLACE]
+        doubt = odometry.contradiction or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:
             write_graph(own.graph, outcome)
             write_georeference(own, earth, config.gnss)
             gnss = gnss_facts(self._recording.info.gnss_topic, earth, correction)
             told += gnss_warnings(earth, config.gnss)
+            if earth.contradiction is not None:
+                doubt = doubt or f"positions by satellite: {earth.contradiction}"
         stored = write_corrected_map(own, config.map, spool, outcome.placed) if spool is not None else 0
         write_loops(own.loops, outcome.loops, np.asarray((correction.time_ns - (odometry.first_time_ns or 0)) * 1e-9))
         shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)
         refused = Counter(_kind(loop.refusal) for loop in outcome.loops if not loop.is_accepted)
         summary = self._facts(odometry.state).model_copy(
             update={
-                "contradiction": odometry.contradiction or outcome.doubt,
+                "contradiction": doubt,
                 "scans": odometry.scans,
                 "path_length_m": odometry.path_length_m,
                 "local_maps": len(correction.time_ns),

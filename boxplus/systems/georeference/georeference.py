@@ -16,7 +16,7 @@ from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
-from boxplus.systems.georeference.doubts import doubts_of, gated_stretches, of_gated
+from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches, of_gated
 from boxplus.systems.georeference.fit import Fit, antennas, fit, level
 from boxplus.systems.georeference.hypotheses import other_clock, other_readings
 from boxplus.systems.georeference.start import Start, extent_of, find_start
@@ -45,6 +45,7 @@ class Georeference:
         left_out: fixes that are not used, by reason.
         stretches: of fixes that fit nothing, (begin [s] since the first fix, duration [s], metres) each.
         warnings: what to doubt about it, one sentence each.
+        contradiction: why it is not to be trusted, as the fixes contradict themselves; None where they do not.
     """
 
     refusal: str | None
@@ -54,6 +55,7 @@ class Georeference:
     left_out: dict[str, int]
     stretches: list[tuple[float, float, float]]
     warnings: list[str]
+    contradiction: str | None = None
 
     @property
     def used(self) -> int:
@@ -191,6 +193,7 @@ def _judged(
         left_out=dict(left_out),
         stretches=stretches,
         warnings=warnings + doubts_of(attached, found, lever is not None, stretches, config),
+        contradiction=contradiction_of(attached, found),
     )
 
 

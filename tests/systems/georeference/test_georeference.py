@@ -67,9 +67,29 @@ def test_what_is_wrong_with_the_fixes_is_refused_with_evidence(laps: Drive, rece
     assert result.fit is None and result.frame is None
 
 
-def test_a_datum_that_changes_a_little_is_not_taken_in_silence(laps: Drive) -> None:
-    jumped = found(laps, GOOD.model_copy(update={"sigma": 0.6, "slow_sigma": 0.5, "claimed": 1.0, "jump": (3.0, 2.0, 0.0)}))
-    assert jumped.refusal is None and any("jump by" in text for text in jumped.warnings)
+PRECISE = {"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02}
+
+
+@pytest.mark.parametrize(
+    "receiver",
+    [
+        {"sigma": 0.6, "slow_sigma": 0.5, "claimed": 1.0, "jump": (3.0, 2.0, 0.0)},
+        {**PRECISE, "jump": (1.2, 0.9, 0.0)},  # so precise that it is gated on both sides of the jump
+    ],
+)
+def test_a_map_between_two_datums_is_not_to_be_trusted(laps: Drive, receiver: dict[str, object]) -> None:
+    jumped = found(laps, GOOD.model_copy(update=receiver))
+    assert jumped.refusal is None and jumped.contradiction is not None
+    assert jumped.contradiction.startswith("fixes jump by ") and "the map lies between the two" in jumped.contradiction
+
+
+@pytest.mark.parametrize(
+    "receiver",
+    [{}, PRECISE, {"multipath": 2, "multipath_s": 5.0}, {**PRECISE, "multipath": 2, "multipath_s": 5.0, "multipath_m": 0.5}],
+)
+def test_noise_and_multipath_do_not_contradict_a_map(laps: Drive, receiver: dict[str, object]) -> None:
+    result = found(laps, GOOD.model_copy(update=receiver))
+    assert result.refusal is None and result.contradiction is None
 
 
 def test_fixes_of_another_vehicle_are_refused(laps: Drive) -> None:
