@@ -22,6 +22,7 @@ _ASKED = 4000  # points that stand, for the fit
 _FAR = 0.15  # m, that a point is off its surface at most: beyond, it does not belong to it
 _FAR_WORSE = 0.5  # of the best fit, before the last stage of registration: what fits less is not worth that stage
 _ONE = 0.2, np.deg2rad(1.0), 0.2  # m, rad, m: guesses that come so near to each other go on as one
+_STACKED_M = 2.0  # m, on the ground, between poses that lie above one another; in height, of storeys at least
 _NO_PLANES = "too few points on planes of the map"
 
 
@@ -135,7 +136,7 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
     ranked = sorted(candidates, key=lambda candidate: -candidate.fit)
     best = next((candidate for candidate in ranked if candidate.refusal is None), None)
     if best is None:
-        return None, "no place passes every test", False
+        return None, f"no place passes every test{_storeys(ranked, config)}", False
     at_once = True
     for other in ranked:
         if other is best or same_pose(other.T_map_query, best.T_map_query):
@@ -146,9 +147,27 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
         )
         if best.fit - other.fit < config.telling * (0.5 if is_clearly_worse else 1.0):
             away = float(np.linalg.norm(other.T_map_query[4:] - best.T_map_query[4:]))
-            return best, f"another pose, {away:.1f} m away, fits nearly as well: {_percent(other)} and {_percent(best)}", False
+            fits = f"{_percent(other)} and {_percent(best)}{_storeys(ranked, config)}"
+            return best, f"another pose, {away:.1f} m away, fits nearly as well: {fits}", False
         at_once = at_once and other.fit * config.decisive <= best.fit
     return best, "", at_once
+
+
+def _storeys(ranked: list[Candidate], config: LocalizationConfig) -> str:
+    """What follows a verdict where poses above one another fit as well as the best of all (empty where none do)."""
+    first = ranked[0]
+    stacked = [first]
+    for other in ranked[1:]:
+        d = np.abs(other.T_map_query[4:] - first.T_map_query[4:])
+        is_above = np.hypot(d[0], d[1]) < _STACKED_M and d[2] > _STACKED_M
+        if is_above and first.fit - other.fit < 0.5 * config.telling:
+            stacked += [other] if not any(same_pose(other.T_map_query, one.T_map_query) for one in stacked) else []
+    if len(stacked) < 2:
+        return ""
+    return (
+        f"; {len(stacked)} poses above one another fit alike, {_percent(stacked[-1])} to {_percent(first)}: storeys that look "
+        "the same from here; go where they differ"
+    )
 
 
 def distinct(candidates: list[Candidate]) -> list[Candidate]:

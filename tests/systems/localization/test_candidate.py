@@ -49,6 +49,23 @@ def test_a_rival_that_fits_nearly_as_well_forbids_to_believe() -> None:
     assert judged(candidate(0.9, 0.0, "seen through"), candidate(0.4, 30.0, "too little")) == (False, False)
 
 
+def above(fit: float, z: float, refusal: str | None = "the surfaces determine 5 of 6 directions only") -> Candidate:
+    own = candidate(fit, 0.0, refusal)
+    return replace(own, T_map_query=own.T_map_query + np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0, z]))
+
+
+def test_storeys_that_look_the_same_are_named() -> None:
+    config = LocalizationConfig()
+    _, why, _ = rivalry([above(0.99, 5.3), above(0.998, 1.3), above(0.96, 9.3), candidate(0.95, 20.0, "no")], config)
+    assert why == (
+        "no place passes every test; 3 poses above one another fit alike, 96 % to 100 %: storeys that look the same from here; "
+        "go where they differ"
+    )
+    _, why, _ = rivalry([above(0.99, 5.3, None), above(0.998, 1.3), above(0.6, 9.3)], config)
+    assert why.startswith("another pose, 4.0 m away, fits nearly as well") and "2 poses above one another fit alike" in why
+    assert rivalry([above(0.9, 0.0), candidate(0.9, 20.0, "no"), above(0.5, 4.0)], config)[1] == "no place passes every test"
+
+
 def test_the_lead_is_over_the_best_of_all_other_poses() -> None:
     best, twin = candidate(0.9, distance=0.03), candidate(0.9, 0.4, distance=0.031)
     assert lead(best, [best]) == pytest.approx(0.8)  # nothing else lies nearer than a point that belongs to no surface
