@@ -46,6 +46,7 @@ _FARTHEST_REVERSED = 4.5  # feet, and a third of it
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
+_MUCH_NEARER = 0.5  # of the angle to the given mounting is left to its inverse, where that was meant
 _MOUNTED = 0.95  # share of the turning that a mounting explains
 _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
 _MIRRORED_RAD, _NEARLY_ALL = np.deg2rad(2.5), 0.12  # a tilt of which a mirrored axis leaves so little is hardly a bias
@@ -229,7 +230,7 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
         f"{np.degrees(np.linalg.norm(rotation.rotation_std[0][seen])):.1f} deg)"
     )
     inverse, mirrored = apart(rotation, T_declared[:3, :3].T, known)[0], _from_mirrored(rotation, T_declared[:3, :3], known)
-    if inverse < min(0.3 * angle, mirrored):
+    if inverse < min(_MUCH_NEARER * angle, mirrored):
         advice = f"its inverse fits to {np.degrees(inverse):.1f} deg: T_imu_lidar maps LiDAR coordinates to IMU coordinates"
     elif abs(angle - np.pi) < _HALF_TURN_RAD or mirrored < apart_allowed(rotation, known):
         advice = "half a turn: the gyroscope's sign is flipped, the points are mirrored, or T_imu_lidar is of another mounting"
