@@ -1,7 +1,6 @@
 """Ctrl-C (or SIGTERM) while a command runs: the first asks to come to an end, the second stops at once.
 
-What may be left out without harm is left at once. What was ignored at the start stays ignored, as Ctrl-C is for what a shell
-runs in the background.
+What may be left out without harm is left at once.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ def stop_on_interrupt(announce: Callable[[], None]) -> Iterator[Callable[[], boo
         stop.set()
         announce()
 
-    before = {number: signal.signal(number, ask) for number in _heeded()}
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop.is_set
     finally:
@@ -41,7 +40,7 @@ def left_at_once() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    around = {number: signal.getsignal(number) for number in _heeded()}
+    around = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def leave(number: int, frame: FrameType | None) -> None:
         asked = around[signal.Signals(number)]
@@ -56,8 +55,3 @@ def left_at_once() -> Iterator[None]:
     finally:
         for number, handler in around.items():
             signal.signal(number, handler)
-
-
-def _heeded() -> list[signal.Signals]:
-    """The signals that ask to stop, but for those that whoever started this had it ignore."""
-    return [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) not in (signal.SIG_IGN, None)]

@@ -336,8 +336,7 @@ class _RefineRun:
 
     def _moved_unshown(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
         """Positions by satellite tell what the surroundings did not show."""
-        trajectory = self._run.trajectory
-        if finished.fixes is not None or trajectory.covariance is None:
+        if finished.fixes is not None or (trajectory := self._run.trajectory).covariance is None:
             return None
         rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
         before, after = (state.T_world_imu[scans, 4:] for state in (found.before, found.after))

@@ -180,7 +180,7 @@ class _Run:
             gnss = gnss_facts(self._recording.info.gnss_topic, earth, correction)
             told += gnss_warnings(earth, config.gnss)
             if earth.contradiction is not None:
-                doubt = doubt or f"positions by satellite: {earth.contradiction}"
+                doubt = "; ".join(filter(None, [doubt, f"positions by satellite: {earth.contradiction}"]))
         stored = write_corrected_map(own, config.map, spool, outcome.placed) if spool is not None else 0
         write_loops(own.loops, outcome.loops, np.asarray((correction.time_ns - (odometry.first_time_ns or 0)) * 1e-9))
         shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)

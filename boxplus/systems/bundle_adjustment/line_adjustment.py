@@ -12,7 +12,7 @@ from pydantic import Field
 from boxplus._arguments import as_settings
 from boxplus._settings import Settings
 from boxplus.cameras.pinhole import Pinhole
-from boxplus.errors import InputError
+from boxplus.errors import BoxplusError, InputError
 from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import lines as line_manifold
 from boxplus.manifolds import quaternion
@@ -246,7 +246,10 @@ def _parallax_ratio(
     held = np.zeros((6, 6))
     held[3:, 3:] = IN_PLACE * np.eye(3)
     problem.add_residuals(Prior(cameras.manifold, cameras.values, information=held), cameras[:])
-    without = problem.solve(config.solver.model_copy(update={**IN_ONE_PLACE, "time_limit_s": None}))
+    try:
+        without = problem.solve(config.solver.model_copy(update={**IN_ONE_PLACE, "time_limit_s": None}))
+    except BoxplusError:  # nothing is shown by what cannot be adjusted
+        return float("inf")
     if any(without.invalid.values()):
         return float("inf")
     noise = max(cost / left, 0.5 * (LEAST_NOISE / config.sigma_px) ** 2)

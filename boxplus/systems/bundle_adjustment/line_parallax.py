@@ -16,6 +16,8 @@ from boxplus.manifolds import quaternion
 
 Floats = NDArray[np.float64]
 
+_TINY = 1e-12  # of a sum of opposite directions, which has none
+
 
 def in_one_place(data: VggLines, seen: NDArray[np.intp]) -> VggLines:
     """All cameras at the origin, and every line and point at distance 1 in the mean plane and direction it is seen in.
@@ -28,22 +30,27 @@ def in_one_place(data: VggLines, seen: NDArray[np.intp]) -> VggLines:
     views, line_of = data.view_of[seen], data.line_of[seen]
     first, last = (_rays(data.K, R, views, data.segments[seen, k : k + 2]) for k in (0, 2))
     normals = np.cross(first, last)
-    for line in np.unique(line_of):
-        own = line_of == line
+    for own in _groups(line_of):
         normal = np.linalg.svd(normals[own])[2][0]
         middle = (first[own] + last[own]).sum(axis=0)
         middle -= normal * (normal @ middle)
-        middle /= np.linalg.norm(middle)
+        middle /= max(float(np.linalg.norm(middle)), _TINY)
         along = 0.5 * np.cross(normal, middle)
-        ends[line] = np.concatenate([middle - along, middle + along])
-    points = data.points_world.copy()
-    rays = _rays(data.K, R, data.point_view_of, data.pixels)
-    for point in np.unique(data.point_of):
-        mean = rays[data.point_of == point].sum(axis=0)
-        points[point] = mean / np.linalg.norm(mean)
+        ends[line_of[own[0]]] = np.concatenate([middle - along, middle + along])
+    points, rays = data.points_world.copy(), _rays(data.K, R, data.point_view_of, data.pixels)
+    shown = np.unique(data.point_of)
+    sums = np.zeros_like(points)
+    np.add.at(sums, data.point_of, rays)
+    points[shown] = sums[shown] / np.maximum(np.linalg.norm(sums[shown], axis=1, keepdims=True), _TINY)
     T = data.T_camera_world.copy()
     T[:, 4:] = 0.0
     return replace(data, T_camera_world=T, end_points_world=ends, points_world=points)
+
+
+def _groups(number: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Where each of the numbers (n,) occurs, in their order."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(number) else []
 
 
 def _rays(K: Floats, R: Floats, views: NDArray[np.integer], pixels: Floats) -> Floats:
