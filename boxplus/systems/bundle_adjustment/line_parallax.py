@@ -47,7 +47,7 @@ def in_one_place(data: VggLines, seen: NDArray[np.intp]) -> VggLines:
     return replace(data, T_camera_world=T, end_points_world=ends, points_world=points)
 
 
-def _groups(number: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _groups(number: NDArray[np.integer]) -> list[NDArray[np.intp]]:
     """Where each of the numbers (n,) occurs, in their order."""
     order = np.argsort(number, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(number) else []
