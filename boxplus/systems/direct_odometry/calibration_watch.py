@@ -17,7 +17,7 @@ from boxplus.systems.direct_odometry.leftover import Combined, Leftover
 
 Matrix = NDArray[np.float64]
 _NAMES = ("the focal length", "the principal point along u", "the principal point along v")
-_FEWEST, _LEAST_SIGMAS = 5, 5.0  # frames, and standard deviations, for a contradiction
+_LEAST_SIGMAS = 5.0  # for a contradiction
 _LEAST_SHARE = 0.02  # by the focal length; smaller errors than that do not need to be told
 _OWN_ERROR = 0.003  # standard deviation of one frame that its scatter does not show: interpolation, vignetting
 
@@ -44,15 +44,12 @@ class CalibrationWatch:
     @property
     def contradiction(self) -> str:
         """Which intrinsics must be wrong, in a sentence; empty where none."""
-        if self._found.frames < _FEWEST:
+        found = self._found.strongest(_LEAST_SHARE, _LEAST_SIGMAS)
+        if found is None:
             return ""
-        q, sigma = self._found.estimate()
-        wrong = (np.abs(q) > _LEAST_SHARE) & (np.abs(q) > _LEAST_SIGMAS * sigma)
-        if not wrong.any():
-            return ""
-        k = int(np.argmax(np.where(wrong, np.abs(q) / sigma, 0.0)))
+        k, q, sigma = found
         kind = "" if k == 0 else " of the focal length"
         return (
-            f"grey values contradict {_NAMES[k]}: they ask for {100.0 * q[k]:+.1f} %{kind}, with a standard deviation of "
-            f"{100.0 * sigma[k]:.1f} %; check the calibration, and whether the images were scaled or cropped"
+            f"grey values contradict {_NAMES[k]}: they ask for {100.0 * q:+.1f} %{kind}, with a standard deviation of "
+            f"{100.0 * sigma:.1f} %; check the calibration, and whether the images were scaled or cropped"
         )

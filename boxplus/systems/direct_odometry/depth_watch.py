@@ -25,7 +25,7 @@ from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.leftover import Combined, Leftover
 
 Matrix = NDArray[np.float64]
-_FEWEST, _LEAST_SIGMAS = 5, 6.0  # frames, and standard deviations, for a contradiction
+_LEAST_SIGMAS = 6.0  # for a contradiction
 _OWN_ERROR = 0.003  # standard deviation of one frame that its scatter does not show
 _REACH = 2  # pixels around one that its surface is told by
 _BENT, _ROUGH = 0.02, 0.03  # shares of ρ by which a pixel, and pixels around it, may be off the plane
@@ -90,17 +90,14 @@ class DepthWatch:
     @property
     def contradiction(self) -> str:
         """What must be wrong with the depths, in a sentence; empty where nothing is."""
-        if self._found.frames < _FEWEST:
+        found = self._found.strongest([least for _, _, least in _CAUSES], _LEAST_SIGMAS)
+        if found is None:
             return ""
-        q, sigma = self._found.estimate()
-        wrong = np.abs(q) > np.maximum(_LEAST_SIGMAS * sigma, [least for _, _, least in _CAUSES])
-        if not wrong.any():
-            return ""
-        k = int(np.argmax(np.where(wrong, np.abs(q) / sigma, 0.0)))
+        k, q, sigma = found
         text, unit, _ = _CAUSES[k]
         return (
-            f"the parallax of the motion contradicts the depths: it looks like {text.format(unit * _SIGNS[k] * q[k])}, "
-            f"{abs(q[k]) / sigma[k]:.0f} standard deviations, over {self._found.frames} keyframes; check that depth and image "
+            f"the parallax of the motion contradicts the depths: it looks like {text.format(unit * _SIGNS[k] * q)}, "
+            f"{abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes; check that depth and image "
             "are registered, taken at the same time, and in the unit and sense that the format defines"
         )
 

@@ -12,7 +12,7 @@ The pose takes what it can; what is left says q, with the covariance of the scat
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.manifolds import quaternion
 from boxplus.residuals.camera.photometric_sampling import sample
@@ -20,6 +20,7 @@ from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
+_FEWEST = 5  # frames for a contradiction
 _CUT = 4.685  # of Tukey's weights, in σ
 _CELLS = 6  # across and down
 _CONDITION = 1e10  # of the normal equations, from which on a frame says nothing
@@ -127,6 +128,21 @@ class Combined:
         self._vector += information @ q
         self._square += float(q @ information @ q)
         self.frames += 1
+
+    def strongest(self, least: ArrayLike, least_sigmas: float) -> tuple[int, float, float] | None:
+        """The cause that stands out most: its number, how much of it there is, and how well that is known; None where none does.
+
+        Args:
+            least: of every cause, or of all, what is worth a word; least_sigmas: standard deviations for a contradiction.
+        """
+        if self.frames < _FEWEST:
+            return None
+        q, sigma = self.estimate()
+        wrong = np.abs(q) > np.maximum(least_sigmas * sigma, least)
+        if not wrong.any():
+            return None
+        k = int(np.argmax(np.where(wrong, np.abs(q) / sigma, 0.0)))
+        return k, float(q[k]), float(sigma[k])
 
     def estimate(self) -> tuple[Matrix, Matrix]:
         """q (k,), and standard deviations (k,) that hold how much at least two frames disagree."""
