@@ -98,11 +98,11 @@ def marginalize(
         problem.set_values(at)
     gone, touched = problem.reach_of(chosen)
     values = [block.values for block in problem.blocks]
-    is_anchored = False
+    is_anchored, some_fixed = False, [bool(block.is_fixed.any()) for block in problem.blocks]
     for group, rows in zip(problem.groups, touched, strict=True):
         if rows.any():
             group.linearize(values, 1)
-            held = any(c.block.is_fixed.any() and c.block.is_fixed[c.rows[rows]].any() for c in group.connections)
+            held = any(some_fixed[c.block.number] and c.block.is_fixed[c.rows[rows]].any() for c in group.connections)
             is_anchored |= group.residual.fixes_gauge or held
     columns = Columns.of(problem.blocks, problem.groups, touched, gone)
     J, r0 = prior_of(*triangle_of(problem.groups, touched, columns), columns.leaving)
@@ -125,5 +125,5 @@ def marginalize(
         keeps_first_estimates=first_estimates,
     )
     absorbed = problem.take_out(gone, touched, prior_follows=True)
-    prior = problem.add_residuals(residual, *(rows.block[k] for rows in variables for k in rows.ids))
+    prior = problem.add_residuals(residual, *(single for rows in variables for single in rows.singles()))
     return Marginal(prior, variables, absorbed, leak)

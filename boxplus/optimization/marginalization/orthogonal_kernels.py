@@ -22,16 +22,6 @@ TOGETHER = 3  # reflections applied in one go; the degrees of freedom of a point
 STEPS = 4  # parts of the columns; rows that begin in a later one are kept apart, as they have less to be merged into
 
 
-@kernel
-def copy_rows(J: NDArray[np.float64], rows: NDArray[np.int64], first: int, packed: NDArray[np.float64]) -> None:
-    """packed[:, :, first:] = J[rows], (n, d, k) into (n, d, more than k)."""
-    for n in range(np.uint64(rows.shape[0])):
-        row = np.uint64(rows[n])
-        for i in range(np.uint64(J.shape[1])):
-            for j in range(np.uint64(J.shape[2])):
-                packed[n, i, np.uint64(first) + j] = J[row, i, j]
-
-
 @kernel(fastmath=True, inline=True)
 def eliminate_columns(
     A: NDArray[np.float64],
@@ -273,6 +263,7 @@ def add_rows(
         squares: (w,) receives the sum of squares of every column.
         triangle: (w, w + 1).
     """
+    zero, one = np.uint64(0), np.uint64(1)
     width = triangle.shape[0]
     place = np.full(width, -1)
     touched = np.empty(width, dtype=np.int64)
@@ -317,24 +308,31 @@ def add_rows(
             A[:, kept:rows] = 0.0
             X[:kept, before:reach] = 0.0
             X[kept:rows, :reach] = 0.0
-            i = kept
+            i = np.uint64(kept)
             for f in range(first, e):
                 n = residual[f]
-                source = at[n]
-                for _ in range(dim[n]):
-                    for q in range(slot[n], slot[n + 1]):
-                        if column[q] >= 0:
-                            to = place[column[q]]
-                            for j in range(dof[q]):
-                                X[i, to + j] += data[source + j]
-                                squares[column[q] + j] += data[source + j] * data[source + j]
-                        elif column[q] == OWN:
-                            for j in range(k):
-                                A[position[j], i] += data[source + j]
-                        source += dof[q]
-                    X[i, 0] = data[source]
-                    source += 1
-                    i += 1
+                source, numbers, height_of = np.uint64(at[n]), np.uint64(0), np.uint64(dim[n])
+                for q in range(slot[n], slot[n + 1]):
+                    numbers += np.uint64(dof[q])
+                numbers += one
+                for q in range(slot[n], slot[n + 1]):
+                    c, d = column[q], np.uint64(dof[q])
+                    if c >= 0:
+                        to, u = np.uint64(place[c]), np.uint64(c)
+                        for h in range(height_of):
+                            for j in range(d):
+                                value = data[source + h * numbers + j]
+                                X[i + h, to + j] += value
+                                squares[u + j] += value * value
+                    elif c == OWN:
+                        for j in range(np.uint64(k)):
+                            to = np.uint64(position[j])
+                            for h in range(height_of):
+                                A[to, i + h] += data[source + h * numbers + j]
+                    source += d
+                for h in range(height_of):
+                    X[i + h, zero] = data[source + h * numbers]
+                i += height_of
             rank = 0
             if k > 0:
                 for c in range(k):
@@ -356,12 +354,13 @@ def add_rows(
                     merge_batch(B[now], start[now], stop, used[now], triangle)
                     used[now] = 0
                 fresh, below = min(rows - done, BATCH - used[now]), used[now]
-                for c in range(1, reach):
-                    to = touched[c - 1]
-                    for i in range(fresh):
-                        B[now, to, below + i] = X[done + i, c]
-                for i in range(fresh):
-                    B[now, width, below + i] = X[done + i, 0]
+                gathered, from_row, to_row = B[now], np.uint64(done), np.uint64(below)
+                for c in range(one, np.uint64(reach)):
+                    to = np.uint64(touched[c - one])
+                    for i in range(np.uint64(fresh)):
+                        gathered[to, to_row + i] = X[from_row + i, c]
+                for i in range(np.uint64(fresh)):
+                    gathered[np.uint64(width), to_row + i] = X[from_row + i, zero]
                 start[now] = min(start[now], lowest)
                 used[now] += fresh
                 done += fresh

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, copy_rows, eliminate_columns
+from boxplus.optimization.marginalization.orthogonal_kernels import OWN, STEPS, TOGETHER, add_rows, eliminate_columns
+from boxplus.optimization.marginalization.packing import begin_group, copy_residuals, keys_of, mark, pack_variable, unmark_shared
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.removal import Masks
 from boxplus.optimization.terms.variables import Variables
@@ -47,10 +48,8 @@ class Columns:
         """From the residuals `touched` of every group and the variables `gone` of every block."""
         met = [np.zeros(len(block), dtype=np.bool_) for block in blocks]
         for group, chosen in zip(groups, touched, strict=True):
-            if chosen.any():
-                every = chosen.all()
-                for c in group.connections:
-                    met[c.block.number][c.rows if every else c.rows[chosen]] = True
+            for c in group.connections:
+                mark(c.rows, chosen, met[c.block.number])
         for block in blocks:
             met[block.number] &= ~block.is_fixed
         alone = _independent(blocks, groups, touched, [m & g for m, g in zip(met, gone, strict=True)])
@@ -91,76 +90,57 @@ def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: 
         alone[block.number] = candidates
         single[block.number] = True
         for group, chosen in zip(groups, touched, strict=True):
-            if not any(c.block is block for c in group.connections):
-                continue
-            hits = [alone[c.block.number][c.rows] for c in group.connections if single[c.block.number]]
-            if len(hits) > 1 and chosen.any():
-                before, shared = hits[0].copy(), np.zeros(len(chosen), dtype=np.bool_)
-                for hit in hits[1:]:
-                    shared |= before & hit
-                    before |= hit
-                shared &= chosen
-                for c in group.connections:
+            leaving_slots = [c for c in group.connections if single[c.block.number]]
+            if len(leaving_slots) > 1 and any(c.block is block for c in leaving_slots):
+                meetings = np.zeros(len(chosen), dtype=np.uint8)
+                for c in leaving_slots:
+                    meetings += alone[c.block.number][c.rows]
+                for c in leaving_slots:
                     if c.block is block:
-                        candidates[c.rows[shared]] = False
+                        unmark_shared(c.rows, chosen, meetings, candidates)
     return alone
-
-
-def _pack(
-    group: Group, chosen: NDArray[np.bool_], columns: Columns, data: NDArray[np.float64], column: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """[J, r] of the chosen residuals into `data` and the columns (n, slots) of their variables; (n,) their landmarks."""
-    every = len(column) == len(chosen)
-    rows = np.flatnonzero(chosen)
-    packed = data.reshape(len(rows), group.residual.dim, -1)
-    end = 0
-    for J in group.jacobians:
-        copy_rows(J, rows, end, packed)
-        end += J.shape[2]
-    packed[:, :, end] = group.r if every else group.r[rows]
-    landmark = np.full(len(rows), _NONE)
-    for slot, c in enumerate(group.connections):
-        at = c.rows if every else c.rows[rows]
-        column[:, slot] = columns.place[c.block.number][at]
-        if columns.has_landmarks[c.block.number]:
-            np.maximum(landmark, columns.landmark[c.block.number][at], out=landmark)
-    return landmark
 
 
 def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """R (w, w + 1) of all rows without their landmarks, residuals in the last column, and (w,) the lengths of the columns."""
-    leaving = [(group, chosen, int(np.count_nonzero(chosen))) for group, chosen in zip(groups, touched, strict=True)]
-    leaving = [part for part in leaving if part[2]]
+    leaving = [(group, np.flatnonzero(chosen)) for group, chosen in zip(groups, touched, strict=True)]
+    leaving = [(group, rows) for group, rows in leaving if len(rows)]
     triangle, squares = np.zeros((columns.width, columns.width + 1)), np.zeros(columns.width)
     if leaving and columns.width:
-        count = np.array([n for *_, n in leaving])
-        dims = np.array([group.residual.dim for group, *_ in leaving])
-        dofs = [np.array([c.block.manifold.dof for c in group.connections]) for group, *_ in leaving]
-        widths = np.array([dof.sum() for dof in dofs])
-        dim, width, slots = np.repeat(dims, count), np.repeat(widths, count), np.repeat([len(dof) for dof in dofs], count)
-        size = dim * (width + 1)
-        at, slot = np.cumsum(size) - size, np.concatenate([[0], np.cumsum(slots)])
-        dof = np.concatenate([np.tile(own, n) for own, n in zip(dofs, count, strict=True)])
-        data, column = np.empty(int(size.sum())), np.empty(len(dof), dtype=np.int64)
-        landmark, first = np.empty(len(dim), dtype=np.int64), np.empty(len(dim), dtype=np.int64)
-        n = 0
-        for (group, chosen, own_count), own in zip(leaving, dofs, strict=True):
-            begin, n = n, n + own_count
-            place = column[slot[begin] : slot[n]].reshape(own_count, len(own))
-            landmark[begin:n] = _pack(group, chosen, columns, data[at[begin] : at[n - 1] + size[n - 1]], place)
-            first[begin:n] = columns.width
-            for slot_place in place.T.view(np.uint64):  # what has no column is negative, and without a sign larger than any
-                np.minimum(first[begin:n], slot_place, out=first[begin:n], casting="unsafe")
+        # Of every group: how many residuals, rows, numbers in a row, variables.
+        shapes = [(len(rows), g.residual.dim, g.tangents + 1, len(g.connections)) for g, rows in leaving]
+        count = sum(n for n, *_ in shapes)
+        data = np.empty(sum(n * dim * width for n, dim, width, _ in shapes))
+        column, dof = np.empty((2, sum(n * slots for n, *_, slots in shapes)), dtype=np.int64)
+        at, dim, slot = (np.empty(count + 1, dtype=np.int64) for _ in range(3))
+        landmark, first = np.empty((2, count), dtype=np.int64)
+        n, size, k = 0, 0, 0
+        for (group, rows), (own_count, own_dim, width, slots) in zip(leaving, shapes, strict=True):
+            own = slice(n, n + own_count)
+            begin_group(own_dim, width, slots, size, k, columns.width, dim[own], at[own], slot[own], landmark[own], first[own])
+            packed = data[size : size + own_count * own_dim * width].reshape(own_count, own_dim, width)
+            end = 0
+            for number, (c, J) in enumerate(zip(group.connections, group.jacobians, strict=True)):
+                block = c.block.number
+                pack_variable(
+                    J, rows, c.rows, columns.place[block], columns.landmark[block], end, number, k, slots,
+                    packed, column, dof, landmark[own], first[own],
+                )  # fmt: skip
+                end += J.shape[2]
+            copy_residuals(group.r, rows, packed)
+            n, size, k = n + own_count, size + packed.size, k + own_count * slots
+        slot[count] = k
         # Residuals without a landmark follow the landmarks, each alone.
-        single = np.flatnonzero(landmark < 0)
-        landmark[single] = len(columns.own) + np.arange(len(single))
-        own = np.concatenate([columns.own, np.zeros(len(single), dtype=np.int64)])
-        step = np.minimum(first * STEPS // columns.width, STEPS - 1)
-        residual, starts = order_by(landmark * STEPS + (STEPS - 1 - step), len(own) * STEPS)
-        order, begin_of = residual.astype(np.int64), starts[::STEPS]
-        rows, reach = (np.bincount(landmark, weights=w, minlength=len(own)) for w in (dim, width))
-        work = np.empty(int((rows * (np.minimum(reach, columns.width) + own + 1)).max()))
-        add_rows(data, at, dim, slot, column, dof, step, order, begin_of, own, _RANK, work, squares, triangle)
+        own, key = np.zeros(len(columns.own) + count, dtype=np.int64), np.empty(count, dtype=np.int64)
+        own[: len(columns.own)] = columns.own
+        alone, work = keys_of(landmark, first, dim, at, len(data), columns.width, own, len(columns.own), key)
+        own = own[: len(columns.own) + alone]
+        order, starts = order_by(key, len(own) * STEPS)
+        step = STEPS - 1 - key % STEPS
+        add_rows(
+            data, at, dim, slot, column, dof, step, order.astype(np.int64), starts[::STEPS], own, _RANK,
+            np.empty(work), squares, triangle,
+        )  # fmt: skip
     return triangle, np.sqrt(squares)
 
 

@@ -153,7 +153,9 @@ class Group:
         self.removed = gone if self.removed is None else self.removed | gone
         # What they were connected to may go as well: they are connected to what another one has, and never looked at.
         present = int(np.argmin(self.removed))
-        self.connections = tuple(VariableRows(c.block, np.where(self.removed, c.ids[present], c.ids)) for c in self.connections)
+        self.connections = tuple(
+            VariableRows.known(c.block, np.where(self.removed, c.ids[present], c.ids)) for c in self.connections
+        )
         self.revision += 1
 
     def synchronize(self) -> None:
@@ -303,8 +305,8 @@ class Group:
                     weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
 
         run_chunks(work, residual.count, self._chunk, threads)
-        cost, common, lost, valid = self._sums.sum(axis=0) if len(self._sums) else (0.0, 0.0, 0, 0)
-        return GroupCost(float(cost), float(common), int(lost), int(valid))
+        cost, common, lost, valid = (self._sums[0] if len(self._sums) == 1 else self._sums.sum(axis=0)).tolist()
+        return GroupCost(cost, common, int(lost), int(valid))
 
     def _evaluate_beside(self, begin: int, end: int, x: tuple[NDArray[np.float64], ...]) -> None:
         """Residuals at x, beside Jacobians that were taken elsewhere; what is singular at one of the points counts nothing."""

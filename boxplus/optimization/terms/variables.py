@@ -216,8 +216,24 @@ class VariableRows:
         self.ids, self._rows, self._revision = ids, rows, self.block.revision
         return True
 
+    @classmethod
+    def known(cls, block: Variables, ids: NDArray[np.int64], rows: NDArray[np.uint32] | None = None) -> VariableRows:
+        """Of ids (k,) that are known to be there, at rows (k,); where none are given they are looked up when asked for."""
+        selected = cls.__new__(cls)
+        selected.block, selected.ids = block, ids
+        if rows is None:
+            selected._revision = -1
+        else:
+            selected._rows, selected._revision = rows, block.revision
+        return selected
+
     def __len__(self) -> int:
         return len(self.ids)
+
+    def singles(self) -> list[VariableRows]:
+        """A selection of one variable for every one of these."""
+        rows = self.rows
+        return [VariableRows.known(self.block, self.ids[k : k + 1], rows[k : k + 1]) for k in range(len(rows))]
 
     @property
     def rows(self) -> NDArray[np.uint32]:
