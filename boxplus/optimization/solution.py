@@ -257,5 +257,5 @@ def values_at(blocks: Sequence[Variables], given: Solution | Sequence[NDArray[np
     for block, array in zip(blocks, values, strict=True):
         if np.shape(array) != block.values.shape:
             raise InputError(f"{block.name} of shape {block.values.shape}", f"shape {np.shape(array)}", "keep the block's shape")
-        checked.append(block.manifold.check(block.name, array))
+        checked.append(array.copy() if isinstance(given, Solution) else block.manifold.check(block.name, array))
     return checked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,8 +65,8 @@ class MarginalPrior(Residual):
         if not (np.isfinite(self.J).all() and np.isfinite(self.r0).all()):
             raise InputError("finite J and r0", "NaN or infinity", "marginalise where all residuals can be evaluated")
         self.keeps_first_estimates = keeps_first_estimates
-        ends = np.cumsum([m.dof for m in manifolds])
-        self._J = tuple(np.ascontiguousarray(self.J[:, end - m.dof : end]) for end, m in zip(ends, manifolds, strict=True))
+        ends = list(accumulate(m.dof for m in manifolds))
+        self._J = tuple(self.J[:, end - m.dof : end].copy() for end, m in zip(ends, manifolds, strict=True))
         # Variables on one manifold are checked and compared with their points all at once.
         points: dict[int, Array] = {}
         self._alike = []
@@ -73,7 +74,7 @@ class MarginalPrior(Residual):
             slots = [k for k, other in enumerate(manifolds) if other == manifold]
             checked = manifold.check("x0", np.array([x0[k] for k in slots]))
             points |= dict(zip(slots, checked, strict=True))
-            columns = (ends[slots, None] + np.arange(-manifold.dof, 0)).reshape(-1)
+            columns = np.array([c for k in slots for c in range(ends[k] - manifold.dof, ends[k])])
             self._alike.append((manifold, slots, checked, columns))
         self.x0 = tuple(points[k] for k in range(len(manifolds)))
         rows = len(self.J)

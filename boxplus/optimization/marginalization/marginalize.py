@@ -101,7 +101,7 @@ def marginalize(
     is_anchored, some_fixed = False, [bool(block.is_fixed.any()) for block in problem.blocks]
     for group, rows in zip(problem.groups, touched, strict=True):
         if rows.any():
-            group.linearize(values, 1)
+            group.linearize_some(values, rows)
             held = any(some_fixed[c.block.number] and c.block.is_fixed[c.rows[rows]].any() for c in group.connections)
             is_anchored |= group.residual.fixes_gauge or held
     columns = Columns.of(problem.blocks, problem.groups, touched, gone)

@@ -26,7 +26,7 @@ def mark(rows: NDArray[np.uint32], chosen: NDArray[np.bool_], marked: NDArray[np
 
 @kernel
 def unmark_shared(
-    rows: NDArray[np.uint32], chosen: NDArray[np.bool_], meetings: NDArray[np.uint8], marked: NDArray[np.bool_]
+    rows: NDArray[np.uint32], chosen: NDArray[np.bool_], meetings: NDArray[np.int64], marked: NDArray[np.bool_]
 ) -> None:
     """marked[rows[n]] = False for the chosen n that meet more than one."""
     for n in range(np.uint64(len(rows))):

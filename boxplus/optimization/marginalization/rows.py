@@ -92,7 +92,7 @@ def _independent(blocks: Sequence[Variables], groups: Sequence[Group], touched: 
         for group, chosen in zip(groups, touched, strict=True):
             leaving_slots = [c for c in group.connections if single[c.block.number]]
             if len(leaving_slots) > 1 and any(c.block is block for c in leaving_slots):
-                meetings = np.zeros(len(chosen), dtype=np.uint8)
+                meetings = np.zeros(len(chosen), dtype=np.int64)
                 for c in leaving_slots:
                     meetings += alone[c.block.number][c.rows]
                 for c in leaving_slots:

@@ -230,6 +230,11 @@ class Group:
             changes = [tangent_change(native, tangents[c.block.number]) for native, c in parts]
         return self._visit(values, threads, changes)
 
+    def linearize_some(self, values: Sequence[NDArray[np.float64]], chosen: NDArray[np.bool_]) -> None:
+        """As `linearize`, but of the residuals from the first to the last of those chosen (N,) alone; one at least is."""
+        first, after = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
+        self._visit(values, 1, self._change, (first, after))
+
     def evaluate(self, values: Sequence[NDArray[np.float64]], threads: int) -> GroupCost:
         """Cost at the point `values`; overwrites `r` and `valid`, not the Jacobians."""
         return self._visit(values, threads, None)
@@ -255,9 +260,17 @@ class Group:
         self.counted[:] = self.valid
 
     def _visit(
-        self, values: Sequence[NDArray[np.float64]], threads: int, changes: list[TangentChange | None] | None
+        self,
+        values: Sequence[NDArray[np.float64]],
+        threads: int,
+        changes: list[TangentChange | None] | None,
+        within: tuple[int, int] | None = None,
     ) -> GroupCost:
-        """Residuals, and unless `changes` is None Jacobians with the change of tangent of every connected variable."""
+        """Residuals, and unless `changes` is None Jacobians with the change of tangent of every connected variable.
+
+        Args:
+            within: begin and end of the residuals that are looked at; all where left out.
+        """
         x = tuple(values[c.block.number] for c in self.connections)
         # Jacobians where the variables were first known, residuals where they are.
         x0 = x
@@ -304,7 +317,10 @@ class Group:
                 if self.loss.code != SQUARED:
                     weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
 
-        run_chunks(work, residual.count, self._chunk, threads)
+        if within is None:
+            run_chunks(work, residual.count, self._chunk, threads)
+        else:
+            work(0, *within)
         cost, common, lost, valid = (self._sums[0] if len(self._sums) == 1 else self._sums.sum(axis=0)).tolist()
         return GroupCost(cost, common, int(lost), int(valid))
 

@@ -120,11 +120,10 @@ def check_pixels(name: str, pixels: ArrayLike, columns: int = 2) -> NDArray[np.f
     array = np.array(as_floats(pixels, "pixels"), order="C")
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{name} of shape (N, {columns}) [px]", f"shape {array.shape}", "give one row for each observation")
-    finite = np.isfinite(array).all(axis=1)
+    finite = np.isfinite(array)
     if not finite.all():
-        raise InputError(
-            f"{name} finite [px]", f"NaN or infinity in row {int(np.argmin(finite))}", "leave out what was not observed"
-        )
+        row = int(np.argmin(finite.all(axis=1)))
+        raise InputError(f"{name} finite [px]", f"NaN or infinity in row {row}", "leave out what was not observed")
     return array
 
 

@@ -193,6 +193,20 @@ def test_one_at_a_time_equals_all_at_once():
     assert len(problem.groups) == 2  # the prior before is in the new one
 
 
+def test_hundreds_of_variables_that_share_one_residual_leave_together():
+    """More of them than a byte counts; each is then not taken for a landmark that goes alone."""
+    count = 257
+    rng = np.random.default_rng(3)
+    J = rng.standard_normal((count, count)) + 10.0 * np.eye(count)
+    problem = Problem()
+    x = problem.add_variables(Euclidean(1), np.zeros((count, 1)), name="x")
+    prior = MarginalPrior([Euclidean(1)] * count, [np.zeros(1)] * count, J, rng.standard_normal(count))
+    problem.add_residuals(prior, *(x[k] for k in range(count)))
+    left = marginalize(problem, x[1:], at=None).prior.residual
+    assert left.J.shape == (1, 1)
+    assert abs(left.J[0, 0]) == pytest.approx(1.0 / np.sqrt(np.linalg.inv(J.T @ J)[0, 0]), rel=1e-9)
+
+
 def test_the_prior_is_the_schur_complement():
     scene = make_scene(cameras=8, points=10)
     solution = scene.problem.solve()

@@ -258,8 +258,8 @@ class FeatureTracker:
             m = self._rays[rows, 0]
             turned = m @ T[:3, :3].T
             guess, seen = model.project(turned + self._rho[rows, None] * T[:3, 3])
-            tried = rows[seen & self._inside(guess, c)]
-            guess = guess[seen & self._inside(guess, c)]
+            may_be_seen = seen & self._inside(guess, c)
+            tried, guess = rows[may_be_seen], guess[may_be_seen]
             if not len(tried):
                 continue
             there, kept = self._flow(first, image, self._pixels[tried, 0], guess, Counter())
