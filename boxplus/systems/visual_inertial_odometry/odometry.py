@@ -28,6 +28,7 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.focal_watch import FocalWatch
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
@@ -99,6 +100,7 @@ class VisualInertialOdometry:
         self._time_ns = 0  # of the frame before
         self._health = Health(self.config)
         self._watch = InertialWatch(self.config.gravity)
+        self._focal_watch = FocalWatch(self.rig, self.config.pixel_sigma)
         self._counters: Counter[str] = Counter()
 
     @overload
@@ -338,7 +340,9 @@ class VisualInertialOdometry:
         lines = tracks.lines
         covariance = self.window.covariance
         self._watch.add(pose, state, covariance, self.window.last_step)
-        sigma, apart = position_sigma(covariance), self._watch.contradiction
+        if is_keyframe:
+            self._focal_watch.add(tracks)
+        sigma, apart = position_sigma(covariance), self._focal_watch.contradiction or self._watch.contradiction
         status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart)
         return VioEstimate(
             time_ns=tracks.time_ns,
