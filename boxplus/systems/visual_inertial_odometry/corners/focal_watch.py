@@ -5,9 +5,9 @@ the epipolar line with normal n = t × R m of a ray m of the first camera, y in 
 
     e = n · y / |n_xy| ≈ ε (n_xy · y_xy) / |n_xy| + θ · (y × n) / |n_xy|
 
-beside a mounting that is turned by θ. Least squares over the corners of the last keyframes tell ε from θ. Corners that lie farther
-off than `VioConfig.epipolar` were taken for mistakes and are not among them, so that those near the middle of the image tell most,
-and ε looks smaller than it is, by as much more as corners are noisy; never larger.
+beside a mounting that is turned by θ. Least squares over the corners of the last keyframes tell ε from θ. Corners that lie
+farther off than `VioConfig.epipolar` were taken for mistakes and are not among them. Those near the middle of the image tell of ε
+then, and the noisier they are, the smaller it looks.
 
 Source: docs/visual_inertial_odometry.md, "What counts as a contradiction".
 """
@@ -24,7 +24,7 @@ from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 
 _MEMORY = 0.9  # of the sums, per keyframe
-_FEWEST = 60  # pairs of corners, as the sums remember them
+_FEWEST = 30  # pairs of corners, as the sums remember them
 _LEAST, _SIGMAS = 0.01, 6.0  # of ε: calibrations are exact to a few thousandths
 _TURN_SIGMA = 0.05  # rad, of θ beforehand
 
@@ -73,7 +73,7 @@ class FocalWatch:
                 are = "longer" if epsilon > 0.0 else "shorter"
                 return (
                     f"corners that cameras 0 and {k} both see fit a focal length of camera {k} that is "
-                    f"{100.0 * abs(epsilon):.1f} % {are} than calibrated or more, beside that of camera 0 (standard deviation "
+                    f"about {100.0 * abs(epsilon):.1f} % {are} than calibrated, beside that of camera 0 (standard deviation "
                     f"{100.0 * sigma:.2f} %): check the focal lengths, and the image sizes they are for"
                 )
         return None

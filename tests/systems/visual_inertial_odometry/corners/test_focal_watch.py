@@ -63,12 +63,12 @@ def _watched(seed, stated, keyframes=12):
 )
 def test_the_ratio_of_two_focal_lengths_is_told_and_named_where_it_is_wrong(factors, expected):
     watch = _watched(1, _stated(factors))
-    # Corners far off were taken for mistakes: what is told is the least that is wrong.
+    # Corners far off were taken for mistakes, which makes less of it.
     least, most = sorted([0.5 * expected, 1.05 * expected])
     assert least - 4.0 * watch.sigma[0] < watch.longer[0] < most + 4.0 * watch.sigma[0]
     assert watch.sigma[0] < 0.005
     if expected:
-        assert f"{abs(100.0 * watch.longer[0]):.1f} % {'longer' if expected > 0.0 else 'shorter'}" in watch.contradiction
+        assert f"about {abs(100.0 * watch.longer[0]):.1f} % {'longer' if expected > 0.0 else 'shorter'}" in watch.contradiction
     else:
         assert watch.contradiction is None
 
