@@ -308,10 +308,10 @@ def add_rows(
             A[:, kept:rows] = 0.0
             X[:kept, before:reach] = 0.0
             X[kept:rows, :reach] = 0.0
-            i = np.uint64(kept)
+            top = np.uint64(kept)
             for f in range(first, e):
                 n = residual[f]
-                source, numbers, height_of = np.uint64(at[n]), np.uint64(0), np.uint64(dim[n])
+                source, numbers, lines = np.uint64(at[n]), np.uint64(0), np.uint64(dim[n])
                 for q in range(slot[n], slot[n + 1]):
                     numbers += np.uint64(dof[q])
                 numbers += one
@@ -319,20 +319,20 @@ def add_rows(
                     c, d = column[q], np.uint64(dof[q])
                     if c >= 0:
                         to, u = np.uint64(place[c]), np.uint64(c)
-                        for h in range(height_of):
+                        for h in range(lines):
                             for j in range(d):
                                 value = data[source + h * numbers + j]
-                                X[i + h, to + j] += value
+                                X[top + h, to + j] += value
                                 squares[u + j] += value * value
                     elif c == OWN:
                         for j in range(np.uint64(k)):
                             to = np.uint64(position[j])
-                            for h in range(height_of):
-                                A[to, i + h] += data[source + h * numbers + j]
+                            for h in range(lines):
+                                A[to, top + h] += data[source + h * numbers + j]
                     source += d
-                for h in range(height_of):
-                    X[i + h, zero] = data[source + h * numbers]
-                i += height_of
+                for h in range(lines):
+                    X[top + h, zero] = data[source + h * numbers]
+                top += lines
             rank = 0
             if k > 0:
                 for c in range(k):
@@ -355,12 +355,12 @@ def add_rows(
                     used[now] = 0
                 fresh, below = min(rows - done, BATCH - used[now]), used[now]
                 gathered, from_row, to_row = B[now], np.uint64(done), np.uint64(below)
-                for c in range(one, np.uint64(reach)):
-                    to = np.uint64(touched[c - one])
-                    for i in range(np.uint64(fresh)):
-                        gathered[to, to_row + i] = X[from_row + i, c]
-                for i in range(np.uint64(fresh)):
-                    gathered[np.uint64(width), to_row + i] = X[from_row + i, zero]
+                for m in range(one, np.uint64(reach)):
+                    to = np.uint64(touched[m - one])
+                    for h in range(np.uint64(fresh)):
+                        gathered[to, to_row + h] = X[from_row + h, m]
+                for h in range(np.uint64(fresh)):
+                    gathered[np.uint64(width), to_row + h] = X[from_row + h, zero]
                 start[now] = min(start[now], lowest)
                 used[now] += fresh
                 done += fresh

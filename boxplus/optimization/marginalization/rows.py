@@ -116,15 +116,17 @@ def triangle_of(groups: Sequence[Group], touched: Masks, columns: Columns) -> tu
         landmark, first = np.empty((2, count), dtype=np.int64)
         n, size, k = 0, 0, 0
         for (group, rows), (own_count, own_dim, width, slots) in zip(leaving, shapes, strict=True):
-            own = slice(n, n + own_count)
-            begin_group(own_dim, width, slots, size, k, columns.width, dim[own], at[own], slot[own], landmark[own], first[own])
+            part = slice(n, n + own_count)
+            begin_group(
+                own_dim, width, slots, size, k, columns.width, dim[part], at[part], slot[part], landmark[part], first[part]
+            )
             packed = data[size : size + own_count * own_dim * width].reshape(own_count, own_dim, width)
             end = 0
             for number, (c, J) in enumerate(zip(group.connections, group.jacobians, strict=True)):
                 block = c.block.number
                 pack_variable(
                     J, rows, c.rows, columns.place[block], columns.landmark[block], end, number, k, slots,
-                    packed, column, dof, landmark[own], first[own],
+                    packed, column, dof, landmark[part], first[part],
                 )  # fmt: skip
                 end += J.shape[2]
             copy_residuals(group.r, rows, packed)
