@@ -191,12 +191,10 @@ class Problem:
                 rows = part if isinstance(part, ResidualRows) else part[:]
                 number = self._number_of(rows.group)
                 chosen[number] |= rows.chosen
-            elif isinstance(part, Variables):
-                self._require_own(part[:0])
-                gone[part.number][:] = True
             else:
-                self._require_own(part)
-                gone[part.block.number][part.rows] = True
+                selected = part[:] if isinstance(part, Variables) else part
+                self._require_own(selected)
+                gone[selected.block.number][selected.rows] = True
         return gone, chosen
 
     def _number_of(self, group: Group) -> int:
