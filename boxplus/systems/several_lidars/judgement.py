@@ -14,7 +14,7 @@ from boxplus.systems.several_lidars.pair import PairFit, fit_pair
 from boxplus.systems.several_lidars.surfaces import Surfaces
 
 Verdict = Literal["agree", "contradicted", "unverified"]
-Cause = Literal["", "pose", "inverted", "clock", "pose or clock", "pose and clock"]
+Cause = Literal["", "pose", "inverted", "clock", "pose or clock", "pose and clock", "the same"]
 
 _FLOOR = np.array([np.radians(0.2)] * 3 + [0.02] * 3 + [0.003])
 """Beside the covariance of a fit: what the surfaces and the first LiDAR's own path leave in error (rad, m, s)."""

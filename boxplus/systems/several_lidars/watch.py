@@ -17,6 +17,7 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.several_lidars.judgement import PairJudgement, judge_pair
 from boxplus.systems.several_lidars.motion import FEWEST_POSES, LidarMotion
 from boxplus.systems.several_lidars.surfaces import Surfaces
+from boxplus.systems.several_lidars.twins import Twins
 
 _WINDOW_S, _SHORTEST_S = 10.0, 3.0
 _EVERY_S = 30.0
@@ -64,6 +65,7 @@ class LidarWatch:
         self.contradiction: str | None = None
         self.every_s = _EVERY_S
         self._others = [_Other(name, k, np.array(T)) for k, (name, T) in enumerate(zip(names, T_first_other, strict=True), 1)]
+        self._twins = Twins([np.eye(4), *(other.T_first_other for other in self._others)])
         self._time_ns: list[int] = []
         self._R: list[NDArray[np.float64]] = []
         self._p: list[NDArray[np.float64]] = []
@@ -79,6 +81,7 @@ class LidarWatch:
         """Take a merged scan in, before its estimate comes."""
         if scan.lidar is None or self._rests(scan.end_ns):
             return
+        self._twins.add(scan)
         for other in self._others:
             own = np.flatnonzero(scan.lidar == other.number)
             if len(own):
@@ -163,7 +166,7 @@ class LidarWatch:
             return []
         T = other.T_first_other
         p_other = (np.concatenate(other.p_first) - T[:3, 3]) @ T[:3, :3]
-        found = judge_pair(motion, surfaces, p_other, np.concatenate(other.time_ns), T)
+        found = self._as_twin(other) or judge_pair(motion, surfaces, p_other, np.concatenate(other.time_ns), T)
         other.last = found
         if found.verdict == "unverified":
             return []
@@ -174,10 +177,23 @@ class LidarWatch:
                 other.agreed = found
             return []
         other.contradicted, other.streak, other.contradicting = other.contradicted + 1, other.streak + 1, found
-        return self._contradict(other) if other.streak > 1 and self.contradiction is None else []
+        is_sure = other.streak > 1 or found.cause == "the same"
+        return self._contradict(other) if is_sure and self.contradiction is None else []
+
+    def _as_twin(self, other: _Other) -> PairJudgement | None:
+        """The verdict on a LiDAR that was given before, which fits itself wherever that lies."""
+        number = self._twins.of(other.number)
+        if number is None:
+            return None
+        which = "the first one" if number == 0 else f"LiDAR {self._others[number - 1].name}"
+        text = f"its points are those of {which}, to a millimetre: one sensor is given twice, and would count twice; leave it out"
+        return PairJudgement("contradicted", "the same", text)
 
     def _contradict(self, other: _Other) -> list[str]:
         text = other.contradicting.text if other.contradicting is not None else ""
+        if other.contradicting is not None and other.contradicting.cause == "the same":
+            self.contradiction = f"LiDAR {other.name} is none of its own: {text}"
+            return [self.contradiction]
         self.contradiction = (
             f"LiDAR {other.name} contradicts the first one: {text}; 'boxplus inspect' measures it by the path of the first "
             "alone, which the error has not bent"

@@ -82,3 +82,36 @@ def test_what_could_not_be_checked_is_said() -> None:
     watch, told = watched(status="lost")
     assert watch.contradiction is None
     assert len(told) == 1 and f"{REAR} could not be checked" in told[0]
+
+
+def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0) -> tuple[LidarWatch, list[str]]:
+    """The first LiDAR, and its points once more, every so many of them, as those of another one declared at T."""
+    random = np.random.default_rng(3)
+    watch, told = LidarWatch([REAR], [T]), list[str]()
+    for event in simulation():
+        if isinstance(event, Scan):
+            again = event.p_lidar[::every].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            again += noise * random.standard_normal(again.shape)
+            p = np.concatenate([event.p_lidar, again.astype(np.float32)])
+            lidar = np.repeat(np.array([0, 1], np.uint8), [len(event), len(again)])
+            merged = replace(event, p_lidar=p, time_ns=np.concatenate([event.time_ns, event.time_ns[::every]]), lidar=lidar)
+            watch.add_scan(replace(merged, intensity=None))
+            told += watch.add_estimate(estimate(replace(merged, intensity=None)))
+    return watch, told + watch.finish()
+
+
+@pytest.mark.parametrize("T", [np.eye(4), T_IMU_REAR])
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_lidar_that_is_given_twice_is_named(T: np.ndarray, every: int) -> None:
+    watch, told = repeated(T, every)
+    assert watch.contradiction is not None and told == [watch.contradiction]
+    assert watch.contradiction.startswith(
+        "LiDAR /rear is none of its own: its points are those of the first one, to a millimetre"
+    )
+    judgement, _, _ = watch.judgements()[REAR]
+    assert judgement is not None and (judgement.verdict, judgement.cause) == ("contradicted", "the same")
+
+
+def test_what_measures_the_same_surfaces_is_another_lidar() -> None:
+    watch, _ = repeated(np.eye(4), noise=0.01)
+    assert watch.contradiction is None

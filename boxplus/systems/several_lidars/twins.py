@@ -1,0 +1,61 @@
+"""Is one LiDAR given twice? Its points come under another name then, and count twice as if they had been measured twice.
+
+Two LiDARs never measure the same points, each in its own frame: the noise of ranges alone is a centimetre. A topic that repeats
+another one, cut or thinned out, has none but the other's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.sensors.scan import Scan
+
+_SAME_M = 1e-3  # apart, each in the frame of its LiDAR, points are one
+_SHARE = 0.9  # of its points, that another LiDAR has too
+_LOOKED = 5  # scans
+_POINTS = 200  # of a LiDAR, in each
+
+
+class Twins:
+    """Compares the LiDARs of the first merged scans.
+
+    Args:
+        T_first_lidar: (4, 4) of each LiDAR, the first one first, as declared.
+    """
+
+    def __init__(self, T_first_lidar: Sequence[NDArray[np.float64]]) -> None:
+        self._T = T_first_lidar
+        self._looked = [0] * len(T_first_lidar)
+        self._same = np.zeros((len(T_first_lidar), len(T_first_lidar)), dtype=np.int64)
+
+    def add(self, scan: Scan) -> None:
+        """Look at a merged scan; at a LiDAR of which enough has been seen no more."""
+        from scipy.spatial import cKDTree
+
+        if scan.lidar is None or min(self._looked[1:], default=_LOOKED) >= _LOOKED:
+            return
+        own = [self._own(scan, number) for number in range(len(self._T))]
+        trees = {number: cKDTree(points) for number, points in enumerate(own) if len(points)}
+        for number in range(1, len(own)):
+            if not len(own[number]) or self._looked[number] >= _LOOKED:
+                continue
+            self._looked[number] += 1
+            some = own[number][:: -(-len(own[number]) // _POINTS)]
+            for earlier in range(number):
+                if earlier in trees:
+                    distance, _ = trees[earlier].query(some, distance_upper_bound=_SAME_M)
+                    self._same[number, earlier] += float(np.isfinite(distance).mean()) >= _SHARE
+
+    def of(self, number: int) -> int | None:
+        """The LiDAR before it that this one repeats, in all of the scans that were looked at; None where it repeats none."""
+        same = np.flatnonzero(self._same[number] == _LOOKED)
+        return int(same[0]) if len(same) else None
+
+    def _own(self, scan: Scan, number: int) -> NDArray[np.float64]:
+        """(n, 3) points of one LiDAR in its own frame."""
+        T = self._T[number]
+        own: NDArray[np.float64] = (scan.p_lidar[scan.lidar == number].astype(np.float64) - T[:3, 3]) @ T[:3, :3]
+        return own
