@@ -159,9 +159,12 @@ def _summary(
     warnings = []
     texts: list[str] = []
     if beside.T_map_world is None:
-        texts = [] if search is None else candidate_texts(search)
+        # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
+        texts = [] if search is None or odometry.contradiction is not None else candidate_texts(search)
         never = "not found" if beside.found_ns is None else "lost at the end, and not found again"
         why = "nothing was collected for long enough to be looked for" if search is None else search.verdict
+        if odometry.contradiction is not None:
+            why = f"{why or 'see losses'}; sensors contradict each other, and what they saw may fit nowhere: repair that first"
         warnings.append(f"{never}: {why or 'see losses'}")
     return LocalizationSummary(
         versions=versions("rosbags"),

@@ -136,7 +136,7 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
     ranked = sorted(candidates, key=lambda candidate: -candidate.fit)
     best = next((candidate for candidate in ranked if candidate.refusal is None), None)
     if best is None:
-        return None, f"no place passes every test{_storeys(ranked, config)}", False
+        return None, f"no place passes every test{_storeys(ranked[0], ranked, config) if ranked else ''}", False
     at_once = True
     for other in ranked:
         if other is best or same_pose(other.T_map_query, best.T_map_query):
@@ -147,25 +147,25 @@ def rivalry(candidates: list[Candidate], config: LocalizationConfig) -> tuple[Ca
         )
         if best.fit - other.fit < config.telling * (0.5 if is_clearly_worse else 1.0):
             away = float(np.linalg.norm(other.T_map_query[4:] - best.T_map_query[4:]))
-            fits = f"{_percent(other)} and {_percent(best)}{_storeys(ranked, config)}"
+            fits = f"{_percent(other)} and {_percent(best)}{_storeys(best, ranked, config)}"
             return best, f"another pose, {away:.1f} m away, fits nearly as well: {fits}", False
         at_once = at_once and other.fit * config.decisive <= best.fit
     return best, "", at_once
 
 
-def _storeys(ranked: list[Candidate], config: LocalizationConfig) -> str:
-    """What follows a verdict where poses above one another fit as well as the best of all (empty where none do)."""
-    first = ranked[0]
-    stacked = [first]
-    for other in ranked[1:]:
-        d = np.abs(other.T_map_query[4:] - first.T_map_query[4:])
+def _storeys(best: Candidate, ranked: list[Candidate], config: LocalizationConfig) -> str:
+    """What follows a verdict where poses above one another fit as well as the best (empty where none do)."""
+    stacked = [best]
+    for other in ranked:
+        d = np.abs(other.T_map_query[4:] - best.T_map_query[4:])
         is_above = np.hypot(d[0], d[1]) < _STACKED_M and d[2] > _STACKED_M
-        if is_above and first.fit - other.fit < 0.5 * config.telling:
+        if is_above and best.fit - other.fit < 0.5 * config.telling:
             stacked += [other] if not any(same_pose(other.T_map_query, one.T_map_query) for one in stacked) else []
     if len(stacked) < 2:
         return ""
+    stacked.sort(key=lambda one: one.fit)
     return (
-        f"; {len(stacked)} poses above one another fit alike, {_percent(stacked[-1])} to {_percent(first)}: storeys that look "
+        f"; {len(stacked)} poses above one another fit alike, {_percent(stacked[0])} to {_percent(stacked[-1])}: storeys that look "
         "the same from here; go where they differ"
     )
 

@@ -64,6 +64,13 @@ def test_storeys_that_look_the_same_are_named() -> None:
     _, why, _ = rivalry([above(0.99, 5.3, None), above(0.998, 1.3), above(0.6, 9.3)], config)
     assert why.startswith("another pose, 4.0 m away, fits nearly as well") and "2 poses above one another fit alike" in why
     assert rivalry([above(0.9, 0.0), candidate(0.9, 20.0, "no"), above(0.5, 4.0)], config)[1] == "no place passes every test"
+    # What fits best of all may be refused: storeys are those of the place that is meant.
+    _, why, _ = rivalry([candidate(0.99, 20.0, "seen through"), above(0.97, 5.3, None), above(0.96, 1.3)], config)
+    assert "2 poses above one another fit alike, 96 % to 97 %" in why
+
+
+def test_no_candidate_is_no_place() -> None:
+    assert rivalry([], LocalizationConfig()) == (None, "no place passes every test", False)
 
 
 def test_the_lead_is_over_the_best_of_all_other_poses() -> None:
