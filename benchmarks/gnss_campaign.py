@@ -54,6 +54,7 @@ CASES = {
     "swapped": Case({"swapped": True}, "refusal"),
     "radians": Case({"unit": "rad"}, "refusal"),
     "datum jumps 5 m": Case({"jump": (4.0, 3.0, 0.0)}, "said"),
+    "RTK, datum jumps 0.5 m": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02, "jump": (0.4, 0.3, 0.0)}, "said"),
     "RTK, datum jumps 1.5 m": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02, "jump": (1.2, 0.9, 0.0)}, "said"),
     "datum jumps 50 m": Case({"jump": (40.0, 30.0, 0.0)}, "said"),
     "other vehicle": Case({}, "refusal"),
@@ -111,7 +112,7 @@ def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
 
 def _serious(warnings: list[str]) -> bool:
     """That the lever arm is not known is said of every such run and speaks against none."""
-    return any("lever arm" not in text for text in warnings)
+    return any(not text.startswith("the lever arm") for text in warnings)
 
 
 def _rms(errors: NDArray[np.float64]) -> float:

@@ -8,18 +8,14 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds import quaternion
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.fit import Fit
+from boxplus.systems.georeference.jump import Jump
 
 _MANY_GATED = 0.15
 _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
-_WINDOW = 5  # fixes on either side of a jump
-_EDGE = 3  # fixes at either end of a stretch
-_FADES = 0.5  # of the step at one end of a gated stretch, that at the other where it only fades
-_HARDLY = 5.0  # standard deviations of the result, the steps at both ends of a stretch that fades in and out
-_OF_BURSTS = 0.6  # of the step at its sudden end, the largest one within a stretch; multipath bursts that meet have larger ones
-_STANDS_OUT = 4.0  # times the usual difference between them
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
@@ -51,79 +47,15 @@ def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
     return counts
 
 
-def jump_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
-    """(since the first fix [s], metres on the ground) of the largest step in the errors of fixes that are used, if it stands out.
-
-    Means over a few fixes before and after every instant, over which the odometry does not drift; their usual difference is what
-    noise makes of it. Or the beginning (the end) of a stretch of gated fixes whose other end is none: the map was bent to them.
-    """
-    fading = _fading_of(attached, found)
-    if fading is not None:
-        return fading
-    used = np.flatnonzero(found.is_used)
-    if len(used) < 4 * _WINDOW:
-        return None
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(found.errors[used, :2], axis=0)])
-    means = (sums[_WINDOW:] - sums[:-_WINDOW]) / _WINDOW
-    steps = np.linalg.norm(means[_WINDOW:] - means[:-_WINDOW], axis=1)
-    seconds = (attached.time_ns[used] - attached.time_ns[0]) * 1e-9
-    ends = np.arange(len(steps)) + _WINDOW
-    lasts = seconds[ends + _WINDOW - 1] - seconds[ends - _WINDOW]
-    is_near = lasts <= max(2.0 * float(np.median(lasts)), _LASTING)  # in a longer gap the odometry drifts
-    if not is_near.any():
-        return None
-    largest = int(np.argmax(np.where(is_near, steps, 0.0)))
-    noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
-    if steps[largest] < max(_STANDS_OUT * float(np.median(steps[is_near])), _SIGMAS * noise):
-        return None
-    return float(seconds[ends[largest]]), float(steps[largest])
-
-
-def _fading_of(attached: AttachedFixes, found: Fit) -> tuple[float, float] | None:
-    """A gated stretch that multipath does not explain, which ends as suddenly as it began and jumps nowhere in between.
-
-    The map turns from one datum to the other on the way, and is off on both sides of the jump: such a stretch fades in and out.
-    """
-    errors, n, sigma = found.errors[:, :2], len(attached), float(np.median(found.sigma))
-    for a, b in runs_of(~found.is_used):
-        if b - a < _EDGE or a < _EDGE or b > n - _EDGE:
-            continue
-        inside = errors[a : a + _EDGE].mean(axis=0), errors[b - _EDGE : b].mean(axis=0)
-        outside = errors[a - _EDGE : a].mean(axis=0), errors[b : b + _EDGE].mean(axis=0)
-        begin, end = (float(np.linalg.norm(i - o)) for i, o in zip(inside, outside, strict=True))
-        middle, step = _largest_step(errors, a, b)
-        if max(begin, end) < min(_FADES * step, _HARDLY * sigma):
-            return float((attached.time_ns[middle] - attached.time_ns[0]) * 1e-9), step
-        if min(begin, end) < _FADES * max(begin, end) and step < _OF_BURSTS * max(begin, end):
-            at = a if begin > end else b
-            return float((attached.time_ns[at] - attached.time_ns[0]) * 1e-9), max(begin, end)
-    return None
-
-
-def _largest_step(errors: NDArray[np.float64], a: int, b: int) -> tuple[int, float]:
-    """Where within fixes [a, b) a few lie farthest from the few before them, and how far [m]; nowhere in a short stretch."""
-    if b - a < 2 * _EDGE:
-        return a, 0.0
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(errors[a:b], axis=0)])
-    means = (sums[_EDGE:] - sums[:-_EDGE]) / _EDGE
-    steps = np.linalg.norm(means[_EDGE:] - means[:-_EDGE], axis=1)
-    return a + _EDGE + int(np.argmax(steps)), float(steps.max())
-
-
-def contradiction_of(attached: AttachedFixes, found: Fit) -> str | None:
+def contradiction_of(jump: Jump | None, found: Fit) -> str | None:
     """Why the result is not to be trusted: it lies between two datums, farther from either than its covariance says."""
-    jump = jump_of(attached, found)
-    return None if jump is None or not _is_beyond(jump, found) else _of_jump(jump)
+    return None if jump is None or not jump.is_beyond(found) else _of_jump(jump)
 
 
-def _is_beyond(jump: tuple[float, float], found: Fit) -> bool:
-    return jump[1] > _SIGMAS * float(np.median(found.sigma))
-
-
-def _of_jump(jump: tuple[float, float]) -> str:
+def _of_jump(jump: Jump) -> str:
     return (
-        f"fixes jump by {jump[1]:.1f} m against the odometry at {jump[0]:.0f} s: another datum or base station from there on, or "
-        "multipath too small to be told; the map lies between the two"
+        f"fixes jump by {jump.metres:.1f} m against the odometry at {jump.seconds:.0f} s: another datum or base station from "
+        "there on, or multipath too small to be told; the map lies between the two"
     )
 
 
@@ -132,6 +64,7 @@ def doubts_of(
     found: Fit,
     has_lever: bool,
     stretches: list[tuple[float, float, float]],
+    jump: Jump | None,
     config: GeoreferenceConfig,
 ) -> list[str]:
     """Sentences about what to doubt, beside what contradicts itself."""
@@ -158,8 +91,7 @@ def doubts_of(
                 f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
                 "another datum or base station, or the odometry is wrong there"
             )
-    jump = jump_of(attached, found)
-    if jump is not None and not _is_beyond(jump, found):
+    if jump is not None and not jump.is_beyond(found):
         warnings.append(_of_jump(jump))
     if found.noise_scale > _NOISY:
         warnings.append(
@@ -175,7 +107,18 @@ def doubts_of(
 
 
 def _or_lever(attached: AttachedFixes, found: Fit) -> str:
-    """At a steady speed a delay and an antenna farther back are one."""
-    speed = float(np.median(np.linalg.norm(attached.v_map, axis=1)))
+    """A word on the antenna where it may explain a delay: a shift of it, the same in the body's frame, that does at any speed.
+
+    A delay is known by velocities, and beside an unknown antenna by what of them differs from their mean: its standard deviation
+    grows by the ratio of the two.
+    """
+    used = found.is_used
+    v_body = np.einsum("nba,nb->na", quaternion.to_matrix(attached.T_map_imu[used, :4]), attached.v_map[used])
+    mean = v_body.mean(axis=0)
+    size, varying = np.linalg.norm(v_body, axis=1), np.linalg.norm(v_body - mean, axis=1)
+    told_by = math.sqrt(float((varying**2).sum()) / max(float((size**2).sum()), 1e-12))
+    if abs(found.delay) * told_by > _SIGMAS * found.delay_sigma:
+        return ""
     where = "back" if found.delay > 0 else "ahead"
-    return f"; an antenna {abs(found.delay) * speed:.1f} m farther {where} than the lever arm says would look the same"
+    metres = abs(found.delay) * float(np.linalg.norm(mean))
+    return f"; an antenna {metres:.1f} m farther {where} than the lever arm says would look the same"

@@ -21,6 +21,7 @@ from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.antenna_position import AntennaPosition
 from boxplus.residuals.gravity_direction import GravityDirection
 from boxplus.residuals.prior import Prior
+from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.slam.graph import MapGraph, add_loops, mean_up, open_graph
@@ -31,6 +32,8 @@ _DAMPING = 1e-9
 _MEDIAN_SQUARE = 2.366  # of a normal vector of three
 _ROUNDS = 4
 _SETTLED = 1.1
+_HERE = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
+_SHIFTED = np.diag(np.repeat([1e-6, 100.0], 3) ** 2)[None]  # rad, m: of one datum in another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +83,7 @@ def fit(
     believed: NDArray[np.bool_],
     lever: Floats | None,
     config: GeoreferenceConfig,
+    after: NDArray[np.bool_] | None = None,
 ) -> Fit:
     """Minimise over everything, from a start.
 
@@ -89,12 +93,16 @@ def fit(
     Args:
         attached: N fixes, p_enu: (N, 3) where they are. T_enu_map: (7,) the start, believed: (N,) the fixes it rests on.
         lever: (3,) given; None: estimated about zero.
+        after: (N,) the fixes in another datum, which is shifted by what fits best; none if left out.
     """
+    datum = np.zeros(len(attached), dtype=np.intp) if after is None else after.astype(np.intp)
+    datums = 1 if after is None else 2
     spacing = float(np.median(np.diff(attached.time_ns))) * 1e-9
     inflation = math.sqrt(max(config.correlation / spacing, 1.0))
     threshold = math.sqrt(chi_square_quantile(config.inlier, 3))
     noise_scale = 1.0
-    start = [graph.T_map, T_enu_map[None], np.zeros((1, 3)) if lever is None else lever[None], np.zeros((1, 1))]
+    arm_start = np.zeros((1, 3)) if lever is None else lever[None]
+    start = [graph.T_map, np.repeat(T_enu_map[None], datums, axis=0), arm_start, np.zeros((1, 1))]
     for _ in range(_ROUNDS):
         problem, x = open_graph(list(graph.T_odo), list(graph.covariances), graph.gravity_sigma)
         if graph.loops:
@@ -102,7 +110,10 @@ def fit(
         world = problem.add_variables(SE3, start[1], name="T_enu_map")
         arm = problem.add_variables(Euclidean(3), start[2], name="lever arm")
         delay = problem.add_variables(Euclidean(1), start[3], name="delay")
-        problem.add_residuals(GravityDirection([mean_up(graph.T_odo)], sigma=graph.gravity_sigma), world, name="vertical")
+        problem.add_residuals(GravityDirection([mean_up(graph.T_odo)], sigma=graph.gravity_sigma), world[:1], name="vertical")
+        if after is not None:
+            same_turn = RelativePose(_HERE, covariance=_SHIFTED)
+            problem.add_residuals(same_turn, world[:1], world[1:], name="step of the datum")
         problem.add_residuals(Prior(Euclidean(1), [0.0], sigma=config.delay_sigma), delay, name="delay")
         if lever is None:
             problem.add_residuals(Prior(Euclidean(3), np.zeros(3), sigma=config.lever_sigma), arm, name="lever arm")
@@ -111,7 +122,7 @@ def fit(
         covariance = (inflation * noise_scale) ** 2 * attached.covariance
         residual = AntennaPosition(p_enu, attached.T_map_imu, attached.v_map, covariance=covariance)
         every = np.zeros(len(attached), dtype=np.intp)
-        fixes = problem.add_residuals(residual, world[every], x[attached.map_of], arm[every], delay[every], name="fixes")
+        fixes = problem.add_residuals(residual, world[datum], x[attached.map_of], arm[every], delay[every], name="fixes")
         options = SolverOptions(initial_damping=_DAMPING)
         found = graduate(
             problem, fixes, loss="truncated", inlier_threshold=threshold / inflation,
@@ -127,7 +138,7 @@ def fit(
     fixes.set_loss(Squared())
     problem.set_weights(fixes, used.astype(np.float64))
     solution = problem.solve(options, start=found.solution)
-    return _result(solution, problem, x, (world, arm, delay), residual, attached, used, covariance, noise_scale)
+    return _result(solution, problem, x, (world, arm, delay), residual, attached, datum, used, covariance, noise_scale)
 
 
 def _result(
@@ -137,18 +148,19 @@ def _result(
     others: tuple[Variables, Variables, Variables],
     residual: AntennaPosition,
     attached: AttachedFixes,
+    datum: NDArray[np.intp],
     used: NDArray[np.bool_],
     fix_covariance: Floats,
     noise_scale: float,
 ) -> Fit:
     world, arm, delay = others
-    T_map, T_enu, lever = solution[x], solution[world][0], solution[arm][0]
-    errors = residual.evaluate(T_enu, T_map[attached.map_of], lever, solution[delay][0])
+    T_map, T_enu, lever = solution[x], solution[world], solution[arm][0]
+    errors = residual.evaluate(T_enu[datum], T_map[attached.map_of], lever, solution[delay][0])
     odometry = [group for group in problem.groups if group.name == "odometry"]
     tension = float(np.mean(odometry[0].squares(solution.values))) / 6.0 if odometry else 0.0
     return Fit(
         T_map=T_map,
-        T_enu_map=T_enu,
+        T_enu_map=T_enu[0],
         covariance=solution.covariance(world)[0],
         sigma=_position_sigma(solution, x, world),
         lever=lever,
@@ -164,7 +176,7 @@ def _result(
 
 
 def _position_sigma(solution: Solution, x: Variables, world: Variables) -> Floats:
-    """Of p = R₁ p₂ + p₁: ∂p/∂T_enu_map = [−R₁ [p₂]×  R₁], ∂p/∂T_map_k = [0  R₁ R₂]."""
+    """In the first datum, of p = R₁ p₂ + p₁: ∂p/∂T_enu_map = [−R₁ [p₂]×  R₁], ∂p/∂T_map_k = [0  R₁ R₂]."""
     T, every = solution[x], np.zeros(len(solution[x]), dtype=np.intp)
     R1 = quaternion.to_matrix(solution[world][0, :4])
     R12 = R1 @ quaternion.to_matrix(T[:, :4])

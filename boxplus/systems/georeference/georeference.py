@@ -19,6 +19,7 @@ from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches, of_gated
 from boxplus.systems.georeference.fit import Fit, antennas, fit, level
 from boxplus.systems.georeference.hypotheses import other_clock, other_readings
+from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.start import Start, extent_of, find_start
 from boxplus.systems.slam.graph import MapGraph
 
@@ -169,7 +170,8 @@ def _judged(
     T_enu_map = se3.compose(
         [math.cos(0.5 * start.yaw), 0.0, 0.0, math.sin(0.5 * start.yaw), *start.shift], [*turn, 0.0, 0.0, 0.0]
     )
-    found = fit(graph, attached, frame.to_enu(attached.lat_lon_alt), T_enu_map, start.inliers, lever, config)
+    p_enu = frame.to_enu(attached.lat_lon_alt)
+    found = fit(graph, attached, p_enu, T_enu_map, start.inliers, lever, config)
     share = 1.0 - float(found.is_used.mean())
     stretches = gated_stretches(attached, found)
     if share > config.most_gated:
@@ -184,6 +186,8 @@ def _judged(
             f"the heading of the map is known to {math.degrees(yaw_sigma):.1f}° only, more than the "
             f"{math.degrees(config.largest_yaw_sigma):.1f}° of gnss.largest_yaw_sigma: record a longer way"
         )
+    used = found.is_used
+    jump = jump_of(attached, found, lambda after: fit(graph, attached, p_enu, found.T_enu_map, used, lever, config, after))
     left_out = Counter(attached.left_out) + of_gated(attached, found)
     return Georeference(
         refusal=None,
@@ -192,8 +196,8 @@ def _judged(
         attached=attached,
         left_out=dict(left_out),
         stretches=stretches,
-        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, config),
-        contradiction=contradiction_of(attached, found),
+        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, jump, config),
+        contradiction=contradiction_of(jump, found),
     )
 
 

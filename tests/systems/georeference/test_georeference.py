@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,9 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.gnss import GnssConfig
-from boxplus.systems.georeference.attachment import attach
+from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.doubts import doubts_of
 from boxplus.systems.georeference.fit import level
 from boxplus.systems.georeference.georeference import Georeference, georeference
 from boxplus.systems.georeference.start import find_start
@@ -75,6 +78,7 @@ PRECISE = {"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02}
     [
         {"sigma": 0.6, "slow_sigma": 0.5, "claimed": 1.0, "jump": (3.0, 2.0, 0.0)},
         {**PRECISE, "jump": (1.2, 0.9, 0.0)},  # so precise that it is gated on both sides of the jump
+        {**PRECISE, "jump": (0.4, 0.3, 0.0)},
     ],
 )
 def test_a_map_between_two_datums_is_not_to_be_trusted(laps: Drive, receiver: dict[str, object]) -> None:
@@ -106,6 +110,20 @@ def test_stamps_that_are_late_are_doubted_and_allowed_for(laps: Drive, delay: fl
     assert ("late" in warning) == (delay > 0)
     corrected = found(laps, GOOD.model_copy(update={"delay_s": delay}), GeoreferenceConfig(time_offset_s=-delay))
     assert corrected.warnings == []
+
+
+def test_an_antenna_elsewhere_is_named_where_speeds_do_not_tell_it_from_a_delay(laps: Drive) -> None:
+    result = found(laps, GOOD.model_copy(update={"delay_s": 0.4, "sigma": 0.02, "slow_sigma": 0.0, "claimed": 0.02}))
+    fit = result.fit
+    assert fit is not None
+
+    def said(attached: AttachedFixes) -> str:
+        (warning,) = [text for text in doubts_of(attached, fit, True, [], None, GeoreferenceConfig()) if "stamped" in text]
+        return warning
+
+    assert "farther back than the lever arm says would look the same" in said(result.attached)  # driven at one speed
+    speeds = np.linspace(0.2, 1.8, len(result.attached))[:, None]
+    assert "lever arm" not in said(replace(result.attached, v_map=speeds * result.attached.v_map))
 
 
 def test_a_lever_arm_nobody_gave_is_estimated_and_said(laps: Drive) -> None:

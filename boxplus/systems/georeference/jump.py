@@ -1,0 +1,81 @@
+"""Does the datum of the fixes jump? The map then lies bent between two datums, farther from either than its covariance says.
+
+At the jump the errors of the fixes step, whatever the map makes of it before and after. So do those where multipath begins and
+ends. But where it is the datum, and all fixes from there on may be shifted by the same, the step is gone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.systems.georeference.attachment import AttachedFixes
+from boxplus.systems.georeference.fit import Fit
+
+Floats = NDArray[np.float64]
+
+_WINDOW = 5  # fixes on either side of a step
+_FEWEST = 2 * _WINDOW  # in a datum, to be one
+_STANDS_OUT = 4.0  # times the usual difference between windows
+_NOISY = 3.0  # times what noise makes of it
+_GONE = 0.4  # of a step, what another datum leaves of it
+_LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
+_TRIED = 4  # steps, the largest first
+_LASTING = 30.0  # s: multipath lasts less, and is no datum
+_SIGMAS = 3.0
+_LEAST_M = 0.1  # between two datums: less than that is no reason to distrust a map
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """Where the datum jumps: time since the first fix [s], and distance on the ground [m]."""
+
+    seconds: float
+    metres: float
+
+    def is_beyond(self, found: Fit) -> bool:
+        """Whether a map between the two datums is off by more than it claims, and by more than matters."""
+        return self.metres > max(_SIGMAS * float(np.median(found.sigma)), _LEAST_M)
+
+
+def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.bool_]], Fit]) -> Jump | None:
+    """The largest step in the errors of the fixes that another datum from there on explains; None where none stands out.
+
+    Args:
+        refit: the fit with a datum of their own for fixes (N,).
+    """
+    seconds = (attached.time_ns - attached.time_ns[0]) * 1e-9
+    steps = _steps(found.errors)
+    if len(steps) <= 2 * (_FEWEST - _WINDOW):
+        return None
+    at = np.arange(len(steps)) + _WINDOW  # of the first fix after it
+    lasts = seconds[at + _WINDOW - 1] - seconds[at - _WINDOW]
+    is_near = lasts <= max(2.0 * float(np.median(lasts)), _LASTING)  # in a longer gap the odometry drifts
+    lasting = (seconds[at] >= _LASTING) & (seconds[-1] - seconds[at] >= _LASTING)
+    enough = lasting & (at >= _FEWEST) & (at <= len(attached) - _FEWEST)
+    noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
+    least = max(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
+    left = np.where(is_near & enough & (steps >= least), steps, 0.0)
+    for _ in range(_TRIED):
+        largest = int(np.argmax(left))
+        if left[largest] == 0.0:
+            return None
+        after = np.arange(len(attached)) >= at[largest]
+        split = refit(after)
+        share = float(_steps(split.errors)[largest] / steps[largest])
+        gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
+        if gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before:
+            return Jump(float(seconds[at[largest]]), float(steps[largest]))
+        left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
+    return None
+
+
+def _steps(errors: Floats) -> Floats:
+    """(N − 2 w + 1,) lengths [m] between the means of w successive errors on the ground (N, 3) and of the next w."""
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(errors[:, :2], axis=0)])
+    means = (sums[_WINDOW:] - sums[:-_WINDOW]) / _WINDOW
+    return np.asarray(np.linalg.norm(means[_WINDOW:] - means[:-_WINDOW], axis=1))
