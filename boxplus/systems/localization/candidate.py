@@ -165,8 +165,8 @@ def _storeys(best: Candidate, ranked: list[Candidate], config: LocalizationConfi
         return ""
     stacked.sort(key=lambda one: one.fit)
     return (
-        f"; {len(stacked)} poses above one another fit alike, {_percent(stacked[0])} to {_percent(stacked[-1])}: storeys that look "
-        "the same from here; go where they differ"
+        f"; {len(stacked)} poses above one another fit alike, {_percent(stacked[0])} to {_percent(stacked[-1])}: storeys that "
+        "look the same from here; go where they differ"
     )
 
 

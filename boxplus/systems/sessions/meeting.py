@@ -5,14 +5,15 @@
    nothing.
 2. *Agreement*: two encounters close a cycle with the ways of both sessions; the largest set in which all pairs do is the
    hypothesis.
-3. *Prediction*: the hypothesis says which other local maps lie over each other. It is right only if they do.
-4. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
+3. *Directions*: along a street of even fronts all of them may leave open how far, and lie wherever their likeness put them. Then
+   what faces along it is laid over each other, of all encounters at once, at every shift (`open_axis`). In the end each direction
+   has to be measured.
+4. *Prediction*: the hypothesis says which other local maps lie over each other. It is right only if they do.
+5. *Rivals*: where another such set is nearly as large, and what it predicts lies over each other too, two places of one session
    look like one of the other: refused.
-5. *Support*: enough encounters, of different local maps, along a way.
-6. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well; where
+6. *Support*: enough encounters, of different local maps, along a way.
+7. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well; where
    nothing does, nothing tells them apart.
-7. *Directions*: each is measured by an encounter. Along a street of equal fronts all of them may leave open how far, and lie
-   wherever their likeness put them.
 8. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
 """
 
@@ -23,10 +24,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
+from boxplus.systems.sessions.open_axis import moved_along, open_axis, shift_along
 from boxplus.systems.sessions.other_alignments import fits_otherwise
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.consistency import agree, largest_clique
@@ -46,7 +48,7 @@ _BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: 
 _PREDICTED = 2  # places that are looked at for each local map of the query session
 _AS_WELL = "the maps fit as well"  # begins what is said of a rival
 _FEWEST_STANDING = 100  # points, of all encounters together
-_WORTH_OF_ONE = 0.99  # encounter that measures a direction, but for rounding
+_SAME_AXIS = 0.9  # cosine
 _FIRST = 2  # encounters that agree make a hypothesis
 
 
@@ -77,6 +79,7 @@ class _Meeting:
         self.place, self.query, self.config, self.numbers = place, query, config, numbers
         self.loops: dict[tuple[int, int], Loop] = {}
         self.proposed = 0
+        self._not_told: str | None = None  # why nothing tells how far along an axis that all encounters leave open
 
     def decide(self) -> Meeting:
         self._look_for_encounters()
@@ -86,6 +89,8 @@ class _Meeting:
         chosen = self._largest_agreeing(standing)
         if len(_queries(chosen)) < _FIRST:
             return self._refused(f"{len(standing)} encounters fit, but no two of them agree on where one session is in the other")
+        chosen = self._closed(chosen)
+        standing = [loop for loop in self.loops.values() if loop.refusal is None]
         predicted, confirmed, found = self._check_predictions(chosen)
         if rival := self._rival(standing, chosen, confirmed):
             return self._refused(rival, predicted, confirmed)
@@ -101,7 +106,7 @@ class _Meeting:
         return self._as_wholes(joined, kept, predicted, confirmed)
 
     def _as_wholes(self, joined: JoinedGraph, kept: set[int], predicted: int, confirmed: int) -> Meeting:
-        """Steps 6 to 8, of encounters whose alignment nothing else speaks against."""
+        """Steps 3, 7 and 8, of encounters whose alignment nothing else speaks against."""
         encounters, least = [loop for loop in self.loops.values() if id(loop) in kept], self.config.least_standing
         share = self._standing_share(encounters)
         if math.isnan(share):
@@ -109,10 +114,11 @@ class _Meeting:
         if share < least:
             why = f"{100.0 * share:.0f} % of what stands upright in one stands at the same place in the other"
             return self._refused(f"{why}, {100.0 * least:.0f} % are asked for", predicted, confirmed, share)
-        if (axis := self._left_open(encounters)) is not None:
+        if (axis := self._open_axis(encounters)) is not None:
             x, y, z = axis.tolist()
             where = f"({x:+.2f}, {y:+.2f}, {z:+.2f}) in the frame of {self.query.session.name}"
             why = f"{len(encounters)} encounters agree, but the surfaces of all of them leave open how far along {where} it lies"
+            why = f"{why}: {self._not_told}" if self._not_told else why
             return self._refused(why, predicted, confirmed, share)
         if otherwise := fits_otherwise(self.place, self.query, joined.T_world_session[1], self.config):
             return self._refused(otherwise, predicted, confirmed, share)
@@ -128,7 +134,7 @@ class _Meeting:
         return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)
 
     def _standing_share(self, loops: list[Loop]) -> float:
-        """Step 6, over encounters together; NaN where too little stands to tell."""
+        """Step 7, over encounters together; NaN where too little stands to tell."""
         found = [
             standing_in_common(
                 self.query.surface(loop.query), self.place.surface(loop.place), loop.T_place_query, self.config.slam.registration
@@ -154,12 +160,10 @@ class _Meeting:
 
     def _look_for_encounters(self) -> None:
         """Step 1."""
-        c = self.config
-        sigma = np.array([_TILT, _TILT, _YAW, *[c.reach / _SIGMAS_OF_REACH] * 3])
         proposals = [(k, proposal) for k in range(len(self.query)) for proposal in self.place.proposals(self.query, k)]
         self.proposed = len(proposals)
         for number, proposal in self._seconded(proposals):
-            self._take([self._verified(number, proposal, _Belief(proposal.T_start, np.diag(sigma**2)))])
+            self._take([self._verified(number, proposal, _Belief(proposal.T_start, _within(self.config)))])
 
     def _seconded(self, proposals: list[tuple[int, Proposal]]) -> list[tuple[int, Proposal]]:
         """Those for which another local map of the query session looks alike at the same alignment, roughly."""
@@ -227,7 +231,7 @@ class _Meeting:
         return agree(a, b, self.query.chain, self.config.slam, self.place.chain)
 
     def _rival(self, standing: list[Loop], chosen: list[Loop], confirmed: int) -> str | None:
-        """Step 4."""
+        """Step 5."""
         others = [loop for loop in standing if sum(self._agree(loop, own) for own in chosen) < 0.5 * len(chosen)]
         rival = self._largest_agreeing(others) if others else []
         mine, theirs, share = len(_queries(chosen)), len(_queries(rival)), self.config.rival_share
@@ -253,7 +257,7 @@ class _Meeting:
         return join(sessions, encounters, np.stack([_START, anchor]), self.config.slam.gravity_sigma)
 
     def _check_predictions(self, chosen: list[Loop]) -> tuple[int, int, list[Loop]]:
-        """Step 3: how many pairs of local maps should lie over each other, how many do, and what was found of them."""
+        """Step 4: how many pairs of local maps should lie over each other, how many do, and what was found of them."""
         joined, found = self._joined(chosen), []
         known = {(loop.query, loop.place) for loop in chosen}
         predicted = confirmed = 0
@@ -296,7 +300,7 @@ class _Meeting:
         return bool(is_near and min(loop.overlap) >= c.least_overlap and loop.rms <= bound)
 
     def _too_little(self, chosen: list[Loop], predicted: int, confirmed: int) -> str | None:
-        """Step 5."""
+        """Step 6."""
         c = self.config
         if confirmed < c.least_confirmed * predicted:
             return f"if they met, {predicted} pairs of local maps would lie over each other; {confirmed} of them do"
@@ -311,21 +315,42 @@ class _Meeting:
             return f"the encounters that agree lie within {spread:.0f} m of way, {c.least_spread:.0f} m are asked for"
         return None
 
-    def _left_open(self, loops: list[Loop]) -> Floats | None:
-        """The direction (3,) in the query session's frame that no encounter measures; None where each is measured.
+    def _open_axis(self, loops: list[Loop]) -> Floats | None:
+        return open_axis(loops, self.query, self.config.slam.registration.weak_sigma)
 
-        Each encounter has the projector on the directions that it measures. Their sum is at least one along what one of them
-        measures, or several in part; the slightly different directions that all leave open add up to nearly nothing, while in
-        the graph, weighed by millimetres across the street, they would pass for decimetres along it.
+    def _closed(self, chosen: list[Loop]) -> list[Loop]:
+        """Step 3: encounters that all leave one axis open, laid over each other anew at the only shift along it that fits.
+
+        Those that leave it open wherever they were, and do not agree with these, are looked for again as well.
         """
-        measured = np.zeros((3, 3))
-        for loop in loops:
-            variance, axes = np.linalg.eigh(loop.covariance[3:, 3:])
-            R = quaternion.to_matrix(self.query.session.T_session_map[loop.query, :4])
-            known = R @ axes[:, variance < self.config.slam.registration.weak_sigma**2]
-            measured += known @ known.T
-        worth, axes = np.linalg.eigh(measured)
-        return None if worth[0] >= _WORTH_OF_ONE else np.asarray(axes[:, 0])
+        axis = self._open_axis(chosen)
+        if axis is None:
+            return chosen
+        T = self._joined(chosen).T_world_session[1]
+        found = shift_along(axis, chosen, T, self.place, self.query, self.config)
+        self._not_told = found.refusal
+        if found.refusal is not None:
+            return chosen
+        T = se3.compose(T, np.array([1.0, 0.0, 0.0, 0.0, *(found.metres * axis)]))
+        for key, loop in list(self.loops.items()):
+            if self._open_axis([loop]) is not None:
+                del self.loops[key]
+        again = [self._laid_again(loop, T) for loop in chosen]
+        again = [loop for loop in again if loop.refusal is None]
+        count = sum(self._leaves_open(loop, axis) for loop in again)
+        self._take([moved_along(loop, axis, self.query, count) if self._leaves_open(loop, axis) else loop for loop in again])
+        standing = [loop for loop in self.loops.values() if loop.refusal is None]
+        return self._largest_agreeing(standing) if len(standing) >= _FIRST else chosen
+
+    def _leaves_open(self, loop: Loop, axis: Floats) -> bool:
+        own = self._open_axis([loop])
+        return own is not None and abs(float(own @ axis)) > _SAME_AXIS
+
+    def _laid_again(self, loop: Loop, T_place_query: Floats) -> Loop:
+        """The same two local maps, from where the sessions lie."""
+        T = self.place.session.T_session_map[loop.place], self.query.session.T_session_map[loop.query]
+        start = se3.compose(se3.compose(se3.inverse(T[0]), T_place_query), T[1])
+        return self._verified(loop.query, Proposal(loop.place, start, "nearby"), _Belief(start, _within(self.config)))
 
 
 def _rival_of(loop: Loop) -> str | None:
@@ -333,6 +358,11 @@ def _rival_of(loop: Loop) -> str | None:
     if loop.refusal is None or not loop.refusal.startswith(_AS_WELL):
         return None
     return loop.refusal.removeprefix(_AS_WELL).split(",")[0].strip()
+
+
+def _within(config: SessionsConfig) -> Floats:
+    """(6, 6) covariance of a proposal, so wide that rivals are tried within reach."""
+    return np.diag(np.array([_TILT, _TILT, _YAW, *[config.reach / _SIGMAS_OF_REACH] * 3]) ** 2)
 
 
 def _queries(loops: list[Loop]) -> set[int]:

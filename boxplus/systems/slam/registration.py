@@ -211,6 +211,26 @@ def plane_normals(points: NDArray[np.float32], surface: Surface, config: LocalMa
     return np.where(valid[:, None], planes[:, :3], np.nan)
 
 
+def facing_planes(
+    points: NDArray[np.float32],
+    target: Surface,
+    T_target_source: Floats,
+    axis: Floats,
+    cosine: float,
+    distance: float,
+    config: LocalMapRegistrationConfig,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """(N,) signed distances [m] of points (N, 3) to planes of the target next to them, and which have one facing along an axis.
+
+    Args:
+        axis: (3,) unit, in the target's frame; cosine: between it and a normal, at least.
+        distance: of a plane's points, at most [m].
+    """
+    planes, valid = _planes(points, target, T_target_source, distance, config)
+    with np.errstate(invalid="ignore"):
+        return planes[:, 3], valid & (np.abs(planes[:, :3] @ axis) >= cosine)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matched:
     """Points on planes, linearised about their middle: ξ' = [lever · w, v'] moves them there."""
