@@ -204,6 +204,9 @@ def _rival(
         moved = np.linalg.norm(other.T_target_source[4:] - T[4:])
         if moved < _SAME_MINIMUM or _is_open(found, other.T_target_source):
             continue
+        # What leaves open how far it is to where more is measured has found nothing there that could tell: no place of its own.
+        if len(other.weak) > len(found.weak) and _is_open(other, T):
+            continue
         xi = se3.log(se3.compose(se3.inverse(other.T_target_source), T_odo))
         if mahalanobis(xi, config.odometry_scale**2 * S_odo + other.covariance) <= loop.innovation_limit:
             return f"the maps fit as well {moved:.1f} m away, and the odometry cannot tell which"
