@@ -41,7 +41,7 @@ from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
 from boxplus.systems.refinement.state import RefinedState
-from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown, moved_unshown
+from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
 
 Floats = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     R_L = quaternion.to_matrix(log.matrix(("imu_lidar_qw", "imu_lidar_qx", "imu_lidar_qy", "imu_lidar_qz")))
     v, b_w, b_a, g, p_L = [log.column(name) for name in ("velocity", "bias_gyro", "bias_accel", "gravity", "imu_lidar_p")]
     states = [NavState(R[k], trajectory.p[k], v[k], b_w[k], b_a[k], g[k], R_L[k], p_L[k]) for k in range(len(times))]
-    rows = OdometryRows(times, states, log.status)
+    rows = OdometryRows(times, states, log.status, trajectory.covariance)
     return OdometryRun(
         run, summary, load_run_config(run.config), trajectory if closed is None else closed.trajectory, rows, closed
     )
@@ -200,7 +200,7 @@ class _RefineRun:
             with self._timed("refining"):
                 found = refine(finished, self._config.refinement, self._tell)
             scans = np.flatnonzero(finished.is_end)
-            refusal = found.refusal or self._moved_unshown(finished, found, scans)
+            refusal = found.refusal
             with self._timed("writing"):
                 self._write_trajectory(finished, found, scans, refusal is None)
                 self._write_place()
@@ -333,14 +333,6 @@ class _RefineRun:
                 "first of them on covariances are those of the run"
             )
         return notes
-
-    def _moved_unshown(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
-        """Positions by satellite tell what the surroundings did not show."""
-        if finished.fixes is not None or (trajectory := self._run.trajectory).covariance is None:
-            return None
-        rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
-        before, after = (state.T_world_imu[scans, 4:] for state in (found.before, found.after))
-        return moved_unshown(self._run.rows.status[rows], before, after, trajectory.covariance[rows])
 
     def _doubt(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64]) -> str | None:
         """What the run claimed, against where refining has put its poses."""

@@ -21,6 +21,7 @@ from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.slices import Slice, cut, slices_that_fit
+from boxplus.systems.refinement.unshown import open_steps
 
 _LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has
 
@@ -31,11 +32,22 @@ class OdometryRows:
 
     Attributes:
         time_ns: (R,) int64, ascending; states: R of them; status: (R,) text.
+        covariance: (R, 6, 6) of the poses, [θ, p], relative to the first one; None where nothing is known of it.
     """
 
     time_ns: NDArray[np.int64]
     states: list[NavState]
     status: NDArray[np.str_]
+    covariance: NDArray[np.float64] | None = None
+
+    @property
+    def open_steps(self) -> NDArray[np.float64]:
+        """(R, 3, 3), see `unshown.open_steps`; zero where nothing is known of the covariance."""
+        if self.covariance is None:
+            return np.zeros((len(self.time_ns), 3, 3))
+        R = np.stack([state.R_world_imu for state in self.states])
+        T = np.hstack([quaternion.from_matrix(R), [state.p_world_imu for state in self.states]])
+        return open_steps(self.status, T, self.covariance)
 
 
 def collect(
@@ -72,6 +84,8 @@ class _Collector:
         self._T: list[NDArray[np.float64]] = []
         self._state: list[NDArray[np.float64]] = []
         self._is_end: list[bool] = []
+        self._open_of_row = rows.open_steps
+        self._open: list[NDArray[np.float64]] = []
         self._newest: NDArray[np.float32] | None = None  # points of the latest slice, to which the next one adds
         self._next = 0
 
@@ -110,6 +124,7 @@ class _Collector:
                 self._T.append(part.T_world_imu)
                 self._state.append(np.concatenate([part.v_world, after.bias_accel, after.bias_gyro]))
                 self._is_end.append(part.is_end)
+                self._open.append(self._open_of_row[number])
                 self._keep(part, is_placed=self._rows.status[number] != "lost")
 
     def _keep(self, part: Slice, *, is_placed: bool) -> None:
@@ -142,4 +157,5 @@ class _Collector:
             imu=ImuSamples(time_ns, imu.gyro[first], imu.accel[first]),
             noise=ImuNoise(gyro=gyro, accel=accel, gyro_walk=gyro_walk, accel_walk=accel_walk),
             is_end=np.array(self._is_end),
+            open_steps=np.stack(self._open),
         )

@@ -30,6 +30,7 @@ class FinishedRun:
         imu: samples in order of time.
         noise: of the IMU as it is mounted.
         is_end: (N,) bool, whether a slice is the last one of its scan.
+        open_steps: (N, 3, 3) projectors, in the world, on what the step to a slice leaves open (`unshown.open_steps`).
         loops, fixes: that were closed, and that the world is laid onto the Earth by; None without.
     """
 
@@ -42,6 +43,7 @@ class FinishedRun:
     imu: ImuSamples
     noise: ImuNoise
     is_end: NDArray[np.bool_]
+    open_steps: Floats
     loops: RunLoops | None = None
     fixes: RunFixes | None = None
 
@@ -58,5 +60,6 @@ class FinishedRun:
             self,
             T_world_imu=T,
             velocity_bias=np.hstack([velocity, self.velocity_bias[:, 3:]]),
+            open_steps=turned @ self.open_steps @ np.swapaxes(turned, 1, 2),
             gravity_world=down * np.linalg.norm(self.gravity_world) / np.linalg.norm(down),
         )

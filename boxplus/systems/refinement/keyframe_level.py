@@ -32,6 +32,7 @@ from boxplus.systems.refinement.loops import KeyframeLoops, between_keyframes
 from boxplus.systems.refinement.outside import Receiver
 from boxplus.systems.refinement.sightings import KeyframeClusters
 from boxplus.systems.refinement.state import RefinedState
+from boxplus.systems.refinement.unshown import between, kept_steps
 from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]
@@ -105,6 +106,10 @@ def move_keyframes(
         group = problem.add_residuals(loops.residual, x.poses[loops.place], x.poses[loops.query], name="loops", carry_over=True)
         held[group] = np.where(loops.is_told, 0.0, 1.0)
         problem.set_weights(group, held[group])
+    pairs, open_ = between(keyframes.scan, run.open_steps)
+    if len(pairs) and run.fixes is None:  # positions by satellite tell what the surroundings did not show
+        as_they_were = kept_steps(run.T_world_imu, keyframes.scan[pairs], keyframes.scan[pairs + 1], open_)
+        problem.add_residuals(as_they_were, x.poses[pairs], x.poses[pairs + 1], name="steps along what is open", carry_over=True)
     fixes = None if run.fixes is None else add_fixes(problem, x.poses, run.fixes, run.time_ns, state, keyframes)
     options = SolverOptions(
         linear_solver="schur", max_iterations=config.max_iterations, cost_tolerance=1e-7, threads=config.threads, examine=False

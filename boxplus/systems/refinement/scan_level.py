@@ -20,6 +20,7 @@ from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, imu_counted, preintegrated
 from boxplus.systems.refinement.sightings import scan_forms, weights_of_slices
 from boxplus.systems.refinement.state import RefinedState
+from boxplus.systems.refinement.unshown import kept_steps
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +43,10 @@ def move_scans(
     by_imu = problem.add_residuals(imu, poses[:-1], states[:-1], poses[1:], states[1:], name="imu")
     forms = scan_forms(run, state.T_world_imu, state.T_imu_lidar, planes, information, config.threads)
     on_planes = problem.add_residuals(PoseQuadratic(forms, state.T_world_imu[:, 4:]), poses, name="planes")
+    steps = np.flatnonzero(np.einsum("nii->n", run.open_steps[1:]) > 0.0)
+    if len(steps):  # the keyframes have been moved by what tells
+        as_they_are = kept_steps(state.T_world_imu, steps, steps + 1, run.open_steps[steps + 1])
+        problem.add_residuals(as_they_are, poses[steps], poses[steps + 1], name="steps along what is open", carry_over=True)
     add_bias_prior(problem, states)
     options = SolverOptions(
         linear_solver="sparse", max_iterations=config.max_iterations, cost_tolerance=1e-7, threads=config.threads, examine=False

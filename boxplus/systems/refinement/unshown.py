@@ -4,8 +4,7 @@ Along a corridor nothing tells how far one has come: the filter says so, scan by
 planes that are found in all scans together, edges and corners among them, the direction seems measured, to millimetres: the path
 stays metres off, and its covariance says that it is not.
 
-So a refinement may move the path along such a direction by what the run was uncertain of it before, and not by more: whether that
-is right, nothing tells, and the points that took no part lie as well either way.
+So along such a direction a refinement keeps the steps of the run, which are those of its IMU, and moves all others.
 """
 
 from __future__ import annotations
@@ -13,11 +12,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from boxplus.manifolds import quaternion, se3, so3
+from boxplus.residuals.relative_pose import RelativePose
+
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _MOST = 0.5  # share of the scans that may be weak or lost
-_FARTHEST = 2.0  # standard deviations, of what the run knew before a spell of weak scans, that the path may move over it
-_LEAST_SIGMA_M = 0.002
+_WINDOW = 10  # scans of a spell over which its covariance tells the direction
+_AS_OPEN = 0.25  # of the variance that grows most: so much of it in another direction, and that is open as well
+_HELD_M = 1e-5  # standard deviation of a step along what is open
 
 
 def after_unshown(status: ArrayLike) -> NDArray[np.bool_]:
@@ -43,39 +47,48 @@ def is_mostly_unshown(status: ArrayLike) -> bool:
     return float(np.mean(np.asarray(status) != "ok")) > _MOST
 
 
-def moved_unshown(status: ArrayLike, p_before: Floats, p_after: Floats, covariance: Floats) -> str | None:
-    """A sentence where the path was moved along what a spell of weak or lost scans did not show, by more than was open before it.
+def open_steps(status: ArrayLike, T_world_imu: Floats, covariance: Floats) -> Floats:
+    """(N, 3, 3) projectors, in the world, on the directions that the step to each scan leaves open; zero where it is shown.
 
-    The direction is the one along which the covariance of the run grows most over the spell.
+    These are the directions in which the covariance of a run grows over a spell of weak scans, beyond what is known of the turns
+    before. Over a lost scan nothing is placed, and nothing claims to show anything.
 
     Args:
         status: (N,) text, of the scans of a run in order of time.
-        p_before, p_after: (N, 3) positions of the run, and as they were refined [m].
-        covariance: (N, 6, 6) of the run's poses, [θ, p], relative to the first one.
+        T_world_imu: (N, 7) poses; covariance: (N, 6, 6) of them, [θ, p], relative to the first one.
 
     Example:
-        >>> p, far = np.zeros((3, 3)), np.array([[0.0, 0, 0], [0, 0, 0], [0.3, 0, 0]])
+        >>> T = np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1))
         >>> P = np.stack([np.diag([0.0, 0, 0, x, 1e-6, 1e-6]) for x in (0.0, 1e-4, 0.04)])
-        >>> moved_unshown(["ok", "ok", "weak"], p, far, P)[:35]
-        'over 1 scan that was weak or lost, '
-        >>> moved_unshown(["ok", "ok", "ok"], p, far, P)
+        >>> np.diagonal(open_steps(["ok", "ok", "weak"], T, P), axis1=1, axis2=2).tolist()
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
-    for begin, end in _spells(np.asarray(status) != "ok"):
-        before, P = max(begin - 1, 0), covariance[:, 3:, 3:]
-        axis = np.linalg.eigh(P[end - 1] - P[before])[1][:, -1]
-        moved = p_after - p_before
-        far = abs(float((moved[end - 1] - moved[before]) @ axis))
-        sigma = float(np.sqrt(axis @ P[before] @ axis)) + _LEAST_SIGMA_M
-        if far > _FARTHEST * sigma:
-            which = "1 scan that was" if end - begin == 1 else f"{end - begin} scans that were"
-            return (
-                f"over {which} weak or lost, from number {begin} on, it moved the path by {100.0 * far:.1f} cm along what they "
-                f"did not show, where the run was sure to {100.0 * sigma:.1f} cm before: nothing tells whether that is right"
-            )
-    return None
+    weak, R = np.asarray(status) == "weak", quaternion.to_matrix(T_world_imu[:, :4])
+    found = np.zeros((len(weak), 3, 3))
+    begin = 0  # of the spell
+    for k in np.flatnonzero(weak).tolist():
+        begin = begin if k and weak[k - 1] else k
+        first = max(begin - 1, k - _WINDOW, 0)
+        J = np.hstack([-so3.hat(T_world_imu[k, 4:] - T_world_imu[first, 4:]) @ R[first], np.eye(3)])
+        growth, axes = np.linalg.eigh(covariance[k, 3:, 3:] - J @ covariance[first] @ J.T)
+        open_ = axes[:, growth > _AS_OPEN * growth[-1]] if growth[-1] > 0.0 else axes[:, :0]
+        found[k] = open_ @ open_.T
+    return found
 
 
-def _spells(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and one past the last of those in a row."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+def kept_steps(T: Floats, first: Ints, second: Ints, open_: Floats) -> RelativePose:
+    """Steps from scans (M,) to later ones (M,), held as poses (N, 7) have them along what (M, 3, 3) projectors say is open."""
+    R = quaternion.to_matrix(T[second, :4])
+    information = np.zeros((len(first), 6, 6))
+    information[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ open_ @ R / _HELD_M**2
+    return RelativePose(se3.compose(se3.inverse(T[first]), T[second]), information=information)
+
+
+def between(scans: Ints, open_: Floats) -> tuple[Ints, Floats]:
+    """Numbers (M,) of successive pairs of chosen scans (K,) with an open step between them, and projectors (M, 3, 3) on that."""
+    sums = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(open_, axis=0)])
+    total = sums[scans[1:] + 1] - sums[scans[:-1] + 1]
+    pairs = np.flatnonzero(np.einsum("kii->k", total) > 0.0)
+    values, vectors = np.linalg.eigh(total[pairs])
+    chosen = vectors * (values > _AS_OPEN * values[:, -1:])[:, None, :]
+    return pairs, chosen @ np.swapaxes(chosen, 1, 2)
