@@ -18,6 +18,7 @@ from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import choose_keyframes
 from boxplus.systems.refinement.refinement import refine
 from boxplus.systems.refinement.sightings import weights_of_slices
+from boxplus.systems.refinement.unshown import kept_steps
 from tests.systems.refinement.cases import Case
 from tests.systems.slam.drives import ate
 
@@ -134,3 +135,23 @@ def test_keyframes_begin_after_a_way_a_turn_or_a_time() -> None:
         keyframes = choose_keyframes(time_ns, poses, config)
         assert np.bincount(keyframes.of_scan)[:-1].tolist() == [length] * (len(keyframes) - 1)
         assert keyframes.scan[0] == 0 and (keyframes.of_scan[keyframes.scan] == np.arange(len(keyframes))).all()
+
+
+def test_steps_along_what_is_open_are_those_of_the_run_and_others_are_refined(case: Case) -> None:
+    open_steps = np.zeros((len(case.run), 3, 3))
+    open_steps[len(case.run) // 2 :, 0, 0] = 1.0
+    run = replace(case.run, open_steps=open_steps)
+    found = refine(run, RefinementConfig(rounds=1))  # type: ignore[call-arg]
+    later = np.flatnonzero(open_steps[:, 0, 0])
+
+    def off(T: np.ndarray, axis: int) -> float:
+        """By which the steps moved along an axis of the world, at most [m]."""
+        along = np.zeros((len(later), 3, 3))
+        along[:, axis, axis] = 1.0
+        step = kept_steps(run.T_world_imu, later - 1, later, along)
+        white = step.whitening.factors @ step.evaluate(T[later - 1], T[later])[:, :, None]
+        return float(1e-5 * np.linalg.norm(white[:, :, 0], axis=1).max())
+
+    held, free = found.after.T_world_imu, case.refined.after.T_world_imu
+    assert 5.0 * off(held, 0) < min(off(free, 0), off(held, 1), off(free, 1))
+    assert found.refusal is None and case.error(held) < case.error(run.T_world_imu)

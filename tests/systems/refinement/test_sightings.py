@@ -36,6 +36,7 @@ def slab_from_both_sides(before: int, behind: int) -> FinishedRun:
         imu=ImuSamples.from_arrays(np.arange(2), np.zeros((2, 3)), np.zeros((2, 3))),
         noise=ImuNoise(gyro=1e-3, accel=1e-2, gyro_walk=1e-5, accel_walk=1e-4),
         is_end=np.ones(count, dtype=np.bool_),
+        open_steps=np.zeros((count, 3, 3)),
     )
 
 
