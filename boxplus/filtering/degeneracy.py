@@ -1,4 +1,4 @@
-"""Directions of the pose that a scan does not determine, and the update without them.
+"""Directions of the pose that a scan does not determine.
 
 The information of points about the pose is S = Σ w h hᵀ, h = [s × C, u] with C = Rᵀu. The normals u come from
 noisy points of the map. A row is linear in its normal, h = M u, so noise of the normals alone gives a direction the information
@@ -11,9 +11,7 @@ rotation and translation nor on the number of points. In a weak direction the up
 its prediction. (Errors in variables: Fuller, Measurement Error Models, 1987, section 2.2; for degeneracy of a registration by
 eigenvalues see Zhang, Kaess, Singh, ICRA 2016.)
 
-In the others noise still has its share. A shift moves the residuals by what the true normals see of it, S − N, while the share N
-stays with the sensor wherever it is: the step −S⁻¹b reaches 1 − 1/λ of the shift, scan after scan, and claims too much.
-What the points say of the shift is −(S − N)⁻¹b with the covariance (S − N)⁻¹ S (S − N)⁻¹, and that is what is taken in.
+In the others noise still has its share (`errors_in_variables`).
 
 A plane counts in both the less, the less its normal is known (`plane_information`): planes across an edge are as good as
 noise for the question, and would hide how well the others measure.
@@ -32,6 +30,7 @@ from boxplus.filtering.small_linalg import inverse_root_into, symmetric_eigen_in
 
 # No normal is known better than this [rad]: edges of the world are not that straight, and N must not vanish.
 _LEAST_TILT = 1e-3
+_ENOUGH_POINTS = 2000  # for the threshold as it is set
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -58,17 +57,10 @@ class PoseDirections:
 
         At 0 this is the projector Π = V_s V_sᵀ N onto the others, which are conjugate to the weak ones in N.
         """
-        return self.scaled(np.where(self.weak, weight, 1.0)) if self.weak.any() else np.eye(6)
-
-    def scaled(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6, 6) what becomes of a small motion [θ, p] when its part along each direction counts by its share (6,)."""
-        left: NDArray[np.float64] = (self.basis * shares) @ np.linalg.inv(self.basis)  # the inverse of V is Vᵀ N
+        if not self.weak.any():
+            return np.eye(6)
+        left: NDArray[np.float64] = (self.basis * np.where(self.weak, weight, 1.0)) @ np.linalg.inv(self.basis)  # V⁻¹ is Vᵀ N
         return left
-
-    @property
-    def measured(self) -> NDArray[np.float64]:
-        """(6,) of what the scan says along each direction, the share that noise of the normals has not made; 0 where weak."""
-        return np.where(self.weak, 0.0, 1.0 - 1.0 / np.maximum(self.ratios, 1.0))
 
     def closest_to(self, axis: NDArray[np.float64]) -> int:
         """The direction closest to a shift along a unit `axis` (3,)."""
@@ -77,6 +69,15 @@ class PoseDirections:
     def ratio_along(self, axis: NDArray[np.float64]) -> float:
         """The ratio of the direction closest to a shift along a unit `axis` (3,)."""
         return float(self.ratios[self.closest_to(axis)])
+
+
+def threshold_for(threshold: float, points: int) -> float:
+    """The least ratio of a measured direction in a scan of so many points, where 2000 points ask for `threshold`.
+
+    The ratio of a direction that measures nothing scatters about 1 as if every tenth point had a normal of its own: by 0.1 where
+    there are 2000 points, by 0.2 where there are 500. A threshold of 1 or less stays as it is.
+    """
+    return 1.0 + (threshold - 1.0) * max(math.sqrt(_ENOUGH_POINTS / max(points, 1)), 1.0) if threshold > 1.0 else threshold
 
 
 def pose_directions(S: NDArray[np.float64], N: NDArray[np.float64], lever_arm: float, threshold: float) -> PoseDirections:
@@ -147,19 +148,6 @@ def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> Pos
     weak = directions.weak.copy()
     weak[directions.closest_to(axis)] = True
     return replace(directions, weak=weak)
-
-
-def without_noise(
-    A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A and b without what noise of the normals claims about the pose: nothing along weak directions, its share along the others.
-
-    With D = V diag(1 − 1/λ) Vᵀ N, zero for the weak ones: DᵀAD, Dᵀb. For the pose alone this is (S − N) S⁻¹ (S − N) and
-    (S − N) S⁻¹ b, whose step is −(S − N)⁻¹ b.
-    """
-    share = np.eye(12)
-    share[:6, :6] = directions.scaled(directions.measured)
-    return share.T @ A @ share, share.T @ b
 
 
 def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import PoseDirections, without_noise
-from boxplus.filtering.nav_state import TANGENT, boxplus_into
+from boxplus.filtering.degeneracy import PoseDirections
+from boxplus.filtering.errors_in_variables import without_noise
+from boxplus.filtering.nav_state import TANGENT, boxminus_into, boxplus_into
 from boxplus.filtering.update_step import map_step, move_covariance
 
 _CONVERGED = 1e-3  # every component of the step, rad and m (docs/lidar_inertial_odometry.md, section 7)
@@ -95,11 +96,23 @@ def iterated_update(
     x = x_prior.copy()
     delta = np.zeros(TANGENT)
     cov = np.zeros((TANGENT, TANGENT))
+    since_match, x_match = np.zeros(TANGENT), x
+    pose_prior = np.ascontiguousarray(cov_prior[:6, :6])
     rematch, converged_before, converged = True, False, False
     steps = 0
     while True:
+        if rematch:
+            x_match = x.copy()
+        boxminus_into(x, x_match, since_match)
         information = measurement.at(x, rematch=rematch)
-        A, b = without_noise(information.A, information.b, information.directions)
+        A, b = without_noise(
+            information.A,
+            information.b,
+            information.directions,
+            cov_prior=pose_prior,
+            used=information.used,
+            since_match=since_match[:6],
+        )
         if information.used < min_used or not map_step(x, x_prior, cov_prior, A, b, delta, cov):
             return Posterior(x_prior.copy(), cov_prior.copy(), False, np.zeros_like(A), information, steps, converged)
         boxplus_into(x, delta, x)

@@ -40,6 +40,7 @@ from boxplus.filtering.nav_state import MEASURED, P, R
 from boxplus.filtering.small_linalg import symmetric_eigen_into
 from boxplus.manifolds import so3
 
+SHARED_ERRORS = 1.5  # how many times the covariance of a scan counts: what random recordings need
 _FIRST, _MARKED = 0, 1  # the pose that errors are counted against
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)

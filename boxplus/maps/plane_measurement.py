@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import run_chunks
-from boxplus.filtering.degeneracy import PoseDirections, pose_directions
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions, threshold_for
 from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
 from boxplus.filtering.plane_information import (
@@ -99,7 +99,8 @@ class PlaneMeasurement:
             total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=True)
         A, b, signal, noise, sums = total
         if matches:  # in between the planes stay, and what they can tell
-            self._directions = pose_directions(signal, noise, self.lever_arm, self._config.weak_threshold)
+            threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
+            self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         return Information(A * self._weight, b * self._weight, self._directions, used, rms)

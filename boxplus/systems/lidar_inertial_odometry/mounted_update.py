@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
+from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+    MOUNTING,
     HeldMounting,
     mounting_known,
     moved_sensitivity,
@@ -63,10 +65,19 @@ def mounted_update(
     if config.extrinsic_estimation == "on" or turns:
         posterior = unshown.mark(iterated_update(x, cov, measurement, **limits))
         after, moved = mounting_known(posterior.cov)
-        return MountedUpdate(posterior, known, after, B, moved)
+        after[MOUNTING, MOUNTING] = _less_sure(cov[MOUNTING, MOUNTING], after[MOUNTING, MOUNTING])
+        return MountedUpdate(replace(posterior, cov=with_mounting(after, moved)), known, after, B, moved)
     held = HeldMounting(measurement)
     posterior = unshown.mark(iterated_update(x, known, held, **limits))
     after, moved = posterior.cov, B
     if posterior.valid:
-        moved = moved_sensitivity(B, after, replace(held.last, directions=posterior.last.directions))
+        moved = moved_sensitivity(B, known, after, replace(held.last, directions=posterior.last.directions))
     return MountedUpdate(replace(posterior, cov=with_mounting(after, moved)), known, after, B, moved)
+
+
+def _less_sure(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) covariance of the mounting where what a scan has said of it counts less, for its points are not independent."""
+    prior = np.linalg.inv(before)
+    gained = (np.linalg.inv(after) - prior) / SHARED_ERRORS
+    less_sure: NDArray[np.float64] = np.linalg.inv(prior + 0.5 * (gained + gained.T))
+    return less_sure

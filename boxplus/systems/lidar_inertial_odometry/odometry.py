@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.map_datum import Correction, MapDatum
+from boxplus.filtering.map_datum import SHARED_ERRORS, Correction, MapDatum
 from boxplus.filtering.nav_state import RL, TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.maps.ikd_tree import IkdTree
@@ -46,7 +46,7 @@ from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
 
 _LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
-_BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS, _SHARED_ERRORS = 3, 8, 2, 1.5  # shared: see `MapDatum`, what random recordings need
+_BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS = 3, 8, 2
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
@@ -91,7 +91,7 @@ class LidarInertialOdometry(Snapshots):
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
-        self._datum = MapDatum(NavState.identity().pack(), self._cov, _SHARED_ERRORS)
+        self._datum = MapDatum(NavState.identity().pack(), self._cov, SHARED_ERRORS)
         self._mounting, self._noise = UnknownMounting(NavState.identity().pack(), self.config), ObservedNoise(self.config)
         self._mounting_drift: MountingDrift | None = None
         self._gap: str | None = None
@@ -201,7 +201,7 @@ class LidarInertialOdometry(Snapshots):
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]
-        self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), _SHARED_ERRORS)
+        self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), SHARED_ERRORS)
         self._mounting = UnknownMounting(self._x, self.config)
         self._mounting_drift = None if self.config.extrinsic_estimation == "off" else MountingDrift(self._x)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)

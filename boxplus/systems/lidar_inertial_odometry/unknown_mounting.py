@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import without_noise
+from boxplus.filtering.errors_in_variables import without_noise
 from boxplus.filtering.iterated_update import Information, Measurement
 from boxplus.filtering.nav_state import PL, RL, T_G, T_P, T_THETA, T_THETA_L, TANGENT, G, P, R
 from boxplus.manifolds import so3
@@ -138,14 +138,23 @@ def mounting_known(cov: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
     return known, B
 
 
-def moved_sensitivity(B: NDArray[np.float64], cov: NDArray[np.float64], information: Information) -> NDArray[np.float64]:
+def moved_sensitivity(
+    B: NDArray[np.float64], cov_prior: NDArray[np.float64], cov: NDArray[np.float64], information: Information
+) -> NDArray[np.float64]:
     """B (18, 6) after a scan that was not asked about the mounting: B − K (H_x B + H_T), K H = P A.
 
     Args:
-        B: before it; cov: (24, 24) after it, with the mounting known.
+        B: before it; cov_prior, cov: (24, 24) before and after it, with the mounting known.
         information: what the scan says of pose and mounting.
     """
-    A, _ = without_noise(information.A, information.b, information.directions)
+    A, _ = without_noise(
+        information.A,
+        information.b,
+        information.directions,
+        cov_prior=np.ascontiguousarray(cov_prior[_POSE, _POSE]),
+        used=information.used,
+        since_match=np.zeros(6),
+    )
     moved: NDArray[np.float64] = B - cov[_REST, _POSE] @ (A[:6, :6] @ B[_POSE] + A[:6, 6:])
     return moved
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.filtering.nav_state import T_V, TANGENT
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
@@ -41,7 +41,6 @@ _LONGEST_GAP_S = 1.0  # nothing holds a velocity for longer
 _MOST_STEPS = 10
 _LEAST_FITTING = 0.8  # of the points with a plane lie on it; 0.95 at least on sound runs
 _LOST_STREAK = 3
-_SHARED_ERRORS = 1.5  # see `MapDatum`
 _UNKNOWN = np.diag([np.pi] * 3 + [1e4] * 3) ** 2  # of the pose against the first one: any turn, kilometres
 _SHOWN = 2.0  # times the threshold at which a direction that was open counts as measured again
 _INDEPENDENT_M = 0.2  # between points whose errors are independent
@@ -86,7 +85,7 @@ class LidarOdometry(Snapshots):
         self._density = ObservedDensity()
         self._state = MotionState(0, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         self._cov: NDArray[np.float64] = np.eye(DOF)
-        self._datum = MapDatum(nav_state(self._state).pack(), self._cov, _SHARED_ERRORS)
+        self._datum = MapDatum(nav_state(self._state).pack(), self._cov, SHARED_ERRORS)
         self._untaken = 0
         self._open = False
         self._weak_since_ns: int | None = None
@@ -177,12 +176,12 @@ class LidarOdometry(Snapshots):
         self.start, self.start_problem = found, None
         self._state, self._cov = found.motion.last, found.covariance.copy()
         if self._gap is None:
-            self._datum = MapDatum(nav_state(self._state).pack(), self._cov, _SHARED_ERRORS)
+            self._datum = MapDatum(nav_state(self._state).pack(), self._cov, SHARED_ERRORS)
         else:
             self._state = replace(self._state, p_world_lidar=self._last_position)
             unknown = self._cov.copy()
             unknown[:6, :6] += _UNKNOWN
-            self._datum = MapDatum(nav_state(self._state).pack(), unknown, _SHARED_ERRORS)
+            self._datum = MapDatum(nav_state(self._state).pack(), unknown, SHARED_ERRORS)
         (first, *rest), self._waiting = self._waiting, []
         p_lidar = _deskewed(first, found.motion)
         self._insert(self._voxel_filter(p_lidar)[1])

@@ -167,7 +167,7 @@ def test_a_scan_not_asked_about_the_mounting_moves_the_state_as_for_any_mounting
         posterior = iterated_update(prior, known, held)
         assert np.array_equal(posterior.x[RL:], prior[RL:])
         posteriors.append(posterior)
-    after = moved_sensitivity(B, posteriors[0].cov, held.last)
+    after = moved_sensitivity(B, known, posteriors[0].cov, held.last)
     shift = posteriors[1].x[P : P + 15] - posteriors[0].x[P : P + 15]
     assert np.allclose(shift, (after @ step)[3:], atol=1e-3 * np.abs(shift).max() + 1e-9)
 
