@@ -6,12 +6,14 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from boxplus._settings import Settings
 from boxplus.errors import InputError
 
-SettingsT = TypeVar("SettingsT", bound=Settings)
+if TYPE_CHECKING:
+    from boxplus._settings import Settings
+
+SettingsT = TypeVar("SettingsT", bound="Settings")
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from boxplus._arguments import shown
 from boxplus.errors import BoxplusError, InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ else:
         def __call__(cls, *values, **settings):
             if values:
                 advice = f"write e.g. {cls.__name__}({next(iter(cls.model_fields))}=…), or {cls.__name__}(**settings)"
-                raise InputError(f"settings of {cls.__name__} by name", _short(values[0]), advice)
+                raise InputError(f"settings of {cls.__name__} by name", shown(values[0]), advice)
             try:
                 return super().__call__(**settings)
             except ValidationError as error:
@@ -43,23 +44,57 @@ class Settings(BaseModel, metaclass=_Refusing):
             change = f"model_copy(update={{{name!r}: …}})"
             raise InputError(f"{type(self).__name__} as it was made", f"another {name}", f"make a new one, or {change}") from None
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """The same settings, with other values for some; these are looked at like any.
 
-def refusal(kind: type[BaseModel], error: ValidationError) -> BoxplusError:
-    """What is wrong with settings, and what was meant."""
-    first = error.errors()[0]
-    cause = first.get("ctx", {}).get("error")
+        Raises:
+            InputError: a setting is unknown or out of range.
+        """
+        copied = super().model_copy(deep=deep)
+        if not update:
+            return copied
+        return type(self)(**{**{name: getattr(copied, name) for name in copied.model_fields_set}, **update})
+
+
+Place = tuple[str | int, ...]
+"""The names that lead to a setting, and numbers where one of several is meant."""
+
+
+def refusal(kind: type[BaseModel], error: ValidationError, named: Callable[[Place], str] | None = None) -> BoxplusError:
+    """What is wrong with settings, all of it, and what was meant.
+
+    Args:
+        named: what whoever gave them calls a setting, such as the option of a command.
+    """
+    found: dict[Place, BoxplusError] = {}
+    for one in error.errors():
+        place = _place(kind, one["loc"])
+        if place not in found:  # of a value that may be one thing or another, there is one for each of them
+            found[place] = _refusal_of_one(kind, one, place, named or (lambda place: f"{_dotted(place)} of {kind.__name__}"))
+    inputs = [one for one in found.values() if isinstance(one, InputError)]
+    first = next(iter(found.values()))
+    if len(inputs) < 2:
+        return first
+    expected, got = ("; ".join(parts) for parts in zip(*((one.expected, one.got) for one in inputs), strict=True))
+    return InputError(expected, got, "; ".join(dict.fromkeys(one.advice for one in inputs)))
+
+
+def _refusal_of_one(kind: type[BaseModel], one: Any, place: Place, named: Callable[[Place], str]) -> BoxplusError:
+    cause = one.get("ctx", {}).get("error")
     if isinstance(cause, BoxplusError):
         return cause
-    place = [str(part) for part in first["loc"]]
-    where, owner = ".".join(place) or "the whole", _owner(kind, place)
-    if first["type"] == "extra_forbidden":
-        name = place[-1]
+    owner, name = _owner(kind, place), str(place[-1]) if place else "the whole"
+    if one["type"] == "extra_forbidden":
         return InputError(f"a setting of {owner.__name__}", repr(name), suggestion(name, owner.model_fields, "setting"))
-    field = owner.model_fields.get(place[-1]) if place else None
-    if first["type"] == "missing":
-        return InputError(f"{where} of {kind.__name__}{_described(field)}", "nothing", f"give {where}=…")
-    got = f"{_short(first['input'])} ({first['msg']})"
-    return InputError(f"a valid value for {where} of {kind.__name__}{_described(field)}", got, "correct the value")
+    field = owner.model_fields.get(name)
+    meaning = f" ({field.description})" if field is not None and field.description else ""
+    if one["type"] == "missing":
+        return InputError(f"{named(place)}{meaning}", "nothing", f"give {_dotted(place)}=…")
+    return InputError(f"a valid value for {named(place)}{meaning}", f"{shown(one['input'])} ({one['msg']})", "correct the value")
+
+
+def _dotted(place: Place) -> str:
+    return ".".join(map(str, place)) or "the whole"
 
 
 def suggestion(word: str, known: Iterable[str], kind: str) -> str:
@@ -79,20 +114,25 @@ def suggestion(word: str, known: Iterable[str], kind: str) -> str:
     return f"{hint}the {kind}s are: {', '.join(names)}"
 
 
-def _owner(kind: type[BaseModel], place: list[str]) -> type[BaseModel]:
+def _place(kind: type[BaseModel], where: Place) -> Place:
+    """The part of pydantic's place of an error that names settings; the rest are the types that it tried."""
+    model: type[BaseModel] | None = kind
+    for depth, name in enumerate(where):
+        if model is None:
+            return where[: depth + 1] if isinstance(name, int) else where[:depth]
+        model = _held(model, str(name))
+    return where
+
+
+def _owner(kind: type[BaseModel], place: Place) -> type[BaseModel]:
     """The model that the last name of a place belongs to: settings may hold others."""
     for name in place[:-1]:
-        field = kind.model_fields.get(name)
-        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
-            break
-        kind = field.annotation
+        kind = _held(kind, str(name)) or kind
     return kind
 
 
-def _described(field: Any) -> str:
-    return f" ({field.description})" if field is not None and field.description else ""
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 120 else f"{text[:117]}…"
+def _held(kind: type[BaseModel], name: str) -> type[BaseModel] | None:
+    """The model that a setting holds, where it does."""
+    field = kind.model_fields.get(name)
+    kinds = () if field is None else (field.annotation, *get_args(field.annotation))
+    return next((one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)), None)

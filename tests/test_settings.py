@@ -48,11 +48,46 @@ def test_settings_stay_as_they_are_made():
     assert config.model_copy(update={"sigma_px": 3.0}).sigma_px == 3.0
 
 
+def test_other_values_in_a_copy_are_looked_at_like_any():
+    config = bp.BundleAdjustmentConfig(sigma_px=2.0)
+    with pytest.raises(bp.InputError, match=r"a setting of BundleAdjustmentConfig – got 'sigma' – did you mean sigma_px\?"):
+        config.model_copy(update={"sigma": 3.0})
+    with pytest.raises(bp.InputError, match=r"a valid value for sigma_px .*– got -3.0"):
+        config.model_copy(update={"sigma_px": -3.0})
+    copied = config.model_copy(update={"solver": {"max_iterations": 7}})
+    assert copied.solver == bp.SolverOptions(max_iterations=7) and copied.sigma_px == 2.0
+    assert copied.model_fields_set == {"sigma_px", "solver"} and config.solver == bp.BundleAdjustmentConfig().solver
+    assert config.model_copy(deep=True) == config.model_copy() == config
+
+
+def test_all_that_is_wrong_is_said_at_once():
+    with pytest.raises(bp.InputError) as caught:
+        bp.BundleAdjustmentConfig(sigma_px=-1.0, solver={"method": "newton", "max_iterations": -2}, sigma=3.0)
+    expected, got = caught.value.expected.split("; "), caught.value.got.split("; ")
+    assert [text.split(" of ")[0].removeprefix("a valid value for ") for text in expected] == [
+        "sigma_px",
+        "solver.method",
+        "solver.max_iterations",
+        "a setting",
+    ]
+    assert [text.split(" ")[0] for text in got] == ["-1.0", "'newton'", "-2", "'sigma'"]
+    assert caught.value.advice.count("correct the value") == 1 and "did you mean sigma_px?" in caught.value.advice
+    with pytest.raises(bp.InputError, match=r"for solver.max_iterations \(.*; a valid value for solver.time_limit_s \("):
+        load_settings(_Sections, settings=["solver.max_iterations=-1", "solver.time_limit_s=0"])
+
+
+class _Sections(Settings):
+    solver: bp.SolverOptions = bp.SolverOptions()
+
+
 def test_a_name_that_is_part_of_others_brings_them_all():
     assert suggestion("voxel", ["odometry.scan_voxel", "map.voxel", "odometry.threads"], "setting").startswith(
         "did you mean map.voxel or odometry.scan_voxel? the settings are: "
     )
     with pytest.raises(bp.InputError, match=r"got 'sigma' – did you mean .*map_sigma"):
         load_settings(RunConfig, settings=["sigma=0.1"])
+    with pytest.raises(bp.InputError, match=r"got 'voxel' – did you mean map.voxel or odometry.scan_voxel\?"):
+        load_settings(RunConfig, settings=["voxel=0.5"])
+    assert load_settings(RunConfig, settings=["map.voxel=0.5"]).map.voxel == 0.5
     with pytest.raises(bp.InputError, match="got 'voxel' – did you mean scan_voxel"):
         bp.LioConfig(voxel=0.5)

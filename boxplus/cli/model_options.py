@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ValidationError
 
-from boxplus.errors import BoxplusError
+from boxplus._settings import refusal
 from boxplus.recordings.options import OtherLidar, RecordingOptions
 
 _TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None, tuple[OtherLidar, ...] | None: list[str] | None}
@@ -31,7 +31,7 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
     option that may be repeated.
 
     Raises, when the command is called:
-        typer.BadParameter: a value outside its range.
+        InputError: a value outside its range.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -45,12 +45,7 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
             try:
                 options = model.model_validate(given)
             except ValidationError as error:
-                first = error.errors()[0]
-                cause = first.get("ctx", {}).get("error")
-                if isinstance(cause, BoxplusError):
-                    raise cause from error
-                name = _flag(str(first["loc"][0]))
-                raise typer.BadParameter(f"{first['msg']} (got {first['input']!r})", param_hint=name) from error
+                raise refusal(model, error, lambda place: _flag(str(place[0]))) from None
             command(**words, options=options)
 
         added = [

@@ -10,7 +10,7 @@ from typing import TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from boxplus._settings import suggestion
+from boxplus._settings import refusal, suggestion
 from boxplus.errors import InputError
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
@@ -62,16 +62,7 @@ def load_settings(
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        cause = first.get("ctx", {}).get("error")
-        if isinstance(cause, InputError):
-            raise cause from error
-        where = ".".join(str(part) for part in first["loc"][:2])
-        raise InputError(
-            f"a valid value for {where} ({_describe_key(where, sections)})",
-            f"{first['input']!r} ({first['msg']})",
-            "correct the value",
-        ) from error
+        raise refusal(kind, error, lambda place: ".".join(map(str, place))) from None
 
 
 def dump_settings(head: str, used: Mapping[str, object]) -> str:
@@ -87,13 +78,6 @@ def _sections(kind: type[BaseModel]) -> Sections:
         for name, field in kind.model_fields.items()
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
     }
-
-
-def _describe_key(dotted: str, sections: Sections) -> str:
-    """The description of a setting, with its unit, from its dotted name (`map.voxel`)."""
-    section, _, key = dotted.partition(".")
-    field = sections[section].model_fields.get(key) if section in sections else None
-    return (field.description if field is not None else None) or "a setting of boxplus"
 
 
 def _read_yaml(path: Path, known: Sections) -> dict[str, dict[str, object]]:
@@ -132,8 +116,10 @@ def _parse_setting(text: str, sections: Sections) -> tuple[str, str, object]:
     section, dot, key = name.strip().rpartition(".")
     if not dot:
         homes = [candidate for candidate, model in sections.items() if key in model.model_fields]
-        if len(homes) != 1:
-            known = sorted(f"{candidate}.{known}" for candidate, model in sections.items() for known in model.model_fields)
+        known = sorted(f"{candidate}.{known}" for candidate, model in sections.items() for known in model.model_fields)
+        # `voxel` is the map's: whoever writes it may as well mean the `scan_voxel` of another section.
+        alike = [other for other in known if key in other.partition(".")[2].split("_") and other.partition(".")[0] not in homes]
+        if len(homes) != 1 or alike:
             raise InputError("the name of a setting", repr(key), suggestion(key, known, "setting"))
         section = homes[0]
     if section not in sections:

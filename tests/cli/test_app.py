@@ -92,7 +92,7 @@ def test_every_field_of_the_recording_is_an_option() -> None:
 def test_a_value_out_of_range_names_its_option() -> None:
     result = CliRunner().invoke(app, ["inspect", "nothing.bag", "--start", "-1"])
     assert result.exit_code == 2
-    assert "Invalid value for --start: Input should be greater than or equal to 0 (got -1.0)" in result.stderr
+    assert "expected a valid value for --start" in result.stderr
 
 
 def test_a_recording_that_does_not_exist_is_bad_input() -> None:
