@@ -59,6 +59,11 @@ def is_finite(value: object) -> bool:
         return False
 
 
+def is_array(values: object, dtype: type, axes: int) -> bool:
+    """Whether it is what kernels are compiled for: of this type and number of axes, in one piece."""
+    return isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes and values.flags.c_contiguous
+
+
 def as_array(values: ArrayLike, what: str) -> NDArray[Any]:
     try:
         return np.asarray(values)

@@ -32,11 +32,14 @@ class Manifold(ABC):
 
     @abstractmethod
     def boxplus(self, x: ArrayLike, delta: ArrayLike) -> NDArray[np.float64]:
-        """x ⊞ δ: the point (..., size) that lies δ (..., dof) away from x (..., size)."""
+        """x ⊞ δ: the point (..., size) that lies δ (..., dof) away from x (..., size).
+
+        NaN gives NaN in its row and nowhere else, as of the functions of NumPy. What keeps points looks at them, by `check`.
+        """
 
     @abstractmethod
     def boxminus(self, x: ArrayLike, base: ArrayLike) -> NDArray[np.float64]:
-        """x ⊟ base: the δ (..., dof) with base ⊞ δ = x."""
+        """x ⊟ base: the δ (..., dof) with base ⊞ δ = x; NaN as in `boxplus`."""
 
     @abstractmethod
     def boxplus_jacobian(self, x: ArrayLike, delta: ArrayLike) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """Scans and IMU samples that a caller has put together himself, before an estimator takes them in.
 
-`from_arrays` has checked its arrays. The bare constructors take what they are given; arrays of other types than the kernels'
+`Scan.from_arrays` has checked its arrays. The bare constructor takes what it is given; arrays of other types than the kernels'
 would then be read as something else, and rows that do not belong together as if they did.
 """
 
@@ -11,23 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from boxplus._numbers import is_array
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 
 
 def checked_imu(samples: ImuSamples) -> ImuSamples:
-    """The same samples; with arrays converted where that is all that they lack.
+    """The same samples, whose constructor has looked at their arrays.
 
     Raises:
-        InputError: no `ImuSamples`, or their arrays have not the shapes and types that its docstring says.
+        InputError: no `ImuSamples`.
     """
     if not isinstance(samples, ImuSamples):
         raise InputError("ImuSamples", _kind(samples), "build them with ImuSamples.from_arrays(time_ns, gyro, accel)")
-    time, gyro, accel = samples.time_ns, samples.gyro, samples.accel
-    typed = _is(time, np.int64, 1) and _is(gyro, np.float64, 2) and _is(accel, np.float64, 2)
-    whole = typed and gyro.shape == accel.shape == (len(time), 3)
-    return samples if whole else ImuSamples.from_arrays(time, gyro, accel)
+    return samples
 
 
 def checked_scan(scan: Scan) -> Scan:
@@ -40,12 +38,12 @@ def checked_scan(scan: Scan) -> Scan:
     if not isinstance(scan, Scan):
         raise InputError("a Scan", _kind(scan), "build it with Scan.from_arrays(p_lidar, time_ns)")
     points, time, intensity = scan.p_lidar, scan.time_ns, scan.intensity
-    whole = _is(points, np.float32, 2) and _is(time, np.int64, 1) and points.shape == (len(time), 3)
+    whole = is_array(points, np.float32, 2) and is_array(time, np.int64, 1) and points.shape == (len(time), 3)
     if scan.lidar is not None and np.shape(scan.lidar) != np.shape(time):
         raise InputError(
             f"lidar of shape {np.shape(time)}, as time_ns", f"shape {np.shape(scan.lidar)}", "give one number a point, or none"
         )
-    if not whole or not (intensity is None or (_is(intensity, np.float32, 1) and intensity.shape == time.shape)):
+    if not whole or not (intensity is None or (is_array(intensity, np.float32, 1) and intensity.shape == time.shape)):
         made = Scan.from_arrays(points, time, intensity, lidar=scan.lidar)
         rejected = dict(Counter(scan.rejected) + Counter(made.rejected))
         scan = replace(made, start_ns=scan.start_ns, end_ns=scan.end_ns, rejected=rejected)
@@ -61,11 +59,6 @@ def checked_scan(scan: Scan) -> Scan:
             "give all of them as absolute nanoseconds; Scan.from_arrays takes start and end from the points",
         )
     return scan
-
-
-def _is(array: object, dtype: type, axes: int) -> bool:
-    """Also whether it lies in one piece: kernels would be compiled anew for any other layout."""
-    return isinstance(array, np.ndarray) and array.dtype == dtype and array.ndim == axes and array.flags.c_contiguous
 
 
 def _kind(value: object) -> str:

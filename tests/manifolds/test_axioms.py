@@ -214,3 +214,22 @@ def test_manifolds_describe_themselves(manifold: Manifold) -> None:
     copy = pickle.loads(pickle.dumps(manifold))
     assert copy == manifold and hash(copy) == hash(manifold)
     assert [other == manifold for other in MANIFOLDS].count(True) == 1
+
+
+@pytest.mark.parametrize("manifold", MANIFOLDS, ids=repr)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_stays_in_its_row(manifold: Manifold, value: float) -> None:
+    rng = np.random.default_rng(0)
+    points, delta = manifold.random(rng, 3), 0.1 * rng.normal(size=(3, manifold.dof))
+    moved, differences = manifold.boxplus(points, delta), manifold.boxminus(points, points[::-1])
+    for column in range(manifold.dof):
+        wrong = delta.copy()
+        wrong[1, column] = value
+        found = manifold.boxplus(points, wrong)
+        assert not np.isfinite(found[1]).all() and np.array_equal(found[[0, 2]], moved[[0, 2]])
+    for column in range(manifold.size):
+        wrong = points.copy()
+        wrong[1, column] = value
+        assert not np.isfinite(manifold.boxplus(wrong, delta)[1]).all()
+        found = manifold.boxminus(wrong, points[::-1])
+        assert not np.isfinite(found[1]).all() and np.array_equal(found[[0, 2]], differences[[0, 2]])

@@ -22,9 +22,11 @@ def test_what_is_right_is_taken_as_it_is() -> None:
 
 
 def test_other_types_are_converted() -> None:
-    loose: Any = bp.ImuSamples(TIMES.tolist(), SAMPLES.gyro.astype(np.float32), SAMPLES.accel.tolist())  # type: ignore[arg-type]
-    found = checked_imu(loose)
+    found = bp.ImuSamples(TIMES.tolist(), SAMPLES.gyro.astype(np.float32), SAMPLES.accel.tolist())  # type: ignore[arg-type]
     assert (found.time_ns.dtype, found.gyro.dtype, found.accel.dtype) == (np.int64, np.float64, np.float64)
+    assert (
+        checked_imu(found) is found and bp.ImuSamples(TIMES[::2], SAMPLES.gyro[::2], SAMPLES.accel[::2]).gyro.flags.c_contiguous
+    )
     wide: Any = replace(SCAN, p_lidar=SCAN.p_lidar.astype(np.float64), start_ns=SCAN.start_ns - 5)
     scan = checked_scan(wide)
     assert scan.p_lidar.dtype == np.float32 and scan.p_lidar.tolist() == SCAN.p_lidar.tolist()
@@ -65,7 +67,7 @@ def test_what_is_converted_keeps_what_belongs_to_it() -> None:
 )
 def test_samples_that_do_not_fit_together(changes: dict[str, Any], told: str) -> None:
     with pytest.raises(bp.InputError, match=told):
-        bp.LidarInertialOdometry().push_imu(replace(SAMPLES, **changes))
+        replace(SAMPLES, **changes)
 
 
 @pytest.mark.parametrize(

@@ -59,3 +59,20 @@ def test_refusals() -> None:
         with pytest.raises(InputError, match=f"1 to 5 levels of an image of 64×48 pixels – got {levels}"):
             image.pyramid(levels)
     assert len(image.pyramid(5)) == 5
+
+
+def test_the_constructor_looks_at_its_values() -> None:
+    grey = np.arange(12.0, dtype=np.float32).reshape(3, 4)
+    assert Image(grey).grey is grey
+    converted = Image(grey[:, ::2].astype(np.float64)).grey  # type: ignore[arg-type]
+    assert converted.dtype == np.float32 and converted.flags.c_contiguous and converted.tolist() == grey[:, ::2].tolist()
+    large = np.full((3, 4), 3e38, np.float32)  # its sum is infinite, its values are not
+    assert Image(large).grey.tolist() == large.tolist()
+    for wrong, told in ((np.nan, "finite – got nan at row and column"), (np.inf, "finite – got inf")):
+        bad = grey.copy()
+        bad[1, 2] = wrong
+        with pytest.raises(InputError, match=told):
+            Image(bad)
+    for shape in ((12,), (1, 12), (2, 2, 3)):
+        with pytest.raises(InputError, match=r"grey of shape \(height, width\), at least 2×2"):
+            Image(np.zeros(shape, np.float32))
