@@ -31,6 +31,7 @@ from boxplus.filtering.small_linalg import cholesky_inverse_into
 
 _POINTS_A_NORMAL = 10.0
 _CONE = 9.0  # squared standard deviations
+_APART = 1e-3  # of two ratios, relative: closer ones are told from each other by chance
 _DOF = len(MEASURED)
 
 
@@ -184,7 +185,8 @@ def _read_into(
             for k in range(6):
                 if weak[k]:
                     tilt += P[i, k] * inverse[k, j]
-            most = math.sqrt(_CONE * per_normal / ratios[i]) / (1.0 - ratios[j] / ratios[i])
+            # One that was called weak for another reason may have the larger ratio.
+            most = math.sqrt(_CONE * per_normal / ratios[i]) / max(abs(1.0 - ratios[j] / ratios[i]), _APART)
             tilt = min(max(tilt, -most), most)
             for k in range(6):
                 T[i, k] -= tilt * U[j, k]

@@ -30,6 +30,7 @@ class RegistrationConfig(Settings):
     weak_threshold: float = Field(
         1.3,
         ge=0,
-        description="a direction is only predicted when the points say less about it than so many times what noise would",
+        description="a direction is only predicted when 2000 points say less about it than so many times what noise would; "
+        "fewer ask for more",
     )
     threads: int = Field(1, ge=1, description="threads that share the work of a scan; the result does not depend on it")

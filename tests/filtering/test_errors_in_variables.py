@@ -262,3 +262,19 @@ def test_walls_without_features_do_not_hold_a_sensor_whose_rotation_is_known() -
         errors.append(place[3])
     assert np.median(held) > 0.2
     assert np.sqrt(np.mean((np.array(errors) / held) ** 2)) < 1.6
+
+
+@given(seeds, st.floats(0.01, 2.0))
+def test_a_direction_called_weak_for_another_reason_learns_only_what_the_prior_ties_to_others(seed: int, sigma: float) -> None:
+    """Its ratio may be larger than that of measured ones: the cone stays one around it."""
+    random = np.random.default_rng(seed)
+    A, N = random_covariance(random, 12), random_covariance(random, 6)
+    A[:6, 6:], A[6:, :6] = 0.0, 0.0
+    directions = pose_directions(A[:6, :6], N, 3.0, 0.0)
+    directions = replace(directions, ratios=2.0 + directions.ratios, weak=np.arange(6) == 3)
+    free = _taken(A, np.zeros(12), directions, sigma**2 * directions.basis @ directions.basis.T, 500)[0]
+    along = directions.basis[:, 3]
+    assert abs(along @ free[:6, :6] @ along) < 1e-6 * (along @ A[:6, :6] @ along)  # the prior ties it to nothing
+    tied = _taken(A, np.zeros(12), directions, sigma**2 * random_covariance(random, 6), 500)[0]
+    assert np.isfinite(tied).all()
+    assert np.linalg.eigvalsh(tied[:6, :6])[0] > -1e-6 * np.abs(tied).max()

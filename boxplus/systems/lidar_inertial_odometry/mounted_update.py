@@ -65,8 +65,10 @@ def mounted_update(
     if config.extrinsic_estimation == "on" or turns:
         posterior = unshown.mark(iterated_update(x, cov, measurement, **limits))
         after, moved = mounting_known(posterior.cov)
-        after[MOUNTING, MOUNTING] = _less_sure(cov[MOUNTING, MOUNTING], after[MOUNTING, MOUNTING])
-        return MountedUpdate(replace(posterior, cov=with_mounting(after, moved)), known, after, B, moved)
+        if posterior.valid:
+            after[MOUNTING, MOUNTING] = less_sure(cov[MOUNTING, MOUNTING], after[MOUNTING, MOUNTING])
+            posterior = replace(posterior, cov=with_mounting(after, moved))
+        return MountedUpdate(posterior, known, after, B, moved)
     held = HeldMounting(measurement)
     posterior = unshown.mark(iterated_update(x, known, held, **limits))
     after, moved = posterior.cov, B
@@ -75,9 +77,11 @@ def mounted_update(
     return MountedUpdate(replace(posterior, cov=with_mounting(after, moved)), known, after, B, moved)
 
 
-def _less_sure(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) covariance of the mounting where what a scan has said of it counts less, for its points are not independent."""
-    prior = np.linalg.inv(before)
-    gained = (np.linalg.inv(after) - prior) / SHARED_ERRORS
-    less_sure: NDArray[np.float64] = np.linalg.inv(prior + 0.5 * (gained + gained.T))
-    return less_sure
+def less_sure(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) covariance of the mounting where what a scan has said of it counts less, for its points are not independent.
+
+    Of the information that was gained, 1 / `SHARED_ERRORS`: a mean of both informations, so that it stays positive definite.
+    """
+    gained = 1.0 / SHARED_ERRORS
+    covariance: NDArray[np.float64] = np.linalg.inv((1.0 - gained) * np.linalg.inv(before) + gained * np.linalg.inv(after))
+    return 0.5 * (covariance + covariance.T)

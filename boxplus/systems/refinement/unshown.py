@@ -20,6 +20,7 @@ Ints = NDArray[np.int64]
 
 _MOST = 0.5  # share of the scans that may be weak or lost
 _WINDOW = 10  # scans of a spell over which its covariance tells the direction
+_LEAST_M = 2e-3  # standard deviation by which a position must have become less sure for a direction to count as open
 _AS_OPEN = 0.25  # of the variance that grows most: so much of it in another direction, and that is open as well
 _HELD_M = 1e-5  # standard deviation of a step along what is open
 
@@ -71,7 +72,7 @@ def open_steps(status: ArrayLike, T_world_imu: Floats, covariance: Floats) -> Fl
         first = max(begin - 1, k - _WINDOW, 0)
         J = np.hstack([-so3.hat(T_world_imu[k, 4:] - T_world_imu[first, 4:]) @ R[first], np.eye(3)])
         growth, axes = np.linalg.eigh(covariance[k, 3:, 3:] - J @ covariance[first] @ J.T)
-        open_ = axes[:, growth > _AS_OPEN * growth[-1]] if growth[-1] > 0.0 else axes[:, :0]
+        open_ = axes[:, growth > _AS_OPEN * growth[-1]] if growth[-1] > _LEAST_M**2 else axes[:, :0]
         found[k] = open_ @ open_.T
     return found
 

@@ -332,15 +332,19 @@ class _Meeting:
         if found.refusal is not None:
             return chosen
         T = se3.compose(T, np.array([1.0, 0.0, 0.0, 0.0, *(found.metres * axis)]))
-        for key, loop in list(self.loops.items()):
-            if self._open_axis([loop]) is not None:
+        before = dict(self.loops)
+        for key, loop in before.items():
+            if loop.refusal is None and self._open_axis([loop]) is not None:
                 del self.loops[key]
         again = [self._laid_again(loop, T) for loop in chosen]
         again = [loop for loop in again if loop.refusal is None]
         count = sum(self._leaves_open(loop, axis) for loop in again)
         self._take([moved_along(loop, axis, self.query, count) if self._leaves_open(loop, axis) else loop for loop in again])
         standing = [loop for loop in self.loops.values() if loop.refusal is None]
-        return self._largest_agreeing(standing) if len(standing) >= _FIRST else chosen
+        if len(standing) < _FIRST:
+            self.loops, self._not_told = before, "laid where what they see together fits, single encounters do not"
+            return chosen
+        return self._largest_agreeing(standing)
 
     def _leaves_open(self, loop: Loop, axis: Floats) -> bool:
         own = self._open_axis([loop])

@@ -35,13 +35,15 @@ class Twins:
         """Look at a merged scan; at a LiDAR of which enough has been seen no more."""
         from scipy.spatial import cKDTree
 
-        if scan.lidar is None or min(self._looked[1:], default=_LOOKED) >= _LOOKED:
+        if scan.lidar is None:
             return
-        own = [self._own(scan, number) for number in range(len(self._T))]
-        trees = {number: cKDTree(points) for number, points in enumerate(own) if len(points)}
-        for number in range(1, len(own)):
-            if not len(own[number]) or self._looked[number] >= _LOOKED:
-                continue
+        seen = set(np.unique(scan.lidar).tolist())
+        ask = [number for number in range(1, len(self._T)) if self._looked[number] < _LOOKED and number in seen]
+        if not ask:
+            return
+        own = [self._own(scan, number) for number in range(max(ask) + 1)]
+        trees = {number: cKDTree(points) for number, points in enumerate(own[:-1]) if len(points)}
+        for number in ask:
             self._looked[number] += 1
             some = own[number][:: -(-len(own[number]) // _POINTS)]
             for earlier in range(number):

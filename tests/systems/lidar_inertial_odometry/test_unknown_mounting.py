@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.iterated_update import Information, iterated_update
+from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.filtering.nav_state import PL, RL, TANGENT, G, NavState, P, R
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
@@ -16,8 +17,10 @@ from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, mo
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.mounted_update import less_sure
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+    MOUNTING,
     HeldMounting,
     UnknownMounting,
     first_sensitivity,
@@ -197,3 +200,17 @@ def test_a_lever_arm_that_nobody_knows_is_found_or_its_covariance_says_so(seed: 
     covariance = last.covariance[21:, 21:]
     assert np.sqrt(np.diag(covariance)).max() < 0.02, "the motion shows it"
     assert off @ np.linalg.solve(covariance, off) < 16.3, "99.9 % of three degrees of freedom"
+
+
+@given(st.integers(0, 10_000))
+def test_what_a_scan_says_of_the_mounting_counts_less_than_as_much_as_its_points_promise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    before = _random_covariance(random)[MOUNTING, MOUNTING]
+    H = random.normal(size=(4, 6))
+    after = np.linalg.inv(np.linalg.inv(before) + H.T @ H)
+    kept = less_sure(before, after)
+    scale = np.sqrt(np.outer(before.diagonal(), before.diagonal()))
+    for larger, smaller in ((before, kept), (kept, after)):
+        assert np.linalg.eigvalsh((larger - smaller) / scale)[0] > -1e-9
+    gained = [np.linalg.inv(cov) - np.linalg.inv(before) for cov in (kept, after)]
+    np.testing.assert_allclose(SHARED_ERRORS * gained[0], gained[1], rtol=1e-5, atol=1e-6 * np.abs(gained[1]).max())

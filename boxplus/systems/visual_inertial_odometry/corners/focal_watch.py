@@ -46,7 +46,8 @@ class FocalWatch:
     def __init__(self, rig: Rig, pixel_sigma: float) -> None:
         T = [camera.T_imu_camera for camera in rig.cameras]
         self._to_others = [np.linalg.inv(t) @ T[0] for t in T[1:]]
-        self._sigmas = [pixel_sigma / camera.model.fx for camera in rig.cameras[1:]]
+        own = rig.cameras[0].model.fx
+        self._sigmas = [pixel_sigma * math.hypot(1.0 / own, 1.0 / camera.model.fx) for camera in rig.cameras[1:]]
         self._H = np.zeros((len(self._to_others), 4, 4))  # of ε and θ
         self._b = np.zeros((len(self._to_others), 4))
         self._count = np.zeros(len(self._to_others))
@@ -64,6 +65,8 @@ class FocalWatch:
             if self._count[k] >= _FEWEST:
                 P = np.linalg.inv(self._H[k] + np.diag([1.0, *[_TURN_SIGMA**-2] * 3]))
                 self.longer[k], self.sigma[k] = P[0] @ self._b[k], math.sqrt(P[0, 0])
+            else:
+                self.longer[k], self.sigma[k] = 0.0, np.inf
 
     @property
     def contradiction(self) -> str | None:
