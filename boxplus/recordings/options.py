@@ -137,20 +137,25 @@ class RecordingOptions(Settings):
 
     @model_validator(mode="after")
     def _some_range_is_left(self) -> RecordingOptions:
-        for name, one in [("", self), *((f" of {other.topic}", self.alone(other)) for other in self.other_lidars or ())]:
-            if one.min_range >= one.max_range:
+        for name, one in [("", None), *((f" of {other.topic}", other) for other in self.other_lidars or ())]:
+            low, high = self._range_of(one)
+            if low >= high:
                 raise InputError(
                     f"min_range (--min-range) below max_range (--max-range){name}",
-                    f"{one.min_range:g} and {one.max_range:g} m, between which no point lies",
+                    f"{low:g} and {high:g} m, between which no point lies",
                     "lower the first or raise the second",
                 )
         return self
 
+    def _range_of(self, other: OtherLidar | None) -> tuple[float, float]:
+        """The least and the greatest range of points that are taken, of the first LiDAR where no other is given [m]."""
+        low, high = (None, None) if other is None else (other.min_range, other.max_range)
+        return self.min_range if low is None else low, self.max_range if high is None else high
+
     def alone(self, other: OtherLidar) -> RecordingOptions:
         """How one of the other LiDARs would be read as the only one, by its own clock."""
         own = other.model_dump(include={"point_time_field", "point_time_unit", "point_time_reference"})
-        ranges = {"min_range": other.min_range, "max_range": other.max_range}
-        own |= {name: value for name, value in ranges.items() if value is not None}
+        own["min_range"], own["max_range"] = self._range_of(other)
         return self.model_copy(update={**own, "lidar_topic": other.topic, "other_lidars": None, "lidar_time_offset_s": 0.0})
 
 
