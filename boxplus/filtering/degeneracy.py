@@ -52,6 +52,11 @@ class PoseDirections:
     weak: NDArray[np.bool_]
     basis: NDArray[np.float64]
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(6,) bool, neither weak nor, where the threshold is below 1, of a ratio that noise alone would have."""
+        return ~self.weak & (self.ratios > 1.0)
+
     def weakened(self, weight: float = 0.0) -> NDArray[np.float64]:
         """(6, 6) what is left of a small motion [θ, p] with its share along the weak directions times `weight`.
 
@@ -151,14 +156,14 @@ def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> Pos
 
 
 def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
-    """The Gauss-Newton step (6,) of the pose alone, without the weak directions; zero if all are weak."""
+    """The Gauss-Newton step (6,) of the pose alone, along the measured directions; zero if there are none."""
     step: NDArray[np.float64] = -strong_covariance(A, directions) @ b[:6]
     return step
 
 
 def strong_covariance(A: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
-    """(6, 6) covariance of the pose from A alone, zero along the weak directions."""
-    strong = directions.basis[:, ~directions.weak]
+    """(6, 6) covariance of the pose from A alone, zero along the directions that are not measured."""
+    strong = directions.basis[:, directions.measured]
     reduced = strong.T @ A[:6, :6] @ strong
     covariance: NDArray[np.float64] = strong @ np.linalg.solve(reduced, strong.T)
     return covariance

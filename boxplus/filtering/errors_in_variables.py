@@ -43,7 +43,7 @@ def without_noise(
     cov_prior: NDArray[np.float64],
     used: int,
     since_match: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """A and b without what noise of the normals claims about the pose.
 
     Args:
@@ -55,14 +55,13 @@ def without_noise(
             of the true normals says something of the world.
 
     Returns:
-        (12, 12), (12,) to be used like A and b; zero where the points measure nothing.
+        (12, 12), (12,) to be used like A and b, zero where the points measure nothing; None where a covariance is none.
     """
     A_left, b_left = np.zeros((_DOF, _DOF)), np.zeros(_DOF)
-    weak = directions.weak | ~(directions.ratios > 1.0)
-    if not _take_off(
-        A, b, directions.basis, directions.ratios, weak, cov_prior, _POINTS_A_NORMAL / max(used, 1), since_match, A_left, b_left
-    ):
-        A_left[:], b_left[:] = 0.0, 0.0
+    per_normal = _POINTS_A_NORMAL / max(used, 1)
+    V, ratios, weak = directions.basis, directions.ratios, ~directions.measured
+    if not _take_off(A, b, V, ratios, weak, cov_prior, per_normal, since_match, A_left, b_left):
+        return None
     return A_left, b_left
 
 

@@ -105,7 +105,7 @@ def iterated_update(
             x_match = x.copy()
         boxminus_into(x, x_match, since_match)
         information = measurement.at(x, rematch=rematch)
-        A, b = without_noise(
+        left = without_noise(
             information.A,
             information.b,
             information.directions,
@@ -113,8 +113,9 @@ def iterated_update(
             used=information.used,
             since_match=since_match[:6],
         )
-        if information.used < min_used or not map_step(x, x_prior, cov_prior, A, b, delta, cov):
-            return Posterior(x_prior.copy(), cov_prior.copy(), False, np.zeros_like(A), information, steps, converged)
+        if information.used < min_used or left is None or not map_step(x, x_prior, cov_prior, *left, delta, cov):
+            nothing = np.zeros_like(information.A)
+            return Posterior(x_prior.copy(), cov_prior.copy(), False, nothing, information, steps, converged)
         boxplus_into(x, delta, x)
         steps += 1
         converged = bool(np.abs(delta).max() < _CONVERGED)
@@ -124,4 +125,4 @@ def iterated_update(
         rematch = converged or (steps == max_iterations and not converged_before)
         converged_before |= converged
     move_covariance(cov, delta)
-    return Posterior(x, cov, True, A, information, steps, converged)
+    return Posterior(x, cov, True, left[0], information, steps, converged)

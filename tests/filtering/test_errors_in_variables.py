@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.filtering.degeneracy import PoseDirections, pose_directions, strong_step, with_weak_axis
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions, strong_covariance, strong_step, with_weak_axis
 from boxplus.filtering.errors_in_variables import without_noise
 from boxplus.filtering.iterated_update import Information, iterated_update
 from boxplus.filtering.nav_state import TANGENT, NavState, P
@@ -29,7 +29,9 @@ def _taken(
     A: np.ndarray, b: np.ndarray, directions: PoseDirections, cov_prior: np.ndarray = KNOWN, used: int = MANY
 ) -> tuple[np.ndarray, np.ndarray]:
     """What is taken in of planes that were found at this pose."""
-    return without_noise(A, b, directions, cov_prior=cov_prior, used=used, since_match=np.zeros(6))
+    left = without_noise(A, b, directions, cov_prior=cov_prior, used=used, since_match=np.zeros(6))
+    assert left is not None
+    return left
 
 
 def test_no_information_is_weak_everywhere() -> None:
@@ -41,12 +43,35 @@ def test_no_information_is_weak_everywhere() -> None:
     assert not strong_step(np.eye(12), np.ones(12), directions).any()
 
 
+def test_a_covariance_that_is_none_makes_no_update() -> None:
+    directions = pose_directions(4.0 * np.eye(6), np.eye(6), 1.0, 0.0)
+    for axis in np.eye(3)[:2]:
+        directions = with_weak_axis(directions, axis)
+    impossible = np.diag([1.0, 1.0, 1.0, 3.0, -1.0, 1.0])
+    assert without_noise(np.eye(12), np.ones(12), directions, cov_prior=impossible, used=100, since_match=np.zeros(6)) is None
+
+
+@given(seeds)
+def test_a_threshold_below_one_makes_no_use_of_what_noise_alone_gives(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    S, N = random_covariance(random, 6), 3.0 * random_covariance(random, 6)
+    directions = pose_directions(S, N, 1.0, 0.2)
+    A, b = np.eye(12), random.normal(size=12)
+    A[:6, :6] = S
+    left, _ = _taken(A, b, directions)
+    covariance = strong_covariance(left, directions)
+    assert np.isfinite(covariance).all()
+    assert np.linalg.matrix_rank(covariance, tol=1e-9 * max(np.abs(covariance).max(), 1.0)) <= np.count_nonzero(
+        directions.ratios > 1.0
+    )
+
+
 @given(seeds)
 def test_normals_without_noise_keep_all_they_say(seed: int) -> None:
     random = np.random.default_rng(seed)
     A, b = random_covariance(random, 12), random.normal(size=12)
-    directions = pose_directions(A[:6, :6], np.eye(6), 1.0, 0.0)
-    left, pulled = _taken(A, b, replace(directions, ratios=np.full(6, np.inf)))
+    directions = replace(pose_directions(A[:6, :6], np.eye(6), 1.0, 0.0), ratios=np.full(6, np.inf))
+    left, pulled = _taken(A, b, directions)
     np.testing.assert_allclose(left, A, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(pulled, b, rtol=1e-6, atol=1e-9)
     assert np.allclose(strong_step(A, b, directions), -np.linalg.solve(A[:6, :6], b[:6]), rtol=1e-6)

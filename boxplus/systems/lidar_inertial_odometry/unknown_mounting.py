@@ -147,7 +147,7 @@ def moved_sensitivity(
         B: before it; cov_prior, cov: (24, 24) before and after it, with the mounting known.
         information: what the scan says of pose and mounting.
     """
-    A, _ = without_noise(
+    left = without_noise(
         information.A,
         information.b,
         information.directions,
@@ -155,6 +155,9 @@ def moved_sensitivity(
         used=information.used,
         since_match=np.zeros(6),
     )
+    if left is None:
+        return B
+    A = left[0]
     moved: NDArray[np.float64] = B - cov[_REST, _POSE] @ (A[:6, :6] @ B[_POSE] + A[:6, 6:])
     return moved
 
