@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.recordings.recording import Event, Recording
+from boxplus.runs.lidar_inertial.rehearsal import rehearse
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
@@ -27,6 +28,9 @@ _CHECK = 6.0, 20.0
 _WIDE_DEG, _WIDE_M = 10.0, 0.3
 _LEVER_EXPLAINED = 0.8
 _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
+_LEAST_DEG = 0.3  # what the scans' own errors leave of the rotation
+_NOBODY_SAYS = "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted"
+_REMEDY = "give --T-imu-lidar for the best result"
 _UNIT_ADVICE = "give --gyro-unit"
 _UNKNOWN = (
     "nobody gave T_imu_lidar, and the motion did not show it: {assumed}, and the path and its covariance are wrong by as much as "
@@ -81,7 +85,7 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
     Either way gyroscope, accelerometer and LiDAR are compared over the first seconds of rotation (`compare_sensors`): without a
     given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations; with one,
     what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
-    deviation.
+    deviation. An estimate is then refined by a first run over the beginning (`rehearsal`).
 
     Raises:
         RecordingError: nothing at all could be read.
@@ -102,7 +106,7 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
                     f"angular velocities in {recording.info.gyro_unit}, as they are read", finding.text, _UNIT_ADVICE
                 )
         text = "; ".join(finding.text for finding in found)
-        chosen = _estimated(agreement) if known is None else known
+        chosen = _rehearsed(recording, config, _estimated(agreement)) if known is None else known
         return replace(chosen, warning="; ".join(filter(None, [text, chosen.warning])), contradiction=text)
     return known if known is not None else _estimated(None)
 
@@ -118,8 +122,6 @@ def _known_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic | Non
 
 def _estimated(agreement: Agreement | None) -> Extrinsic:
     """As far as the comparison determined it."""
-    unknown = "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted"
-    remedy = "give --T-imu-lidar for the best result"
     T, wide = np.eye(4), (_WIDE_DEG, _WIDE_M)
     rotation = None if agreement is None else agreement.rotation
     if agreement is None or rotation is None or not judges_rotation(agreement):
@@ -127,35 +129,59 @@ def _estimated(agreement: Agreement | None) -> Extrinsic:
         return Extrinsic(
             T,
             "identity",
-            f"identity assumed: {unknown}; {why}",
+            f"identity assumed: {_NOBODY_SAYS}; {why}",
             True,
-            f"{unknown}: identity assumed; {why}; {remedy}",
+            f"{_NOBODY_SAYS}: identity assumed; {why}; {_REMEDY}",
             wide,
             unknown=_UNKNOWN.format(assumed="the identity was assumed"),
         )
     T[:3, :3] = rotation.R_imu_lidar
     std_deg = np.degrees(rotation.rotation_std[0])
-    angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     translation = agreement.translation
     std_m = np.full(3, _WIDE_M)
     if translation is not None and translation.explained > _LEVER_EXPLAINED:
         T[:3, 3] = translation.p_imu_lidar
         # Neighbouring poses of the path share their errors, which the covariance does not know.
         std_m = np.minimum(_LEVER_CAUTION * np.sqrt(np.diag(translation.covariance)[ARM]) + _LEVER_FLOOR_M, _WIDE_M)
+    open_axes = std_deg[-1] > _WIDE_DEG
+    return _guessed(T, f"estimated over {rotation.intervals} scan pairs", std_deg, std_m, open_axes=open_axes)
+
+
+def _guessed(
+    T: NDArray[np.float64], how: str, std_deg: NDArray[np.float64], std_m: NDArray[np.float64], *, open_axes: bool
+) -> Extrinsic:
+    """An estimate, to be refined while running.
+
+    Args:
+        T: (4, 4) T_imu_lidar.
+        how: it was found.
+        std_deg, std_m: (3,) each, of rotation (ascending) and translation.
+        open_axes: whether the motion has not turned about enough axes to show the rotation.
+    """
+    angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     numbers = ", ".join(f"{value:.3f}" for value in T[:3, 3])
     text = (
-        f"estimated over {rotation.intervals} scan pairs: {angle:.1f} deg from identity (std "
-        f"{', '.join(f'{value:.1f}' for value in std_deg)} deg about its principal axes), translation ({numbers}) m (std "
-        f"{', '.join(f'{value:.2f}' for value in std_m)} m)"
+        f"{how}: {angle:.1f} deg from identity (std {', '.join(f'{value:.1f}' for value in std_deg)} deg about its principal axes), "
+        f"translation ({numbers}) m (std {', '.join(f'{value:.2f}' for value in std_m)} m)"
     )
-    open_axes = ""
-    if std_deg[-1] > _WIDE_DEG:
+    if open_axes:
         text += "; the motion turns about too few axes to determine the rest"
-        open_axes = _UNKNOWN.format(assumed="it was estimated about some axes only")
-    sigma = (float(np.clip(std_deg[-1], 0.3, _WIDE_DEG)), float(std_m.max()))
-    return Extrinsic(
-        T, "estimated", text, True, f"{unknown}: it was {text}, and is refined while running; {remedy}", sigma, unknown=open_axes
-    )
+    sigma = (float(np.clip(std_deg[-1], _LEAST_DEG, _WIDE_DEG)), float(std_m.max()))
+    unknown = _UNKNOWN.format(assumed="it was estimated about some axes only") if open_axes else ""
+    warning = f"{_NOBODY_SAYS}: it was {text}, and is refined while running; {_REMEDY}"
+    return Extrinsic(T, "estimated", text, True, warning, sigma, unknown=unknown)
+
+
+def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic) -> Extrinsic:
+    """An estimate as a first run over the beginning of the recording refines it, where it can."""
+    begun_with = found.applied_to(config)
+    if found.source != "estimated" or found.unknown or found.sigma is None or begun_with.extrinsic_estimation == "off":
+        return found
+    rehearsal = rehearse(recording, begun_with)
+    if rehearsal is None or rehearsal.std_m.max() > found.sigma[1]:
+        return found
+    how = f"{found.text.partition(':')[0]} and in a first run over {rehearsal.seconds:.0f} s"
+    return _guessed(rehearsal.T_imu_lidar, how, rehearsal.std_deg, rehearsal.std_m, open_axes=False)
 
 
 def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) -> tuple[list[Scan], ImuSamples] | None:
