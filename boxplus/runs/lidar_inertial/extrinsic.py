@@ -159,11 +159,9 @@ def _guessed(
         open_axes: whether the motion has not turned about enough axes to show the rotation.
     """
     angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-    numbers = ", ".join(f"{value:.3f}" for value in T[:3, 3])
-    text = (
-        f"{how}: {angle:.1f} deg from identity (std {', '.join(f'{value:.1f}' for value in std_deg)} deg about its principal axes), "
-        f"translation ({numbers}) m (std {', '.join(f'{value:.2f}' for value in std_m)} m)"
-    )
+    p, s_p = ", ".join(f"{value:.3f}" for value in T[:3, 3]), ", ".join(f"{value:.2f}" for value in std_m)
+    s_R = ", ".join(f"{value:.1f}" for value in std_deg)
+    text = f"{how}: {angle:.1f} deg from identity (std {s_R} deg about its principal axes), translation ({p}) m (std {s_p} m)"
     if open_axes:
         text += "; the motion turns about too few axes to determine the rest"
     sigma = (float(np.clip(std_deg[-1], _LEAST_DEG, _WIDE_DEG)), float(std_m.max()))
