@@ -96,7 +96,7 @@ class Association:
             silent = "" if found.shows else f"none shows, and none up to {found.least_s:.3g} s would; "
             lines.append(
                 f"clock offset: {silent}the motions fit best with {found} added to the estimate's stamps, correlation "
-                f"{found.correlation:.3f}{applied}"
+                f"{found.correlation:.3f}{applied}{found.repetition}"
             )
         return lines
 

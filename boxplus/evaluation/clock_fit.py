@@ -22,12 +22,13 @@ Signal = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Vectors (n, 3) of a motion at times (n,) [s]."""
 
 _STRETCHES, _LEAST_SAMPLES = 10, 12  # at most, and samples in each
+LEAST_STRETCHES = 3
 _MOST_SAMPLES = 2000
 _SLOPE_S = 0.1  # shortest time over which a velocity is taken
 _TURN_S = 0.5  # over which rotations are compared
 _GAP_S, _GAP_STEPS = 0.25, 5.0  # and that of median steps: what is farther apart is not interpolated
 _STEPS, _SETTLED_S = 10, 1e-5
-_SCAN_S = 0.05
+_CLEARLY, _WORSE = 4.0, 1.1  # standard deviations and times by which an offset has to fit worse to be dropped
 _ROUNDING = 1e-9  # of the squared slopes, that an alignment leaves of those it explains
 
 
@@ -86,15 +87,22 @@ class MotionPair:
         whole = _Stretch.of(x, y, np.zeros_like(x), np.zeros_like(x))
         return whole.left < (1.0 - least**2) * whole.size
 
-    def scan(self, name: str, largest_s: float) -> float:
-        """The offset within ± `largest_s` whose motions fit best, on a grid [s]; 0 where there is nothing to compare."""
-        best, found = math.inf, 0.0
-        for offset_s in sorted(np.arange(-largest_s, largest_s + 0.5 * _SCAN_S, _SCAN_S), key=abs):
-            stretches = self._stretches(name, float(offset_s), widest_s=largest_s)
-            left = sum(one.left for one in stretches) / max(sum(one.size for one in stretches), 1e-300)
-            if stretches and left < best:
-                best, found = left, float(offset_s)
-        return found
+    def misfits(self, offsets_s: list[float]) -> list[NDArray[np.float64]]:
+        """What every offset leaves, (offsets, k) squares over k stretches of the path, the same samples for all.
+
+        Of the places as a whole, with one alignment, then of either signal, with an alignment for every stretch.
+        """
+        own, true, _ = self.signals["translation"]
+        widest_s = max(map(abs, offsets_s))
+        t = self._t[self._covered[0](self._t, 0.0) & self._covered[1](self._t, widest_s)]
+        parts = []
+        if len(t) >= _STRETCHES * _LEAST_SAMPLES:
+            off = [(_aligned_error(own(t), true(t + offset_s)) ** 2).sum(axis=1) for offset_s in offsets_s]
+            parts.append(np.array([[part.sum() for part in np.array_split(one, _STRETCHES)] for one in off]))
+        for name in self.signals:
+            stretches = [self._stretches(name, offset_s, widest_s=widest_s) for offset_s in offsets_s]
+            parts.append(np.array([[part.left for part in one] for one in stretches]).reshape(len(offsets_s), -1))
+        return parts
 
     def fit(self, name: str, offset_s: float, largest_s: float) -> ClockFit | None:
         """The offset near `offset_s`, at most `largest_s` from it; None where the motions do not tell one."""
@@ -102,7 +110,7 @@ class MotionPair:
         for _ in range(_STEPS):
             stretches = self._stretches(name, at)
             told = sum(one.told for one in stretches)
-            if len(stretches) < 3 or not told > _ROUNDING * sum(one.moved for one in stretches):
+            if len(stretches) < LEAST_STRETCHES or not told > _ROUNDING * sum(one.moved for one in stretches):
                 return None
             step = sum(one.pull for one in stretches) / told
             at += float(step)
@@ -110,7 +118,7 @@ class MotionPair:
                 return None
             if abs(step) < _SETTLED_S:
                 break
-        deviation = _jackknife(stretches)
+        deviation = jackknife(np.array([one.pull for one in stretches]), np.array([one.told for one in stretches]))
         if not math.isfinite(deviation) or abs(step) > 0.1 * deviation:
             return None
         left, size = sum(one.left for one in stretches), sum(one.size for one in stretches)
@@ -123,7 +131,7 @@ class MotionPair:
         reach = around + widest_s
         t = t[self._covered[0](t, around) & self._covered[1](t + (0.0 if widest_s else offset_s), reach)]
         count = min(_STRETCHES, len(t) // _LEAST_SAMPLES)
-        if count < 3:
+        if count < LEAST_STRETCHES:
             return []
         x, y = own(t), true(t + offset_s)
         half = 0.5 * self._slope_s
@@ -147,12 +155,9 @@ class _Stretch:
     @classmethod
     def of(cls, x: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> _Stretch:
         """From vectors x of the estimate and y of the ground truth and their slopes u and v, all (n, 3)."""
-        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
-        U, d, Vt = np.linalg.svd(y.T @ x)
-        sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
-        R = (U * sign) @ Vt
-        scale = float(d @ sign) / max(float((x * x).sum()), 1e-300)
-        x, u = scale * x @ R.T, scale * u @ R.T
+        y = y - y.mean(axis=0)
+        scale, R = _similarity(x, y)
+        x, u = scale * (x - x.mean(axis=0)) @ R.T, scale * u @ R.T
         e = x - y
         # What place, turn and scale of the stretch explain as well as an offset does is no evidence of it.
         free = np.stack([*(np.cross(axis, x) for axis in np.eye(3)), x]).reshape(4, -1).T
@@ -172,11 +177,40 @@ class _Stretch:
         )
 
 
-def _jackknife(stretches: list[_Stretch]) -> float:
-    """Standard deviation of the offset: how it scatters when each stretch is left out in turn; infinite where one alone tells."""
-    pull, told = np.array([one.pull for one in stretches]), np.array([one.told for one in stretches])
+def _similarity(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Scale and rotation (3, 3) that bring x (n, 3) nearest to y (n, 3), each about its mean (Umeyama 1991)."""
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    U, d, Vt = np.linalg.svd(y.T @ x)
+    sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
+    return float(d @ sign) / max(float((x * x).sum()), 1e-300), (U * sign) @ Vt
+
+
+def _aligned_error(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) what is left between them after that."""
+    scale, R = _similarity(x, y)
+    return np.asarray(scale * (x - x.mean(axis=0)) @ R.T - (y - y.mean(axis=0)))
+
+
+def as_good(parts: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Which of several offsets, that leave `parts` (offsets, k) over k stretches, none fits clearly better than.
+
+    Every stretch gives a difference to the best one, and how these scatter says how clear their mean is.
+    """
+    best = parts[np.argmin(parts.sum(axis=1))]
+    more = parts - best
+    deviation = more.std(axis=1, ddof=1) / math.sqrt(parts.shape[1])
+    is_worse = (parts.sum(axis=1) > _WORSE * best.sum()) & (more.mean(axis=1) > _CLEARLY * deviation)
+    return np.flatnonzero(~is_worse)
+
+
+def jackknife(pull: NDArray[np.float64], told: NDArray[np.float64]) -> float:
+    """Standard deviation of Σ pull / Σ told, as it scatters when each stretch is left out; infinite where one alone tells.
+
+    Args:
+        pull, told: (k,) the two sums of the regression in every stretch.
+    """
     without = told.sum() - told
-    if not (without > 0.0).all():
+    if len(told) < 2 or not (without > 0.0).all():
         return math.inf
     offsets = (pull.sum() - pull) / without
     return float(np.sqrt((len(offsets) - 1) / len(offsets) * ((offsets - offsets.mean()) ** 2).sum()))
@@ -208,7 +242,8 @@ def _turns(t: NDArray[np.float64], trajectory: Trajectory, over_s: float) -> Sig
 
     def orientation(at: NDArray[np.float64]) -> NDArray[np.float64]:
         before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-        share = (at - t[before]) / (t[before + 1] - t[before])
+        gap = t[before + 1] - t[before]  # none where a stamp is there twice
+        share = (at - t[before]) / np.where(gap > 0.0, gap, 1.0)
         return np.asarray(R[before] @ so3.exp(share[:, None] * steps[before]))
 
     return lambda at: so3.log(orientation(at - 0.5 * over_s).transpose(0, 2, 1) @ orientation(at + 0.5 * over_s))

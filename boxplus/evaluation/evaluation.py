@@ -340,7 +340,8 @@ def _is_told(found: TimeOffset, estimate: Trajectory, ground_truth: Trajectory) 
 
 def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:
     """An offset is advised only where the errors do get smaller with it."""
-    motions = f"the motions fit best with {found} added to the estimate's stamps (correlation {found.correlation:.3f})"
+    known = f"correlation {found.correlation:.3f}{found.repetition}"
+    motions = f"the motions fit best with {found} added to the estimate's stamps ({known})"
     if rmse_with is None:
         return f"{motions}, but the poses cannot be compared with that: no offset is advised"
     if rmse_with < _BETTER * rmse:

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from boxplus.errors import InputError
 from boxplus.evaluation.association import associate
+from boxplus.evaluation.clock_fit import MotionPair
 from boxplus.formats.trajectory import Trajectory
-from tests.evaluation.smooth_paths import SmoothPath
+from tests.evaluation.smooth_paths import SmoothPath, disturbed
 
 stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=40, unique=True).map(sorted)
 
@@ -199,3 +200,70 @@ def test_settings_are_checked() -> None:
     for wrong in ({"max_difference_s": 0.0}, {"max_difference_s": np.nan}, {"offset_s": np.inf}, {"min_matches": 0}):
         with pytest.raises(InputError, match="positive max_difference_s"):
             associate(path, path, **wrong)
+
+
+def _walked_in_circles(late_s: float, seed: int) -> tuple[Trajectory, Trajectory]:
+    """A person who walks a circle of 4 m and rolls with every second step of 0.53 s, and an estimate whose stamps are late."""
+    rng = np.random.default_rng(seed)
+
+    def walked(t: np.ndarray) -> Trajectory:
+        p = np.column_stack([4.0 * np.cos(0.5 * t), 4.0 * np.sin(0.5 * t), 0.03 * np.sin(2.0 * np.pi * t / 0.53)])
+        R = Rotation.from_euler("ZX", np.column_stack([0.5 * t, 0.02 * np.sin(np.pi * t / 0.53)]))
+        return Trajectory(np.round(1e9 * t).astype(np.int64), p, R.as_quat()[:, [3, 0, 1, 2]])
+
+    exact = walked(np.arange(2.0, 58.0, 0.1))
+    p = exact.p + 0.03 * rng.standard_normal(exact.p.shape)
+    return Trajectory(exact.times + round(late_s * 1e9), p, exact.q_wxyz), walked(np.arange(0.0, 60.0, 0.02))
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.7])
+def test_of_motion_that_repeats_itself_all_offsets_are_told(late_s: float) -> None:
+    for seed in range(3):
+        seen = associate(*_walked_in_circles(late_s, seed))
+        found = seen.time_offset
+        told = np.array([found.offset_s, *found.others_s])
+        assert np.abs(told + late_s).min() < 0.01
+        assert abs(found.offset_s) == np.abs(told).min()
+        assert "; as the motion repeats itself, " in seen.lines()[-1]
+
+
+def test_laps_that_differ_tell_a_lap_from_the_next() -> None:
+    """Another lap correlates nearly as well, and within the nearer range; the places tell them apart."""
+    t = np.arange(0.0, 60.0, 0.02)
+    lap = 2.0 * np.pi * t / 3.6
+    p = np.column_stack([2.0 * np.cos(lap), np.sin(lap), 0.1 * t])
+    R = Rotation.from_rotvec(np.column_stack([0.0 * t, 0.3 * np.sin(lap), lap]))
+    truth = Trajectory(
+        np.round(1e9 * t).astype(np.int64), p + 0.2 * np.sin(np.outer(t, [0.7, 0.4, 0.3])), R.as_quat()[:, [3, 0, 1, 2]]
+    )
+    rows = np.arange(500, 2500, 5)
+    for late_s in (2.6, -2.6):
+        estimate = Trajectory(truth.times[rows] + round(1e9 * late_s), truth.p[rows], truth.q_wxyz[rows])
+        found = associate(disturbed(estimate, 1, sigma_m=0.01, sigma_rad=0.002), truth).time_offset
+        assert found.offset_s == pytest.approx(-late_s, abs=0.01) and not found.others_s
+
+
+def test_an_offset_that_is_not_refined_has_a_deviation_that_holds() -> None:
+    """Too few poses for stretches, and errors that swing as slowly as the motion."""
+    ratios = []
+    for seed in range(40):
+        estimate, truth = wandering(seed, 0.5, 0.3, 0.001)
+        rng = np.random.default_rng(seed)
+        swing = np.sin(0.1 * np.arange(len(estimate))[:, None] * rng.uniform(0.8, 1.6, 3) + rng.uniform(0.0, 6.0, 3))
+        rows = np.arange(200, 312, 4)
+        p, level = estimate.p[rows] + 0.1 * swing[rows], np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))
+        found = associate(Trajectory(estimate.times[rows], p, level), truth).time_offset
+        if found is not None:
+            ratios.append((found.offset_s + 0.3) / found.deviation_s)
+    assert len(ratios) > 10
+    assert np.quantile(np.abs(ratios), 0.9) < 3.0  # 4.7 of what white noise would leave
+
+
+def test_stamps_that_are_there_twice_are_no_division_by_zero() -> None:
+    truth = SmoothPath(3).sample(np.arange(0.0, 20.0, 0.1))
+    twice = truth.times.copy()
+    twice[-1] = twice[-2]
+    pair = MotionPair(twice, truth, truth.times, truth)
+    end = 1e-9 * (twice[-1] - twice[0])
+    with np.errstate(all="raise", under="ignore"):
+        assert np.isfinite(pair.signals["rotation"][0](np.array([end - 0.25]))).all()
