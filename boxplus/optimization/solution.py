@@ -32,6 +32,7 @@ class Iteration:
         parameter: λ, radius or step length of the method when the step was chosen.
         accepted: whether the step was taken.
         time_s: since `solve` began.
+        purpose: what a solve that examines a result is for; empty of the steps that lead to it.
     """
 
     number: int
@@ -42,6 +43,7 @@ class Iteration:
     parameter: float
     accepted: bool
     time_s: float
+    purpose: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def ba(
         from boxplus.report.optimization.bundle_scene import camera_centers
         from boxplus.runs.storage.output_folder import output_folder
         from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
-        from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+        from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig, LineAdjustmentConfig
 
     started, terminal = datetime.now(UTC), OptimizationTerminal(quiet=quiet, as_json=as_json)
     robust = parse_loss(loss)
@@ -116,8 +116,6 @@ def ba(
             raise InputError("--view with cameras and points", "a line set", "leave it out; scene.ply shows the result")
         if refine_intrinsics or refine_principal_point:
             raise InputError("--refine-intrinsics with points", "a line set", "the intrinsics of line sets are held")
-        from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig
-
         line_config = LineAdjustmentConfig(use_points=points, triangulate=triangulate)
         if sigma is not None:
             line_config = line_config.model_copy(update={"sigma_px": sigma, "sigma_point_px": sigma})

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
-    from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentConfig, LineAdjustmentResult
+    from boxplus.systems.bundle_adjustment.config import LineAdjustmentConfig
+    from boxplus.systems.bundle_adjustment.line_adjustment import LineAdjustmentResult
 
 _ADJUSTED = "adjusted"
 

@@ -188,13 +188,17 @@ class OptimizationTerminal(Terminal):
                 compiling = True
                 self.console.print("compiling kernels (first use only) …")
 
+        purpose = ""
         head: list[str] | None = ["step", "cost", "change", "gradient", "largest δ", parameter, "time [s]"]
 
         def show(iteration: Iteration) -> bool:
-            nonlocal head
+            nonlocal head, purpose
             if head is not None:
                 self._row(head, "bold")
                 head = None
+            if iteration.purpose != purpose:
+                purpose, self._last = iteration.purpose, None
+                self.console.print(Text(f"examining the result: {purpose}" if purpose else "adjusting again", "bold"))
             change = "" if self._last is None else f"{iteration.cost - self._last:.2e}"
             style = ""
             if not iteration.accepted:

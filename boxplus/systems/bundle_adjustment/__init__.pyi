@@ -2,8 +2,8 @@ from .bundle_adjustment import BundleAdjustmentResult as BundleAdjustmentResult
 from .bundle_adjustment import adjust_bundle as adjust_bundle
 from .cheirality import Cheirality as Cheirality
 from .config import BundleAdjustmentConfig as BundleAdjustmentConfig
+from .config import LineAdjustmentConfig as LineAdjustmentConfig
 from .depth import DepthUncertainty as DepthUncertainty
-from .line_adjustment import LineAdjustmentConfig as LineAdjustmentConfig
 from .line_adjustment import LineAdjustmentResult as LineAdjustmentResult
 from .line_adjustment import adjust_lines as adjust_lines
 from .line_triangulation import LineTriangulation as LineTriangulation

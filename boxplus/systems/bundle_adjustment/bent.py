@@ -15,7 +15,7 @@ from boxplus.optimization.losses import Huber
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-from boxplus.systems.bundle_adjustment.examination import examination_options
+from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, pixel_errors
 
 _HUBER = 1.345  # of the typical error: 95 % of the efficiency of least squares
@@ -30,6 +30,7 @@ def bent_doubt(
     config: BundleAdjustmentConfig,
     errors: NDArray[np.float64],
     solved: Solution,
+    watch: Watch,
 ) -> str | None:
     """A sentence where the typical error falls as soon as gross errors pull less; to be asked where there are such.
 
@@ -45,12 +46,14 @@ def bent_doubt(
     loss = Huber(_HUBER * before / _RAYLEIGH / config.sigma_px)
     cameras, points = add_reconstruction(problem, adjusted, used, config, loss)
     problem.fix(points[dropped])
-    options = examination_options(problem, len(cameras), solved, config)
+    options = examination_options(problem, len(cameras), solved, config, watch)
     if options is None:
         return None
     try:
-        solution = problem.solve(options)
+        solution = problem.solve(options, callback=watch.of("bent by wrong matches?"))
     except BoxplusError:
+        return None
+    if watch.is_stopped:
         return None
     after = float(np.nanmedian(pixel_errors(problem, list(solution.values))))
     if not after < _BENT * before:

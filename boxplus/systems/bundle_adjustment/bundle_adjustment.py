@@ -23,6 +23,7 @@ from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
+from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.lens import lens_finding
 from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
 from boxplus.systems.bundle_adjustment.plausibility import (
@@ -36,10 +37,12 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_notes,
     structure_notes,
 )
+from boxplus.systems.bundle_adjustment.readings import reading_doubt
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     add_reconstruction,
     adjusted_reconstruction,
     pixel_errors,
+    refuse_focal_lengths,
     start_values,
 )
 from boxplus.systems.bundle_adjustment.strays import stray_notes, stray_points
@@ -100,6 +103,9 @@ def adjust_bundle(
 
     A redescending loss starts from the minimum under Huber's (`solve_from_convex`): it does not see what is far off.
 
+    The callback sees the steps that lead to the result, then those of the solves that examine it, with their `purpose`; where it
+    stops one of these, the result stays and a note says what was not examined.
+
     Nothing is held: Levenberg-Marquardt stays near the start along the seven directions that move the whole scene.
 
     Raises:
@@ -126,6 +132,8 @@ def adjust_bundle(
             f"not a single observation of a point ({getattr(reconstruction, 'source', 'reconstruction')})",
             "triangulate first",
         )
+    refuse_focal_lengths(reconstruction)
+    other_axes = reading_doubt(reconstruction)
     problem = Problem()
     sound = make_sound(reconstruction)
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
@@ -138,19 +146,22 @@ def adjust_bundle(
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
     )
     _refuse_turned_lenses(reconstruction, solution.values[cameras.number])
+    watch = Watch(callback)
     strayed: list[NDArray[np.int64]] = []
     astray = np.zeros(0, dtype=np.int64)
     while True:
         errors = pixel_errors(problem, list(solution.values))
         adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
-        depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss)
+        depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss, watch)
         is_out = solution.reason.startswith("iteration limit")
         left = 0 if is_out else config.solver.max_iterations - solution.iterations
         if len(strayed) == _ROUNDS or (solution.status == "stopped" and not is_out):  # by somebody, who does not wait for more
             break
-        numbers, places = stray_points(adjusted, sound.used, depth.ratio, config, loss)
+        numbers, places = stray_points(adjusted, sound.used, depth.ratio, config, loss, watch)
         if left <= 0:
             astray = numbers
+            break
+        if watch.is_stopped:
             break
         values = [array.copy() for array in solution.values]
         values[points.number][numbers] = places
@@ -171,14 +182,15 @@ def adjust_bundle(
     notes += [*gross, *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
     notes += misfit_notes(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     seen = np.unique(point_of)
-    lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left)
+    lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left, watch)
     if lens is not None and not lens.is_grave:
         notes.append(lens.sentence)
-    origin = pixel_origin(reconstruction, config, loss, solution, left)
+    origin = pixel_origin(reconstruction, config, loss, errors, solution, left, watch)
     if origin.note is not None:
         notes.append(origin.note)
     said = [
-        bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution) if gross else None,
+        other_axes,
+        bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution, watch) if gross else None,
         sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
         coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),
         mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
@@ -193,7 +205,7 @@ def adjust_bundle(
         point_of=point_of,
         cheirality=cheirality,
         depth=depth,
-        notes=(*notes, *structure_notes(len(points), camera_of, point_of, solution)),
+        notes=(*notes, *watch.notes, *structure_notes(len(points), camera_of, point_of, solution)),
         doubt=_doubt(cheirality, depth, solution, left, [text for text in said if text]),
         solution=solution,
         cameras=cameras,

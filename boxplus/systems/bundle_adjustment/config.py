@@ -1,4 +1,4 @@
-"""Options of bundle adjustment."""
+"""Options of bundle adjustment, on points and on lines."""
 
 from __future__ import annotations
 
@@ -30,4 +30,23 @@ class BundleAdjustmentConfig(Settings):
     )
     solver: SolverOptions = Field(
         SolverOptions(cost_tolerance=_COST_TOLERANCE), description="see SolverOptions; stops once the cost settles to 8 digits"
+    )
+
+
+class LineAdjustmentConfig(Settings):
+    """Options of `adjust_lines`.
+
+    Example:
+        >>> from boxplus.systems.bundle_adjustment import LineAdjustmentConfig
+        >>> LineAdjustmentConfig(sigma_px=0.5, triangulate=True).use_points
+        True
+    """
+
+    sigma_px: float = Field(0.3, gt=0, description="[px] standard deviation of a segment's end across the segment")
+    sigma_point_px: float = Field(0.5, gt=0, description="[px] standard deviation of a point's pixel")
+    use_points: bool = Field(True, description="adjust the points with the lines, where there are any")
+    triangulate: bool = Field(False, description="take only cameras and segments from the input, and find the lines from them")
+    solver: SolverOptions = Field(
+        SolverOptions(max_iterations=1000, cost_tolerance=1e-9),
+        description="see SolverOptions; lines that are hardly determined creep on for many steps",
     )

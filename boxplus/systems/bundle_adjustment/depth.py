@@ -18,6 +18,7 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.parallax import parallax_ratio
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text
 
@@ -78,6 +79,7 @@ def depth_uncertainty(
     used: NDArray[np.bool_],
     config: BundleAdjustmentConfig,
     loss: Loss | None,
+    watch: Watch,
 ) -> DepthUncertainty:
     """From the residuals at the solution, their losses' weights included.
 
@@ -119,5 +121,5 @@ def depth_uncertainty(
     known = ratio[~np.isnan(ratio)]
     apart = True
     if len(known) and np.median(known) > _VAGUE:
-        apart = parallax_ratio(adjusted, used, config, loss, solution.cost) > TURNING
+        apart = parallax_ratio(adjusted, used, config, loss, solution.cost, watch) > TURNING
     return DepthUncertainty(ratio, apart)

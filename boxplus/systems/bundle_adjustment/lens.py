@@ -22,7 +22,7 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-from boxplus.systems.bundle_adjustment.examination import examination_options
+from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
@@ -55,6 +55,7 @@ def lens_finding(
     loss: Loss | None,
     solved: Solution,
     left: int,
+    watch: Watch,
 ) -> LensFinding | None:
     """Whether another lens than the one that was held explains the images clearly better.
 
@@ -77,7 +78,7 @@ def lens_finding(
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
     problem.fix(points[dropped])
-    options = examination_options(problem, len(cameras), solved, config)
+    options = examination_options(problem, len(cameras), solved, config, watch)
     if options is None:
         return None
     numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
@@ -86,14 +87,18 @@ def lens_finding(
     if is_out:  # more steps would lower the cost without another lens, too
         share = max(share, _MORE_STEPS)
 
+    shown = watch.of("another lens?")
+
     def is_settled(step: Iteration) -> bool:
+        if shown(step):
+            return True
         return step.number > 0 and step.accepted and not cost - step.cost > _HINT * share * step.cost
 
     try:
         solution = problem.solve(options, callback=is_settled)
     except BoxplusError:
         return None
-    if not cost - solution.cost > share * solution.cost:
+    if watch.is_stopped or not cost - solution.cost > share * solution.cost:
         return None
     none = np.zeros(0)
     other = adjusted_reconstruction(adjusted, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))

@@ -7,31 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from boxplus._arguments import as_settings
-from boxplus._settings import Settings
-from boxplus.cameras.pinhole import Pinhole
-from boxplus.errors import BoxplusError, InputError
+from boxplus.errors import InputError
 from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import lines as line_manifold
 from boxplus.manifolds import quaternion
-from boxplus.manifolds.euclidean import Euclidean
-from boxplus.manifolds.lines import Line3D
-from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
 from boxplus.residuals.camera.line_reprojection import LineReprojection
-from boxplus.residuals.camera.reprojection import Reprojection
-from boxplus.residuals.prior import Prior
+from boxplus.systems.bundle_adjustment.config import LineAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, TURNING
-from boxplus.systems.bundle_adjustment.line_parallax import in_one_place
-from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, triangulate_lines
-from boxplus.systems.bundle_adjustment.parallax import IN_ONE_PLACE, IN_PLACE, LEAST_NOISE
+from boxplus.systems.bundle_adjustment.examination import Watch
+from boxplus.systems.bundle_adjustment.line_parallax import line_parallax_ratio
+from boxplus.systems.bundle_adjustment.line_problem import add_line_set
+from boxplus.systems.bundle_adjustment.line_triangulation import LineTriangulation, have_direction, triangulate_lines
 
 Floats = NDArray[np.float64]
 
@@ -39,31 +32,13 @@ _BAD_SHARE = 0.005  # of the observations that may lie behind their cameras befo
 _MOST_SIGMAS = 5.0  # of the errors' root mean square, in standard deviations
 
 
-class LineAdjustmentConfig(Settings):
-    """Options of `adjust_lines`.
-
-    Example:
-        >>> from boxplus.systems.bundle_adjustment import LineAdjustmentConfig
-        >>> LineAdjustmentConfig(sigma_px=0.5, triangulate=True).use_points
-        True
-    """
-
-    sigma_px: float = Field(0.3, gt=0, description="[px] standard deviation of a segment's end across the segment")
-    sigma_point_px: float = Field(0.5, gt=0, description="[px] standard deviation of a point's pixel")
-    use_points: bool = Field(True, description="adjust the points with the lines, where there are any")
-    triangulate: bool = Field(False, description="take only cameras and segments from the input, and find the lines from them")
-    solver: SolverOptions = Field(
-        SolverOptions(max_iterations=1000, cost_tolerance=1e-9),
-        description="see SolverOptions; lines that are hardly determined creep on for many steps",
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class LineAdjustmentResult:
     """Adjusted cameras, lines and points.
 
     Attributes:
-        data: like the input, with adjusted cameras, end points of the lines (moved onto the adjusted lines) and points.
+        data: like the input, with adjusted cameras, end points of the lines (moved onto the adjusted lines) and points; lines
+            that no segment of a pixel and more is of stay as they were.
         errors_start, errors: (N,) root mean square of the distances of a segment's two ends from its projected line [px], NaN
             where the line is not determined or cannot be projected.
         point_errors_start, point_errors: (M,) distance of a pixel from its projected point [px], NaN where that is impossible;
@@ -108,8 +83,9 @@ def adjust_lines(
 
     The first camera is held: where the world is, no image tells. Its size is not told either; damping keeps it. Lines of
     which the images determine nothing but a plane (seen once, or from cameras that move along them) are named; damping keeps
-    them near their start in what is not determined. With `triangulate` they have no start and are left out, and so are lines
-    behind cameras and those that their segments contradict.
+    them near their start in what is not determined. Those of which all segments are shorter than a pixel are left out. With
+    `triangulate` lines have no start, and those are left out that are not determined, lie behind cameras or contradict their
+    segments.
 
     Raises:
         InputError: no line that the segments determine; a method without damping.
@@ -129,15 +105,18 @@ def adjust_lines(
     found = triangulate_lines(
         data.K, data.T_camera_world, data.segments, data.view_of, data.line_of, len(data.end_points_world), config.sigma_px
     )
-    used = found.found if config.triangulate else np.ones(len(found.states), dtype=np.bool_)
-    long = np.hypot(*(data.segments[:, 2:] - data.segments[:, :2]).T) >= 1.0
+    long = have_direction(data.segments)
+    used = np.zeros(len(found.states), dtype=np.bool_)
+    used[data.line_of[long]] = True
+    if config.triangulate:
+        used &= found.found
     seen = np.flatnonzero(used[data.line_of] & long)
     if not len(seen):
         why = " ".join(found.notes()) or "no segment"
         raise InputError("segments that determine a line", why, "give views from places beside the lines")
     problem = Problem()
     ends = _start_ends(data, found, used, config.triangulate)
-    cameras, lines, points = _add_line_set(problem, replace(data, end_points_world=ends), seen, config, loss)
+    cameras, lines, points = add_line_set(problem, replace(data, end_points_world=ends), seen, config, loss)
     problem.fix(cameras[0])
     start = [block.values for block in problem.blocks]
     solution = problem.solve(config.solver, callback=callback)
@@ -150,15 +129,16 @@ def adjust_lines(
     )
     said = [_doubt(adjusted, errors, point_errors, seen, config, loss)]
     is_stopped = solution.status == "stopped" and not solution.reason.startswith("iteration limit")  # who does that does not wait
-    if not is_stopped and not _parallax_ratio(adjusted, seen, config, loss, solution.cost) > TURNING:
+    watch = Watch(callback)
+    if not is_stopped and not line_parallax_ratio(adjusted, seen, config, loss, solution.cost, watch) > TURNING:
         said.append(NOT_APART)
     # From a start that is off, segments of a line may disagree; what the adjustment makes of given lines decides about these.
-    notes = found.notes() if config.triangulate else found.notes(("one view", "along the line"))
+    notes = found.notes() if config.triangulate else found.notes(("one view", "along the line", "too short"))
     if data.reflected:
         notes.append("the input has the world behind the cameras, as a mirror image; it was reflected through its origin")
     if not long.all():
         notes.append(f"{int((~long).sum())} segments shorter than 1 px have no direction and were left out")
-    notes += solution.doubts()
+    notes += [*watch.notes, *solution.doubts()]
     return LineAdjustmentResult(
         data=adjusted,
         errors_start=errors_start,
@@ -179,81 +159,6 @@ def adjust_lines(
 def _start_ends(data: VggLines, found: LineTriangulation, used: NDArray[np.bool_], triangulated: bool) -> Floats:
     """(L, 6): those that were triangulated, or those given."""
     return np.where(used[:, None], found.end_points_world, data.end_points_world) if triangulated else data.end_points_world
-
-
-def _add_line_set(
-    problem: Problem, data: VggLines, seen: NDArray[np.intp], config: LineAdjustmentConfig, loss: Loss | None
-) -> tuple[Variables, Variables, Variables | None]:
-    """Cameras, lines and, where they are used, points, with their residuals; what no residual takes is held where it is."""
-    cameras = problem.add_variables(SE3Left, data.T_camera_world, name="cameras")
-    own = np.unique(data.line_of[seen])
-    world = np.tile(Line3D.identity(), (len(data.end_points_world), 1))
-    world[own] = line_manifold.from_points(data.end_points_world[own, :3], data.end_points_world[own, 3:])
-    lines = problem.add_variables(Line3D, world, name="lines")
-    segments = LineReprojection(data.K[data.view_of[seen]], data.segments[seen], sigma=config.sigma_px)
-    problem.add_residuals(segments, cameras[data.view_of[seen]], lines[data.line_of[seen]], loss=loss, name="segments")
-    problem.fix(lines[np.setdiff1d(np.arange(len(world)), own)])
-    return cameras, lines, _add_points(problem, cameras, data, config, loss) if config.use_points and len(data.pixels) else None
-
-
-def _add_points(
-    problem: Problem, cameras: Variables, data: VggLines, config: LineAdjustmentConfig, loss: Loss | None
-) -> Variables:
-    points = problem.add_variables(Euclidean(3), data.points_world, name="points")
-    for view, K in enumerate(data.K):
-        rows = np.flatnonzero(data.point_view_of == view)
-        if not len(rows):
-            continue
-        camera, pixels, information = _without_skew(K, data.pixels[rows], config.sigma_point_px)
-        residual = Reprojection(camera, pixels, information=information)
-        problem.add_residuals(
-            residual,
-            cameras[np.full(len(rows), view)],
-            points[data.point_of[rows]],
-            loss=loss,
-            name=f"points of {data.names[view]}",
-        )
-    seen = np.unique(data.point_of)
-    if len(seen) < len(data.points_world):
-        problem.fix(points[np.setdiff1d(np.arange(len(data.points_world)), seen)])
-    return points
-
-
-def _without_skew(K: Floats, pixels: Floats, sigma_px: float) -> tuple[Pinhole, Floats, Floats]:
-    """A camera with right angles, pixels (n, 2) as it has them, and their information (2, 2); M = [[1, −s/fy], [0, 1]]."""
-    M = np.array([[1.0, -K[0, 1] / K[1, 1]], [0.0, 1.0]])
-    moved = pixels @ M.T
-    moved[:, 0] += K[0, 1] * K[1, 2] / K[1, 1]
-    back = np.linalg.inv(M)
-    return Pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), moved, back.T @ back / sigma_px**2
-
-
-def _parallax_ratio(
-    adjusted: VggLines, seen: NDArray[np.intp], config: LineAdjustmentConfig, loss: Loss | None, cost: float
-) -> float:
-    """Cost that distances explain, for each of their numbers, over that of a number that explains noise; see `parallax.py`."""
-    problem = Problem()
-    cameras, _, points = _add_line_set(problem, in_one_place(adjusted, seen), seen, config, loss)
-    shown, view_count = len(np.unique(adjusted.line_of[seen])), len(np.unique(adjusted.view_of[seen]))
-    point_count = 0 if points is None else len(np.unique(adjusted.point_of))
-    numbers = 2 * shown + point_count + 3 * (view_count - 1) - 1  # distance and slant of a line
-    measured = sum(2 * group.residual.count for group in problem.groups)
-    left = measured - numbers - 2 * shown - 2 * point_count - 3 * (view_count - 1)
-    if view_count < 2:
-        return 0.0
-    if left <= 0:
-        return float("inf")
-    held = np.zeros((6, 6))
-    held[3:, 3:] = IN_PLACE * np.eye(3)
-    problem.add_residuals(Prior(cameras.manifold, cameras.values, information=held), cameras[:])
-    try:
-        without = problem.solve(config.solver.model_copy(update={**IN_ONE_PLACE, "time_limit_s": None}))
-    except BoxplusError:  # nothing is shown by what cannot be adjusted
-        return float("inf")
-    if any(without.invalid.values()):
-        return float("inf")
-    noise = max(cost / left, 0.5 * (LEAST_NOISE / config.sigma_px) ** 2)
-    return float((without.cost - cost) / numbers / noise)
 
 
 def _line_errors(data: VggLines, poses: Floats, lines: Floats, seen: NDArray[np.intp]) -> Floats:

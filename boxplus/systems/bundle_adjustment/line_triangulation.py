@@ -21,12 +21,15 @@ from boxplus.manifolds import lines as line_manifold
 from boxplus.manifolds import quaternion
 
 Floats = NDArray[np.float64]
-LineState = Literal["found", "one view", "along the line", "behind", "disagrees"]
+LineState = Literal["found", "too short", "one view", "along the line", "behind", "disagrees"]
 
 _SURE = 3.0  # times its standard deviation is the angle between the planes that determines a line
 _DISAGREES = 6.0  # standard deviations of an end point from the line, root mean square
 
+_SHORT_PX = 1.0  # [px] a segment below that has no direction
+
 REASONS: dict[LineState, str] = {
+    "too short": "of which all segments are shorter than 1 px and have no direction; they are left out, as they were given",
     "one view": "seen in one view only, which gives a plane and not a line",
     "along the line": "seen from cameras that move along them or in one plane with them: their planes are one within the noise",
     "behind": "behind cameras that see them",
@@ -121,6 +124,7 @@ def triangulate_lines(
         raise InputError(
             f"views from 0 to {len(poses) - 1} and lines from 0 to {count - 1}", "an index beyond them", "count from zero"
         )
+    long = have_direction(seen)
     planes = _planes(K, poses, seen, views)
     lines, ends = np.full((count, 5), np.nan), np.full((count, 6), np.nan)
     angle, angle_std = np.full(count, np.nan), np.full(count, np.nan)
@@ -128,11 +132,19 @@ def triangulate_lines(
     order = np.argsort(rows, kind="stable")
     bounds = np.searchsorted(rows[order], np.arange(count + 1))
     for line in range(count):
-        own = order[bounds[line] : bounds[line + 1]]
+        shown = order[bounds[line] : bounds[line + 1]]
+        own = shown[long[shown]]
+        if len(shown) and not len(own):
+            states[line] = "too short"
         if len(np.unique(views[own])) < 2:
             continue
         states[line] = _triangulate(planes.of(own), sigma_px, line, lines, ends, angle, angle_std)
     return LineTriangulation(lines, ends, tuple(states), angle, angle_std)
+
+
+def have_direction(segments: Floats) -> NDArray[np.bool_]:
+    """(N,) which of the segments (N, 4) are long enough to have one."""
+    return np.asarray(np.hypot(*(segments[:, 2:] - segments[:, :2]).T) >= _SHORT_PX)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

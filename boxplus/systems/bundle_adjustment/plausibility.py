@@ -135,14 +135,18 @@ def _noise(errors: NDArray[np.float64], left: int) -> float | None:
     return float(np.median(known)) / _RAYLEIGH * float(np.sqrt(2.0 * len(known) / left))
 
 
+def typical_error(errors: NDArray[np.float64]) -> float:
+    """Standard deviation of a pixel by the median of the errors (k,), of which NaN do not count [px]."""
+    return max(float(np.nanmedian(errors)) / _RAYLEIGH, _LEAST_PIXEL)
+
+
 def outlier_notes(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
     """A sentence where errors that no noise explains carry most of a cost without robust loss."""
     known = errors[np.isfinite(errors)]
     if loss is not None or len(known) < _LEAST:
         return []
     squared = known**2
-    typical = max(float(np.median(known)) / _RAYLEIGH, _LEAST_PIXEL)
-    gross = known > _GROSS * typical
+    gross = known > _GROSS * typical_error(known)
     if not squared[gross].sum() > _LOAD * squared.sum():
         return []
     return [

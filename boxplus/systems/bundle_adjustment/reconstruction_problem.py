@@ -43,6 +43,23 @@ def add_reconstruction(
     return _add_colmap(problem, reconstruction, used, config, loss)
 
 
+def refuse_focal_lengths(reconstruction: Reconstruction) -> None:
+    """Refuse cameras of BAL that no lens is: the format does not say what they may be.
+
+    Raises:
+        InputError: a focal length that is not positive; the message names the first camera.
+    """
+    if not isinstance(reconstruction, BalProblem):
+        return
+    bad = np.flatnonzero(~(reconstruction.cameras[:, 6] > 0.0))
+    if bad.size:
+        raise InputError(
+            "positive focal lengths [px]",
+            f"{reconstruction.cameras[bad[0], 6]:g}, camera {bad[0]} ({reconstruction.source})",
+            "a camera of BAL looks along −z of its frame: turn the frame, not the sign of the focal length",
+        )
+
+
 def start_values(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Values of the variables of cameras and of points."""
     if isinstance(reconstruction, BalProblem):
@@ -54,13 +71,6 @@ def start_values(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], N
 def _add_bal(
     problem: Problem, bal: BalProblem, used: Mask, config: BundleAdjustmentConfig, loss: Loss | None
 ) -> tuple[Variables, Variables]:
-    bad = np.flatnonzero(~(bal.cameras[:, 6] > 0.0))
-    if bad.size:
-        raise InputError(
-            "positive focal lengths [px]",
-            f"{bal.cameras[bad[0], 6]:g}, camera {bad[0]} ({bal.source})",
-            "a camera of BAL looks along −z of its frame: turn the frame, not the sign of the focal length",
-        )
     poses, p_world = start_values(bal)
     cameras = problem.add_variables(BalCamera, poses, name="cameras")
     points = problem.add_variables(Euclidean(3), p_world, name="points")

@@ -17,6 +17,7 @@ from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss, loss_at
 from boxplus.optimization.problem import Problem
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import UNWATCHED, Watch
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, names_text
 from boxplus.systems.bundle_adjustment.triangulation import intersect_rays
@@ -33,6 +34,7 @@ def stray_points(
     ratio: NDArray[np.float64],
     config: BundleAdjustmentConfig,
     loss: Loss | None,
+    watch: Watch = UNWATCHED,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Numbers (s,) of the points that have a lower minimum elsewhere, and where it is, (s, 3) p_world.
 
@@ -69,7 +71,7 @@ def stray_points(
     concerned = concerned[np.isin(sightings.point_of[concerned], tried)]
     if not len(tried):
         return none
-    moved = _settled(replace(adjusted, points=points), concerned, len(used), tried, config, loss)
+    moved = _settled(replace(adjusted, points=points), concerned, len(used), tried, config, loss, watch)
     if moved is None:
         return none
 
@@ -105,6 +107,7 @@ def _settled(
     tried: NDArray[np.int64],
     config: BundleAdjustmentConfig,
     loss: Loss | None,
+    watch: Watch,
 ) -> NDArray[np.float64] | None:
     """(n, 3) all points, with those that are tried where their cost is least between cameras that are held."""
     problem, used = Problem(), np.zeros(count, dtype=np.bool_)
@@ -115,9 +118,10 @@ def _settled(
     problem.fix(points[np.setdiff1d(np.arange(len(points)), tried)])
     options = config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": None})
     try:
-        return np.asarray(problem.solve(options)[points])
+        solution = problem.solve(options, callback=watch.of("points at a wrong depth?"))
     except BoxplusError:
         return None
+    return None if watch.is_stopped else np.asarray(solution[points])
 
 
 def _costs(loss: Loss | None, squared: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -112,3 +112,40 @@ def test_cameras_that_only_turn_are_told_from_those_that_move_apart(seed: int, u
         assert told is not None and told.startswith("the cameras do not move apart")
     for baseline in (0.15, 1.0):
         assert adjust_lines(perturbed(turning(seed, baseline), seed), config).doubt is None
+
+
+@pytest.mark.parametrize("triangulate", [False, True])
+def test_lines_of_segments_that_have_no_direction_are_left_out_and_named(triangulate: bool) -> None:
+    data = house(3)
+    segments = data.segments.copy()
+    dots = np.isin(data.line_of, [2, 7])
+    segments[dots, 2:] = segments[dots, :2] + [0.4, 0.3]
+    result = adjust_lines(replace(data, segments=segments), LineAdjustmentConfig(triangulate=triangulate))
+    (told,) = (note for note in result.notes if "shorter than 1 px and have no direction" in note)
+    assert told.startswith("2 lines are not determined, of which all segments are shorter than 1 px") and told.endswith(": 2, 7")
+    assert (result.data.end_points_world[[2, 7]] == data.end_points_world[[2, 7]]).all()
+    assert np.isnan(result.errors[dots]).all() and np.isfinite(result.errors[~dots]).all()
+    assert [result.triangulation.states[line] for line in (2, 7)] == ["too short"] * 2
+    assert result.doubt is None
+
+
+def test_a_line_without_any_segment_stays_as_it_is() -> None:
+    data = house(4)
+    rows = np.flatnonzero(data.line_of != 5)
+    without = replace(data, segments=data.segments[rows], view_of=data.view_of[rows], line_of=data.line_of[rows])
+    assert (adjust_lines(without).data.end_points_world[5] == data.end_points_world[5]).all()
+
+
+def test_the_examination_of_lines_is_seen_and_can_be_stopped() -> None:
+    purposes = []
+
+    def stop(step) -> bool:
+        purposes.append(step.purpose)
+        return bool(step.purpose)
+
+    data = turning(0, 0.0)
+    assert adjust_lines(data).doubt is not None
+    result = adjust_lines(data, callback=stop)
+    assert purposes[-1] == "do the cameras move apart?" and purposes.count(purposes[-1]) == 1
+    assert result.solution.status == "converged"
+    assert any("stopped while the result was examined (do the cameras move apart?)" in note for note in result.notes)

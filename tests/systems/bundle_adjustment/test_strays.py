@@ -107,3 +107,19 @@ def test_a_wrong_lens_that_is_held_is_told_whatever_is_wrong_of_it(what):
         notes = adjust_bundle(replace(radial, camera_params=(wrong,)), GIVEN).notes
         (note,) = [note for note in notes if "other intrinsics than those held" in note]
         assert f"{what} = " in note and "which moves its pixels by" in note
+
+
+def test_the_search_for_points_astray_is_seen_and_can_be_stopped():
+    _, start = row(3)
+    sound = adjust_bundle(start, GIVEN)
+    points = sound.reconstruction.points.copy()
+    points[[5, 40]] *= np.array([[30.0], [0.3]])
+    purposes = []
+
+    def stop(step):
+        purposes.append(step.purpose)
+        return bool(step.purpose)
+
+    result = adjust_bundle(replace(sound.reconstruction, points=points), GIVEN, callback=stop)
+    assert purposes[-1] == "points at a wrong depth?" and purposes.count(purposes[-1]) == 1
+    assert any("stopped while the result was examined (points at a wrong depth?)" in note for note in result.notes)

@@ -10,7 +10,9 @@ import pytest
 
 import boxplus as bp
 from boxplus.errors import BoxplusError, InputError, NotFiniteError
+from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
+from boxplus.manifolds import se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import examination_options
@@ -336,3 +338,84 @@ def test_wrong_matches_are_triangulated_without_a_warning_of_numpy():
     of[wrong] = rng.permutation(of[wrong])
     with np.errstate(divide="raise"):
         assert adjust_bundle(replace(start, point_of=of)).doubt is not None
+
+
+def inverted(start: Reconstruction) -> Reconstruction:
+    """Poses from camera to world, where the format has them from world to camera."""
+    if not isinstance(start, BalProblem):
+        return replace(start, T_camera_world=se3.inverse(start.T_camera_world))
+    cameras = start.cameras.copy()
+    cameras[:, :3] *= -1.0
+    cameras[:, 3:6] = -np.einsum("nij,nj->ni", so3.exp(cameras[:, :3]), start.cameras[:, 3:6])
+    return replace(start, cameras=cameras)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_inverted_poses_are_refused_by_name(format):
+    for seed in range(100, 108):
+        start = reconstruction(seed, format)
+        with pytest.raises(InputError, match=r"if the poses are inverted.*give poses from world to camera, R → Rᵀ"):
+            adjust_bundle(inverted(start))
+        assert adjust_bundle(start).doubt is None
+
+
+@pytest.mark.parametrize("name", ["trafalgar-21-11315-pre", "dubrovnik-16-22106-pre", "ladybug-49-7776-pre"])
+def test_published_sets_with_inverted_poses_are_refused(name, shared_data):
+    start = bp.formats.read_bal(shared_data / "bal" / f"{name}.txt.bz2")
+    with pytest.raises(InputError, match="if the poses are inverted"):
+        adjust_bundle(inverted(start))
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+def test_quaternions_in_another_order_are_refused_by_name(format):
+    start = reconstruction(100, format)
+    T = start.T_camera_world.copy()
+    T[:, :4] = T[:, [1, 2, 3, 0]]
+    with pytest.raises(InputError, match="if the quaternions have another order"):
+        adjust_bundle(replace(start, T_camera_world=T))
+
+
+def test_rotations_in_degrees_and_points_in_millimetres_are_refused_by_name():
+    start = reconstruction(100, "bal")
+    cameras = start.cameras.copy()
+    cameras[:, :3] = np.degrees(cameras[:, :3])
+    with pytest.raises(InputError, match=r"if the rotations are in degrees.*give them in radians"):
+        adjust_bundle(replace(start, cameras=cameras))
+    with pytest.raises(InputError, match=r"if the points are 0\.001 times as large.*in the same unit"):
+        adjust_bundle(replace(start, points=1000.0 * start.points))
+
+
+def test_a_wild_pixel_does_not_move_the_middle_that_pixels_are_counted_from():
+    start = reconstruction(100, "bal")
+    pixels = start.pixels + np.abs(start.pixels).max(axis=0)
+    pixels[7] = [90_000.0, 70_000.0]
+    told = adjust_bundle(replace(start, pixels=pixels), loss=bp.losses.Huber(1.345)).doubt
+    middle = re.search(r"from the middle of their range, \((\S+), (\S+)\) px, the cost is", told)
+    assert [float(middle[k]) for k in (1, 2)] == pytest.approx(np.abs(start.pixels).max(axis=0), abs=40.0)
+
+
+@pytest.mark.parametrize(
+    ("purpose", "format", "change"),
+    [
+        ("another lens?", "colmap", lambda start: replace(start, camera_params=(0.8 * start.camera_params[0],))),
+        ("pixels from a corner?", "bal", lambda start: replace(start, pixels=start.pixels + np.abs(start.pixels).max(axis=0))),
+        ("bent by wrong matches?", "gbp", lambda start: replace(start, pixels=start.pixels + _wrong_matches(start))),
+    ],
+)
+def test_examinations_are_seen_and_can_be_stopped(purpose, format, change):
+    start, seen = change(reconstruction(100, format)), []
+
+    def stop(step):
+        seen.append(step.purpose)
+        return step.purpose == purpose
+
+    result = adjust_bundle(start, callback=stop)
+    assert seen.count(purpose) == 1 and seen[-1] == purpose
+    (told,) = (note for note in result.notes if "stopped while the result was examined" in note)
+    assert purpose in told
+    assert result.solution.status == "converged"
+
+
+def _wrong_matches(start: Reconstruction) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return np.where(rng.random((len(start.pixels), 1)) < 0.05, rng.uniform(-60.0, 60.0, start.pixels.shape), 0.0)

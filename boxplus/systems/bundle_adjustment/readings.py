@@ -1,0 +1,142 @@
+"""Does a reconstruction mean something else than it is read as? Its own start tells, where it is one.
+
+A start explains its pixels to within a few of them, as it was meant. Read with inverted poses, in degrees or with points in
+another unit it is nowhere near; so where another reading explains the pixels far better than the format's own, that was meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.errors import InputError
+from boxplus.formats.reconstructions.bal import BalProblem
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
+from boxplus.formats.reconstructions.gbp import GbpProblem
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
+from boxplus.manifolds import quaternion, so3
+from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout
+
+_FAR_BETTER = 0.2  # times the error as read, that another reading has to reach
+_OFF, _NEAR = 0.25, 0.2  # of how far the pixels spread: errors that ask for another reading, and that answer it
+_LEAST = 20  # observations
+_MOST = 5000  # observations that are looked at
+_UNITS = (1e3, 1e2, 1e-2, 1e-3)
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+_INVERT = "give poses from world to camera, R → Rᵀ and t → −Rᵀ t"
+_BAL_AXES = "the cameras of BAL look along −z, x to the right and y upwards"
+_TURN = "turn the cameras by half a turn about x: they have to look along +z, y downwards"
+_ORDER = "give them in the order of the format"
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """What it may mean: `got`, what is there, and what to do; not refused where it is a matter of the pixels alone."""
+
+    sightings: Sightings
+    got: str
+    advice: str
+    is_of_pixels: bool = False
+
+
+def reading_doubt(reconstruction: Reconstruction) -> str | None:
+    """A sentence where the pixels have other axes than they are read with.
+
+    Raises:
+        InputError: poses that are inverted, or whose rotations are in degrees or in another order; points in another unit.
+    """
+    seen = Sightings.of(reconstruction)
+    rows = np.arange(len(seen.pixels))[:: max(1, len(seen.pixels) // _MOST)]
+    if len(rows) < _LEAST:
+        return None
+    off, pixels = _typical(seen, rows), seen.pixels[rows]
+    spread = float(np.median(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)))
+    if not off > _OFF * spread:
+        return None
+    ways = [(_typical(way.sightings, rows), way) for way in _readings(reconstruction, seen)]
+    least, way = min(ways, key=lambda one: one[0])
+    if not (least < _FAR_BETTER * off and least < _NEAR * spread):
+        return None
+    as_read = f"within {off:.3g} px" if np.isfinite(off) else "behind their cameras"
+    told = f"half of the points lie within {least:.3g} px of where they were seen {way.got}, and {as_read} as the file is read"
+    if way.is_of_pixels:
+        return f"{told}: {way.advice}"
+    raise InputError(
+        "cameras and points that lie, as the format reads them, near to what was seen",
+        f"{told} ({getattr(reconstruction, 'source', 'reconstruction')})",
+        way.advice,
+    )
+
+
+def _typical(seen: Sightings, rows: NDArray[np.intp]) -> float:
+    """Median error [px]; infinite where half of the points are behind their cameras."""
+    with np.errstate(all="ignore"):
+        errors = seen.errors(rows, seen.points[seen.point_of[rows]])
+    return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
+
+
+def _readings(own: Reconstruction, seen: Sightings) -> Iterator[_Reading]:
+    yield from _of_bal(own, seen) if isinstance(own, BalProblem) else _with_quaternions(own, seen)
+    for unit in _UNITS:
+        scaled = replace(seen, points=unit * seen.points)
+        yield _Reading(scaled, f"if the points are {unit:g} times as large", "give points and cameras in the same unit")
+    centre = _principal_points(own, seen)
+    flipped = [(replace(seen, pixels=(seen.pixels - centre) * flip + centre), flip) for flip in ([-1.0, 1.0], [1.0, -1.0])]
+    for (other, _), name in zip(flipped, "xy", strict=True):
+        yield _Reading(other, f"with {name} the other way", f"is {name} of the pixels flipped?", True)
+    # BAL counts y upwards: seen downwards, what was swapped is negated as well.
+    sign = -1.0 if isinstance(own, BalProblem) else 1.0
+    for about in (np.zeros(2), centre):
+        swapped = sign * (seen.pixels - about)[:, ::-1] + about
+        yield _Reading(replace(seen, pixels=swapped), "with x and y swapped", "are x and y of the pixels swapped?", True)
+    if centre.any():
+        of_lens = "are they counted from the principal point?"
+        yield _Reading(replace(seen, pixels=seen.pixels + centre), "with the principal point added to the pixels", of_lens, True)
+
+
+def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:
+    as_it_is = replace(seen, R_camera_world=so3.exp(own.cameras[:, :3]), t=own.cameras[:, 3:6])
+    inverted = _inverse(as_it_is)
+    yield _Reading(_turned(inverted), "if the poses are inverted", _INVERT)
+    for pixels in (seen.pixels, own.pixels):
+        forward = replace(inverted, pixels=pixels)
+        yield _Reading(forward, "if the poses are inverted and look along +z", f"{_INVERT}; {_BAL_AXES}")
+    degrees = so3.exp(np.radians(own.cameras[:, :3])) * _HALF_TURN[:, None]
+    yield _Reading(replace(seen, R_camera_world=degrees), "if the rotations are in degrees", "give them in radians")
+    yield _Reading(replace(as_it_is, pixels=own.pixels), "by cameras that look along +z, y downwards", _BAL_AXES, True)
+
+
+def _with_quaternions(own: GbpProblem | ColmapModel, seen: Sightings) -> Iterator[_Reading]:
+    yield _Reading(_inverse(seen), "if the poses are inverted", _INVERT)
+    for order in ([3, 0, 1, 2], [1, 2, 3, 0]):
+        other = replace(seen, R_camera_world=quaternion.to_matrix(np.ascontiguousarray(own.T_camera_world[:, order])))
+        how = "if the quaternions have another order"
+        yield _Reading(other, how, _ORDER)
+        yield _Reading(_inverse(other), f"{how} and the poses are inverted", f"{_ORDER}; {_INVERT}")
+    axes = "by cameras that look along −z, y upwards"
+    yield _Reading(_turned(seen), axes, _TURN)
+    yield _Reading(_turned(_inverse(seen)), f"{axes}, of inverted poses", f"{_INVERT}; {_TURN}")
+    yield _Reading(_inverse(_turned(seen)), f"if the poses are inverted, {axes}", f"{_INVERT}; {_TURN}")
+
+
+def _principal_points(own: Reconstruction, seen: Sightings) -> NDArray[np.float64]:
+    """(k, 2) or (2,) of the camera of every observation [px]."""
+    if isinstance(own, BalProblem):
+        return np.zeros(2)
+    if isinstance(own, GbpProblem):
+        return own.intrinsics[2:]
+    of_lens = [(colmap_layout(own, number) @ own.camera_params[number])[2:4] for number in range(len(own.camera_ids))]
+    return np.asarray(np.array(of_lens)[seen.lens_of[seen.camera_of]])
+
+
+def _inverse(seen: Sightings) -> Sightings:
+    R = np.ascontiguousarray(seen.R_camera_world.transpose(0, 2, 1))
+    return replace(seen, R_camera_world=R, t=-np.einsum("nij,nj->ni", R, seen.t))
+
+
+def _turned(seen: Sightings) -> Sightings:
+    """Cameras turned by half a turn about their x axes."""
+    return replace(seen, R_camera_world=seen.R_camera_world * _HALF_TURN[:, None], t=seen.t * _HALF_TURN)
