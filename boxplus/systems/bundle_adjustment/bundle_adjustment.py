@@ -133,7 +133,9 @@ def adjust_bundle(
             "triangulate first",
         )
     refuse_focal_lengths(reconstruction)
-    other_axes = reading_doubt(reconstruction)
+    other_axes = reading_doubt(
+        reconstruction, is_lens_held=not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
+    )
     problem = Problem()
     sound = make_sound(reconstruction)
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)

@@ -6,6 +6,7 @@ another unit it is nowhere near; so where another reading explains the pixels fa
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -21,9 +22,10 @@ from boxplus.manifolds import quaternion, so3
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout
 
 _FAR_BETTER = 0.2  # times the error as read, that another reading has to reach
-_OFF, _NEAR = 0.25, 0.2  # of how far the pixels spread: errors that ask for another reading, and that answer it
+_OFF, _NEAR = 0.08, 0.2  # of how far the pixels spread: errors that ask for another reading, and that answer it
 _LEAST = 20  # observations
 _MOST = 5000  # observations that are looked at
+_SIZES, _RESIZED = (0.25, 0.5, 2.0, 4.0), 0.1  # of images, and logarithm of any other size from which on it is told
 _UNITS = (1e3, 1e2, 1e-2, 1e-3)
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _INVERT = "give poses from world to camera, R → Rᵀ and t → −Rᵀ t"
@@ -42,8 +44,11 @@ class _Reading:
     is_of_pixels: bool = False
 
 
-def reading_doubt(reconstruction: Reconstruction) -> str | None:
-    """A sentence where the pixels have other axes than they are read with.
+def reading_doubt(reconstruction: Reconstruction, *, is_lens_held: bool) -> str | None:
+    """A sentence where the pixels have other axes or another size than they are read with.
+
+    Args:
+        is_lens_held: whether focal lengths are not adjusted, so that another size of the image is not found by that.
 
     Raises:
         InputError: poses that are inverted, or whose rotations are in degrees or in another order; points in another unit.
@@ -56,7 +61,10 @@ def reading_doubt(reconstruction: Reconstruction) -> str | None:
     spread = float(np.median(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)))
     if not off > _OFF * spread:
         return None
-    ways = [(_typical(way.sightings, rows), way) for way in _readings(reconstruction, seen)]
+    readings = [*_readings(reconstruction, seen)]
+    if is_lens_held:
+        readings += _of_other_size(seen, rows, _principal_points(reconstruction, seen))
+    ways = [(_typical(way.sightings, rows), way) for way in readings]
     least, way = min(ways, key=lambda one: one[0])
     if not (least < _FAR_BETTER * off and least < _NEAR * spread):
         return None
@@ -87,14 +95,30 @@ def _readings(own: Reconstruction, seen: Sightings) -> Iterator[_Reading]:
     flipped = [(replace(seen, pixels=(seen.pixels - centre) * flip + centre), flip) for flip in ([-1.0, 1.0], [1.0, -1.0])]
     for (other, _), name in zip(flipped, "xy", strict=True):
         yield _Reading(other, f"with {name} the other way", f"is {name} of the pixels flipped?", True)
-    # BAL counts y upwards: seen downwards, what was swapped is negated as well.
-    sign = -1.0 if isinstance(own, BalProblem) else 1.0
-    for about in (np.zeros(2), centre):
+    # Where y is counted upwards, what was swapped is negated as well, once it is counted downwards.
+    signs = (1.0, -1.0) if isinstance(own, BalProblem) else (1.0,)
+    for sign, about in itertools.product(signs, (np.zeros(2), centre)):
         swapped = sign * (seen.pixels - about)[:, ::-1] + about
         yield _Reading(replace(seen, pixels=swapped), "with x and y swapped", "are x and y of the pixels swapped?", True)
     if centre.any():
         of_lens = "are they counted from the principal point?"
         yield _Reading(replace(seen, pixels=seen.pixels + centre), "with the principal point added to the pixels", of_lens, True)
+
+
+def _of_other_size(seen: Sightings, rows: NDArray[np.intp], centre: NDArray[np.float64]) -> Iterator[_Reading]:
+    """Of pixels that are so many times as far apart as those of this lens."""
+    for size in _SIZES:
+        advice = "are the pixels those of an image of another size than the focal length?"
+        yield _Reading(replace(seen, pixels=size * seen.pixels), f"with pixels {size:g} times as large", advice, True)
+    about = np.broadcast_to(centre, seen.pixels.shape)[rows]
+    with np.errstate(all="ignore"):
+        projected = seen.projections(rows, seen.points[seen.point_of[rows]]) - about
+        ratios = ((seen.pixels[rows] - about) * projected).sum(axis=1) / (projected**2).sum(axis=1)
+    size = float(np.median(ratios[np.isfinite(ratios)])) if np.isfinite(ratios).any() else 1.0
+    if size > 0.0 and abs(np.log(size)) > _RESIZED:
+        advice = "is the focal length wrong, or that of an image of another size?"
+        resized = replace(seen, pixels=(seen.pixels - centre) / size + centre)
+        yield _Reading(resized, f"with a focal length {size:.4g} times as large", advice, True)
 
 
 def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:

@@ -99,16 +99,21 @@ class Sightings:
 
         NaN behind a camera, unless those points are to be mirrored at its centre: the same line, as if it were a ray.
         """
+        off = self.projections(rows, p_world, mirrored=mirrored) - self.pixels[rows]
+        return np.asarray(np.linalg.norm(off, axis=1))
+
+    def projections(self, rows: NDArray[np.intp], p_world: NDArray[np.float64], *, mirrored: bool = False) -> NDArray[np.float64]:
+        """(r, 2) where the cameras of chosen observations have points (r, 3) [px]; NaN as in `errors`."""
         camera = self.camera_of[rows]
         p_camera = np.einsum("nij,nj->ni", self.R_camera_world[camera], p_world) + self.t[camera]
         if mirrored:
             p_camera *= np.sign(p_camera[:, 2:])
-        distance = np.full(len(rows), np.nan)
+        pixels = np.full((len(rows), 2), np.nan)
         lens_of = self.lens_of[camera]
         for lens in np.unique(lens_of):
             own = np.flatnonzero(lens_of == lens)
-            distance[own] = np.linalg.norm(self._lens(int(lens)).project(p_camera[own])[0] - self.pixels[rows[own]], axis=1)
-        return distance
+            pixels[own] = self._lens(int(lens)).project(p_camera[own])[0]
+        return pixels
 
     def _lens(self, number: int) -> Pinhole:
         own = self.reconstruction

@@ -18,7 +18,7 @@ from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
 from tests.small_problems import scene
-from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, perturbed, reconstruction
+from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, perturbed, reconstruction, turning
 
 
 def chosen(start: Reconstruction, rows: np.ndarray) -> Reconstruction:
@@ -419,3 +419,24 @@ def test_examinations_are_seen_and_can_be_stopped(purpose, format, change):
 def _wrong_matches(start: Reconstruction) -> np.ndarray:
     rng = np.random.default_rng(0)
     return np.where(rng.random((len(start.pixels), 1)) < 0.05, rng.uniform(-60.0, 60.0, start.pixels.shape), 0.0)
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+@pytest.mark.parametrize("wrong", [0.6, 1.6])
+def test_a_focal_length_that_contradicts_the_start_of_two_views_is_not_trusted(format, wrong):
+    """Two images hardly tell a focal length; a start that was made with the right one does."""
+    for seed in (100, 102):
+        start = turning(seed, 0.5, format, cameras=2, points=120)
+        lens = np.array([wrong, wrong, 1.0, 1.0]) * 500.0 * [1.0, 1.0, 0.0, 0.0]
+        other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
+        told = adjust_bundle(other).doubt
+        found = re.search(r"with a focal length (\S+) times as large", told)
+        assert float(found[1]) == pytest.approx(1.0 / wrong, rel=0.03)
+        assert adjust_bundle(start).doubt is None
+
+
+def test_swapped_pixels_of_either_direction_of_y_are_named():
+    start = reconstruction(100, "bal")
+    for sign in ([1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]):
+        told = adjust_bundle(replace(start, pixels=start.pixels[:, ::-1] * sign)).doubt
+        assert ("are x and y of the pixels swapped?" in told) == (sign[0] * sign[1] > 0.0)
