@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ _LEAST, _ROUNDS, _TURNS = 50, 10, 0.05  # poses; repetitions; turning in rad, ab
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
 _CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
+_UNLIKE = 0.6  # of the size of the path, that an alignment leaves of one with which it has nothing in common
+_STRAIGHT = 0.02  # second against first principal deviation, up to which a way is straight
 
 
 def alignment_doubts(
@@ -105,6 +107,7 @@ def reading_doubts(association: Association, alignment: Alignment, translation: 
         *_scale_doubts(estimate, truth, alignment),
         *_lever_doubts(estimate, truth, alignment),
         *_world_doubts(estimate, truth, alignment, rmse),
+        *_unrelated_doubts(estimate, truth),
     ]
 
 
@@ -120,6 +123,13 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
                 "nothing"
             )
             return
+    conjugate = _scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R)
+    if conjugate < _CLEARLY * scatter:
+        yield (
+            f"the orientations scatter by {scatter:.0f}° as they were read, and by {conjugate:.1f}° if those of one file are "
+            "inverted and its positions are not: conjugate its quaternions, the rotation error and the relative errors mean nothing"
+        )
+        return
     swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
     ways = {
         "the estimate": _scatter_deg(R @ swapped[0], truth.R),
@@ -140,13 +150,17 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
 
 
 def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
-    if alignment.kind not in ("se3", "sim3", "yaw"):
-        return
+    kind: PositionAlignment = "sim3" if alignment.kind == "sim3" else "se3"
+    if alignment.kind in ("none", "origin"):  # of what the worlds have in common, `_world_doubts` tells
+        try:
+            rmse = rms(np.linalg.norm(align(estimate.p, truth.p, kind).apply(estimate).p - truth.p, axis=1))
+        except InputError:
+            return
     errors = {}
     for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
         p = -np.einsum("nba,nb->na", one.R, one.p)
         try:
-            found = align(p, other.p, "sim3" if alignment.kind == "sim3" else "se3")
+            found = align(p, other.p, kind)
         except InputError:
             continue
         moved = found.apply(replace(one, p=p, covariance=None, lines=None)).p
@@ -173,28 +187,40 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     try:
         rigid, found = align(estimate.p, truth.p), align(estimate.p, truth.p, "sim3")
     except InputError:
-        return
-    rmse, error = (rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
-    if error < min(_SCALED * rmse, _FITS * rigid.spread_m[0]) and abs(found.scale - 1.0) > _SCALE:
+        line = _OnLine.of(estimate, truth)
+        if line is None:
+            return
+        scale, rmse, error, spread = line.scale, line.rigid_m, line.scaled_m, line.spread_m
+    else:
+        rmse, error = (rms(np.linalg.norm(one.apply(estimate).p - truth.p, axis=1)) for one in (rigid, found))
+        scale, spread = found.scale, float(rigid.spread_m[0])
+    if error < min(_SCALED * rmse, _FITS * spread) and abs(scale - 1.0) > _SCALE:
         yield (
-            f"{found.scale:.4g} times as large the estimate has, rigidly aligned, an ATE of {error:.4g} m instead of {rmse:.4g} "
+            f"{scale:.4g} times as large the estimate has, rigidly aligned, an ATE of {error:.4g} m instead of {rmse:.4g} "
             "m: a wrong scale is most of its error (--align sim3, for an estimate that has none)"
         )
 
 
 def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Iterator[str]:
     """Whether the ground truth is that of another point of the body: p_truth = s R (p + R_estimate l) + t, with l sought."""
-    if alignment.kind not in ("se3", "sim3") or len(estimate) < _LEAST:
-        return
     kind: PositionAlignment = "sim3" if alignment.kind == "sim3" else "se3"
-    found = align(estimate.p, truth.p, kind)
+    if len(estimate) < _LEAST:
+        return
+    try:
+        found = align(estimate.p, truth.p, kind)
+    except InputError:
+        return
     rmse = rms(np.linalg.norm(found.apply(estimate).p - truth.p, axis=1))
     turned = (estimate.R - estimate.R.mean(axis=0)).reshape(-1, 3)
-    if np.linalg.svd(turned, compute_uv=False)[-1] < _TURNS * np.sqrt(len(estimate)):
+    able = np.linalg.svd(turned, full_matrices=False)
+    shown = able[1] > _TURNS * np.sqrt(len(estimate))
+    if np.count_nonzero(shown) < 2:
         return
+    # Along an axis that the body turns about alone, and about no other, no lever shows, and none is told.
+    solve = able[2][shown].T @ (able[0][:, shown] / able[1][shown]).T
     for _ in range(_ROUNDS):  # the lever given the alignment, and the other way round: they hardly depend on each other
         rest = (truth.p - found.apply(estimate).p) @ found.R_world_estimate / found.scale
-        lever = np.linalg.lstsq(turned, (rest - rest.mean(axis=0)).reshape(-1), rcond=None)[0]
+        lever = solve @ (rest - rest.mean(axis=0)).reshape(-1)
         moved = replace(estimate, p=estimate.p + estimate.R @ lever, covariance=None, lines=None)
         found = align(moved.p, truth.p, kind)
     error = rms(np.linalg.norm(found.apply(moved).p - truth.p, axis=1))
@@ -214,6 +240,12 @@ def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment,
     try:
         found = align(estimate.p, truth.p)
     except InputError:
+        line = _OnLine.of(estimate, truth)
+        if line is not None and alignment.kind != "yaw" and line.rigid_m < min(_CLEARLY * rmse, _FITS * line.spread_m):
+            yield (
+                f"both ways are straight, in directions that differ by {line.angle_deg:.1f}°, and laid onto each other they are "
+                f"{line.rigid_m:.4g} m apart instead of {rmse:.4g} m: the worlds of the files, or the first poses, are not the same"
+            )
         return
     if found.mirrored:
         yield _MIRROR
@@ -226,6 +258,51 @@ def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment,
         f"{error:.4g} m instead of {rmse:.4g} m: the worlds of the two files are not the same, or differ in axes (ENU, NED): "
         "--align se3"
     )
+
+
+def _unrelated_doubts(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
+    """Whether no alignment brings the two paths together: an estimate of something else, or one that is lost."""
+    try:
+        found = align(estimate.p, truth.p)
+    except InputError:
+        return
+    # The median, as few poses far off are no other path.
+    error = float(np.median(np.linalg.norm(found.apply(estimate).p - truth.p, axis=1)))
+    size = float(np.linalg.norm(found.spread_m))
+    if error > _UNLIKE * size:
+        yield (
+            f"laid onto each other as well as possible half of the poses are still {error:.4g} m apart, where the path spreads "
+            f"over {size:.4g} m: the two have nothing in common, the estimate is lost, or the files are not of the same run"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _OnLine:
+    """Two straight ways: how much longer the ground truth's is, the angle between them, and how far apart they are laid onto each
+    other, as they are and scaled [m]; `spread_m` is that of the ground truth."""
+
+    scale: float
+    angle_deg: float
+    rigid_m: float
+    scaled_m: float
+    spread_m: float
+
+    @classmethod
+    def of(cls, estimate: Trajectory, truth: Trajectory) -> _OnLine | None:
+        """None where one of them is no straight way."""
+        own, true = (poses.p - poses.p.mean(axis=0) for poses in (estimate, truth))
+        axes, along = [], []
+        for p in (own, true):
+            _, d, Vt = np.linalg.svd(p, full_matrices=False)
+            if not d[0] > 0.0 or d[1] > _STRAIGHT * d[0]:
+                return None
+            axes.append(Vt[0])
+            along.append(p @ Vt[0])
+        x, y = along
+        sign = 1.0 if x @ y > 0.0 else -1.0
+        scale = sign * float(x @ y) / float(x @ x)
+        angle = float(np.degrees(np.arccos(np.clip(sign * axes[0] @ axes[1], -1.0, 1.0))))
+        return cls(scale, angle, rms(sign * x - y), rms(scale * sign * x - y), rms(y))
 
 
 def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> float:

@@ -20,6 +20,7 @@ from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
+from boxplus.evaluation.incidents import incident_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
 from boxplus.evaluation.time_offset import TimeOffset
@@ -243,6 +244,7 @@ def evaluate(
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
+        *incident_doubts(aligned, truth, translation, estimate),
     ]
     relative = []
     for delta in deltas:

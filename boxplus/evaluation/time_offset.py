@@ -98,16 +98,15 @@ def estimate_time_offset(
         return None
     pair = MotionPair(t_estimate, estimate, t_ground_truth, ground_truth)
     coarse = _correlated(t_estimate, estimate, t_ground_truth, ground_truth)
-    if not coarse:
+    if coarse:
+        told = [_told(pair, one) for one in _not_refuted(pair, coarse)]
+    else:
         largest_s = min(_NEAR[0], 0.25e-9 * float(end - begin))
         starts = np.arange(-largest_s, largest_s + 0.5 * _APART_S, _APART_S)
         fits = [fit for start in starts if (fit := _refined(pair, float(start))) is not None]
-        coarse = [
-            TimeOffset(fit.offset_s, fit.correlation, fit.signal, fit.deviation_s)
-            for fit in fits
-            if pair.are_alike(fit.offset_s, _ALIKE)
-        ]
-    told = [_told(pair, one) for one in _not_refuted(pair, _distinct(coarse))]
+        alike = [fit for fit in fits if pair.are_alike(fit.offset_s, _ALIKE)]
+        found = [TimeOffset(fit.offset_s, fit.correlation, fit.signal, fit.deviation_s) for fit in alike]
+        told = _not_refuted(pair, _distinct(found))
     if not told:
         return None
     nearest, *others = _distinct(sorted(told, key=lambda one: abs(one.offset_s)))

@@ -1,0 +1,90 @@
+"""What few poses of an estimate do to its errors: poses far off, jumps, a pose that is repeated, stamps that were rounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.evaluation.statistics import rms
+from boxplus.formats.trajectory import Trajectory
+
+_FAR, _FEW, _LOAD = 10.0, 0.03, 0.5  # times the median error, share of the poses, and of the squared error, of poses far off
+_JUMP, _USUAL, _OF_ERROR = 20.0, 0.95, 0.5  # times the usual error of a step, its quantile, and of the whole error
+_LEAST, _ROUNDING = 30, 1e-9  # poses, and error as a share of the largest coordinate, for any of that to be told
+_STILL, _LEAST_STILL, _WENT = 1e-6, 10, 0.1  # of the path, poses, and of the spread, for a pose that is repeated
+_ROUNDED_NS = (1_000_000_000, 100_000_000, 10_000_000)
+_OF_ROUNDING, _EVEN = 0.3, 0.8  # of the whole error, that rounded stamps explain; share of equal steps that are no rounding's
+
+
+def incident_doubts(aligned: Trajectory, truth: Trajectory, translation: NDArray[np.float64], estimate: Trajectory) -> list[str]:
+    """What to know of an error that few poses make.
+
+    Args:
+        aligned, truth: (M) matched poses in the frame of the ground truth. translation: (M,) errors [m].
+        estimate: all poses, as they are in the file.
+    """
+    if len(translation) < _LEAST or rms(translation) < _ROUNDING * float(np.abs(truth.p).max()):
+        return []
+    found = [*_far_off(aligned, translation), *_jumps(aligned, truth, translation), *_stands(aligned, truth)]
+    return [*found, *_rounded(estimate, truth, translation)]
+
+
+def _when(trajectory: Trajectory, row: int) -> str:
+    return f"pose {row}" if trajectory.time_ns is None else f"{(trajectory.time_ns[row] - trajectory.time_ns[0]) * 1e-9:.2f} s"
+
+
+def _far_off(aligned: Trajectory, translation: NDArray[np.float64]) -> Iterator[str]:
+    far = np.flatnonzero(translation > _FAR * float(np.median(translation)))
+    share = float((translation[far] ** 2).sum() / max((translation**2).sum(), 1e-300))
+    if 0 < len(far) <= max(_FEW * len(translation), 1) and share > _LOAD:
+        worst = far[np.argmax(translation[far])]
+        yield (
+            f"{len(far)} of the {len(translation)} poses are off by more than {_FAR:g} times the median error and make up "
+            f"{share:.0%} of the squared error; the farthest by {translation[worst]:.4g} m at {_when(aligned, int(worst))}: "
+            "the ATE speaks for these, the median for the others"
+        )
+
+
+def _jumps(aligned: Trajectory, truth: Trajectory, translation: NDArray[np.float64]) -> Iterator[str]:
+    off = np.linalg.norm(np.diff(aligned.p - truth.p, axis=0), axis=1)
+    far = np.flatnonzero((off > _JUMP * np.quantile(off, _USUAL)) & (off > _OF_ERROR * rms(translation)))
+    if len(far):
+        worst = far[np.argmax(off[far])]
+        yield (
+            f"the estimate jumps {len(far)} times against the ground truth, by {off[worst]:.4g} m at "
+            f"{_when(aligned, int(worst) + 1)}: what is before and after may be better than the errors say"
+        )
+
+
+def _stands(aligned: Trajectory, truth: Trajectory) -> Iterator[str]:
+    size = float(np.linalg.norm(truth.p.std(axis=0)))
+    step = np.linalg.norm(np.diff(aligned.p, axis=0), axis=1)
+    moving = np.flatnonzero(np.concatenate([[True], step > _STILL * size, [True]]))
+    longest = int(np.argmax(np.diff(moving)))
+    first, last = int(moving[longest]), int(moving[longest + 1]) - 1
+    went = float(np.linalg.norm(np.diff(truth.p[first : last + 1], axis=0), axis=1).sum())
+    if last - first >= _LEAST_STILL and went > _WENT * size:
+        yield (
+            f"the estimate repeats one position from {_when(aligned, first)} to {_when(aligned, last)}, while the ground truth "
+            f"goes {went:.4g} m: it had stopped there"
+        )
+
+
+def _rounded(estimate: Trajectory, truth: Trajectory, translation: NDArray[np.float64]) -> Iterator[str]:
+    if estimate.time_ns is None or truth.time_ns is None:
+        return
+    for unit in _ROUNDED_NS:
+        steps = np.unique(np.diff(estimate.time_ns), return_counts=True)[1]
+        if (estimate.time_ns % unit).any() or steps.max() > _EVEN * steps.sum():  # even steps are those of a clock
+            continue
+        t = (truth.time_ns - truth.time_ns[0]) * 1e-9
+        speed = float(np.linalg.norm(np.diff(truth.p, axis=0), axis=1).sum() / max(t[-1], 1e-9))
+        makes = speed * unit * 1e-9 / np.sqrt(12.0)
+        if makes > _OF_ROUNDING * rms(translation):
+            yield (
+                f"all stamps of the estimate are multiples of {unit * 1e-9:g} s: if they were rounded to that, it makes an error "
+                f"of about {makes:.3g} m, and clocks up to {0.5e-9 * unit:g} s apart"
+            )
+        return

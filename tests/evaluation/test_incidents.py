@@ -1,0 +1,113 @@
+"""Errors that few poses make, and paths that have nothing in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from boxplus.evaluation.evaluation import evaluate
+from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
+from tests.evaluation.test_other_meanings import moved, path, told
+
+KINDS = ["none", "origin", "yaw", "se3", "sim3"]
+
+
+@pytest.mark.parametrize("alignment", ["yaw", "se3", "sim3"])
+def test_poses_far_off_are_counted(alignment: str) -> None:
+    estimate = path(1, 0.03)
+    p = estimate.p.copy()
+    p[[100, 101, 350]] += [30.0, -20.0, 5.0]
+    assert "3 of the 600 poses are off by more than 10 times the median error" in told(moved(estimate, p), alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", KINDS)
+def test_a_jump_is_told_with_its_time(alignment: str) -> None:
+    estimate = path(1, 0.02)
+    p = estimate.p.copy()
+    p[300:] += [3.0, 2.0, 0.0]
+    assert "the estimate jumps 1 times against the ground truth, by 3.6" in told(moved(estimate, p), alignment=alignment)
+    assert "at 30.00 s" in told(moved(estimate, p), alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", KINDS)
+def test_an_estimate_that_stops_is_told(alignment: str) -> None:
+    estimate = path(1, 0.03)
+    p = estimate.p.copy()
+    p[400:] = p[400]
+    assert "the estimate repeats one position from 40.00 s to 59.90 s" in told(moved(estimate, p), alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", ["none", "se3"])
+def test_paths_of_different_runs_are_told(alignment: str) -> None:
+    rng = np.random.default_rng(5)
+    other = np.cumsum(rng.normal(size=(600, 3)), axis=0)
+    assert "have nothing in common" in told(moved(path(), other), alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
+def test_inverted_poses_are_told_however_the_frames_are_aligned(alignment: str) -> None:
+    estimate = path(1, 0.03)
+    R = estimate.R.transpose(0, 2, 1)
+    inverted = moved(estimate, -np.einsum("nij,nj->ni", R, estimate.p), R)
+    assert "seem to be those of the world in the body" in told(inverted, alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", ["none", "se3"])
+def test_conjugate_quaternions_are_told(alignment: str) -> None:
+    estimate = path(1, 0.03)
+    conjugate = replace(estimate, q_wxyz=estimate.q_wxyz * [1.0, -1.0, -1.0, -1.0])
+    assert "if those of one file are inverted and its positions are not: conjugate" in told(conjugate, alignment=alignment)
+    assert "of the world in the body" not in told(conjugate, alignment=alignment)
+
+
+@pytest.mark.parametrize("alignment", KINDS)
+def test_another_point_of_the_body_is_told_of_a_body_that_only_turns_about_one_axis(alignment: str) -> None:
+    flat = path()
+    yaw = np.linspace(0.0, 9.0, 600)
+    R = so3.exp(np.stack([0.0 * yaw, 0.0 * yaw, yaw], 1))
+    truth = Trajectory(flat.time_ns, flat.p, quaternion.from_matrix(R))
+    noise = 0.01 * np.random.default_rng(0).standard_normal(flat.p.shape)
+    estimate = replace(truth, p=flat.p + noise + R @ np.array([0.6, -0.3, 0.0]))
+    warnings = evaluate(estimate, truth, alignment=alignment).warnings
+    (said,) = (text for text in warnings if "another point of the body" in text)
+    numbers = np.array(said.split("at (")[1].split(")")[0].split(","), dtype=float)
+    np.testing.assert_allclose(numbers, [-0.6, 0.3, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("alignment", ["none", "origin"])
+def test_of_straight_ways_scale_and_direction_are_told(alignment: str) -> None:
+    t = 0.1 * np.arange(300)
+    p = np.stack([5.0 * t + np.sin(t), 0.0 * t, 0.0 * t], 1)
+    stamps = np.round(1e9 * t).astype(np.int64)
+    truth = Trajectory(stamps, p, np.tile([1.0, 0.0, 0.0, 0.0], (300, 1)))
+    noise = 0.01 * np.random.default_rng(0).standard_normal(p.shape)
+    (said,) = (
+        text for text in evaluate(replace(truth, p=p / 1.2 + noise), truth, alignment=alignment).warnings if "scale" in text
+    )
+    assert said.startswith("1.2 times as large the estimate has")
+    turned = replace(truth, p=(p + noise) @ so3.exp(np.array([[0.0, 0.0, 0.3]]))[0].T)
+    said = " ".join(evaluate(turned, truth, alignment=alignment).warnings)
+    assert "both ways are straight, in directions that differ by 17.2°" in said
+    assert evaluate(replace(truth, p=p + noise), truth, alignment="none").warnings == ()
+
+
+def test_rounded_stamps_are_told() -> None:
+    truth = path()
+    fast = replace(truth, p=10.0 * truth.p)
+    rows = np.arange(5, 590, 3)
+    stamps = truth.time_ns[rows] + np.random.default_rng(0).integers(0, 150_000_000, len(rows))
+    p = np.stack([np.interp(stamps, truth.time_ns, axis) for axis in fast.p.T], 1)
+    estimate = Trajectory(stamps, p, truth.q_wxyz[rows])
+    rounded = replace(estimate, time_ns=np.round(stamps * 1e-8).astype(np.int64) * 100_000_000)
+    said = " ".join(evaluate(rounded, fast, method="interpolate").warnings)
+    assert "all stamps of the estimate are multiples of 0.1 s" in said
+    assert "multiples" not in " ".join(evaluate(estimate, fast, method="interpolate").warnings)
+
+
+@pytest.mark.parametrize("alignment", KINDS)
+def test_sound_estimates_have_no_incidents(alignment: str) -> None:
+    for seed in range(10, 20):
+        assert told(path(seed, 0.03), alignment=alignment) == ""
