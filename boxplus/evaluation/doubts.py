@@ -127,7 +127,7 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
     if conjugate < _CLEARLY * scatter:
         yield (
             f"the orientations scatter by {scatter:.0f}° as they were read, and by {conjugate:.1f}° if those of one file are "
-            "inverted and its positions are not: conjugate its quaternions, the rotation error and the relative errors mean nothing"
+            "inverted and its positions are not: conjugate its quaternions; rotation error and relative errors mean nothing"
         )
         return
     swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
@@ -244,7 +244,7 @@ def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment,
         if line is not None and alignment.kind != "yaw" and line.rigid_m < min(_CLEARLY * rmse, _FITS * line.spread_m):
             yield (
                 f"both ways are straight, in directions that differ by {line.angle_deg:.1f}°, and laid onto each other they are "
-                f"{line.rigid_m:.4g} m apart instead of {rmse:.4g} m: the worlds of the files, or the first poses, are not the same"
+                f"{line.rigid_m:.4g} m apart instead of {rmse:.4g} m: worlds, or first poses, of the files are not the same"
             )
         return
     if found.mirrored:
