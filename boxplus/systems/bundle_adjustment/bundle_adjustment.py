@@ -24,7 +24,7 @@ from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behin
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
 from boxplus.systems.bundle_adjustment.examination import Watch
-from boxplus.systems.bundle_adjustment.lens import lens_finding
+from boxplus.systems.bundle_adjustment.lens import lens_finding, lens_of_start
 from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
 from boxplus.systems.bundle_adjustment.plausibility import (
     coarse_doubt,
@@ -177,6 +177,9 @@ def adjust_bundle(
     left = _redundancy(problem, points, point_of)
     notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
     ids = getattr(reconstruction, "point_ids", None)
+    by_start = None if other_axes else lens_of_start(sound.reconstruction, sound.used, config)
+    if by_start is not None:
+        notes.append(by_start)
     notes += stray_notes(strayed, astray, ids)
     notes += point_notes(errors, point_of, _weights(problem, solution, loss), ids)
     is_given = "sigma_px" in config.model_fields_set

@@ -18,7 +18,7 @@ from boxplus.formats.reconstructions.between_formats import colmap_of
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
-from boxplus.optimization.losses import Loss
+from boxplus.optimization.losses import Huber, Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
@@ -31,6 +31,7 @@ _HINT = 0.3  # of the fall of the cost that counts, which the first step that is
 _CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
 _BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
+_ROUGH_PX, _OF_START, _STEPS = 2.0, 0.5, 10  # [px] median error of a start; share of it that another lens leaves; steps
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -110,6 +111,47 @@ def lens_finding(
         f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
         f"{solution.cost:.6g} and below, and the scene is bent by what they are wrong ({told_by})",
         most > _BENT and solution.cost < _FALLS * cost,
+    )
+
+
+def lens_of_start(start: Reconstruction, used: NDArray[np.bool_], config: BundleAdjustmentConfig) -> str | None:
+    """A sentence where the cameras and points of the start were made with another lens than the one that is held.
+
+    Few images hardly tell a lens: that one of two views is wrong shows in nothing that comes out.
+
+    Args:
+        used: (k,) observations that are adjusted.
+    """
+    if isinstance(start, GbpProblem):
+        used, start = used[np.argsort(start.camera_of, kind="stable")], _with_any_lens(start)
+    if not isinstance(start, ColmapModel) or config.intrinsics != "held":
+        return None
+    free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
+    seen, rows = Sightings.of(start), np.flatnonzero(used)
+    off = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+    if not off > _ROUGH_PX:
+        return None
+    problem = Problem()
+    cameras, points = add_reconstruction(problem, start, used, free, Huber(off / config.sigma_px))
+    problem.fix(cameras)
+    problem.fix(points)
+    try:
+        solution = problem.solve(config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": None}))
+    except BoxplusError:
+        return None
+    none = np.zeros(0)
+    other = adjusted_reconstruction(start, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
+    seen = Sightings.of(other)
+    left = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+    if not isinstance(other, ColmapModel) or not left < _OF_START * off:
+        return None
+    changes, most = _changes(start, other)
+    if not most > _BENT:
+        return None
+    told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
+    return (
+        f"cameras and points of the input were made with another lens than the one that is held: {told}; half of the points lie "
+        f"within {left:.3g} px of where they were seen by that, and within {off:.3g} px as it is: is the lens wrong?"
     )
 
 

@@ -14,6 +14,7 @@ from boxplus._jit import kernel
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 from boxplus.optimization.solution import Solution
+from boxplus.systems.pose_graph.problem import positions
 from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start
 
@@ -25,6 +26,7 @@ _SAME = 1e-3  # relative difference up to which two minima are one
 _WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an information matrix says nothing along some direction
 _ROUNDED, _DIGITS = 1e-9, 6  # by which numbers of edges that are there twice differ, and digits that they are sorted by
 _LISTED = 5
+_DRIFTED = 0.5  # of the median length of an edge, by which half of them may be off in what carries no information
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +229,28 @@ def undetermined_notes(graph: PoseGraph, solution: Solution) -> list[str]:
     return [
         f"the edges do not determine all poses; where they do not, the start decides: {told}" for told in solution.undetermined()
     ]
+
+
+def drifted_doubt(graph: PoseGraph, poses: NDArray[np.float64]) -> str | None:
+    """A sentence where poses that the edges leave free ended far from the very numbers that these edges give.
+
+    To be asked where there is something free: what has no information counts as nothing, and yet somebody wrote it down.
+
+    Args:
+        poses: at the end.
+    """
+    group = se3 if graph.dimension == 3 else se2
+    i, j = graph.edges.T
+    relative = group.compose(group.inverse(poses[i]), poses[j])
+    way, measured = positions(graph, relative), positions(graph, graph.measurements)
+    off = float(np.median(np.linalg.norm(way - measured, axis=1)))
+    length = float(np.median(np.linalg.norm(measured, axis=1)))
+    if not off > _DRIFTED * length:
+        return None
+    return (
+        f"along what the edges do not determine the poses are anywhere: half of the edges end {off:.3g} m and more beside what "
+        f"they say, and are {length:.3g} m long; give every direction some information, or fix poses"
+    )
 
 
 @kernel

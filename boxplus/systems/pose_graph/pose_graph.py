@@ -30,6 +30,7 @@ from boxplus.systems.pose_graph.contradictions import contradictions
 from boxplus.systems.pose_graph.doubts import (
     Fit,
     disagree,
+    drifted_doubt,
     local_notes,
     misfit,
     poor_fit_sentence,
@@ -210,11 +211,13 @@ def optimize_pose_graph(
     fit = _fit(graph, squared, weights, config, len(held))
     certificate = certify(replace(graph, poses=poses_end)) if config.certify else None
     notes = [*silent_notes(whole, silent), *repetition_notes(graph), *structure_notes(graph, held), *solution.notes]
-    notes += undetermined_notes(graph, solution)
+    free = undetermined_notes(graph, solution)
+    notes += free
     if fit.is_slack:
         notes.append(slack_sentence(fit))
     notes += local_notes(fit, minima)
-    reasons = [text for text in (misreading(graph),) if text]
+    drifted = drifted_doubt(graph, poses_end) if free else None
+    reasons = [text for text in (misreading(graph), drifted) if text]
     if verdict is not None:
         if fit.is_poor and not fit.is_contradiction:
             notes.append(f"{misfit(fit)}: information that is too optimistic, or false loop closures among those that were kept")

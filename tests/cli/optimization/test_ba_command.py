@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.reconstructions.bal import read_bal, write_bal
 from boxplus.formats.reconstructions.colmap import read_colmap, write_colmap
 from boxplus.formats.reconstructions.gbp import read_gbp, write_gbp
+from boxplus.manifolds import so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from tests.small_problems import bal_problem, colmap_model, gbp_problem
 
@@ -211,3 +213,22 @@ def test_a_folder_without_a_model_says_what_it_holds(tmp_path: Path) -> None:
     assert (
         f"got {tmp_path}, a folder with scene.txt – give the folder that has them (often sparse/0), or one BAL" in result.stderr
     )
+
+
+def test_inverted_poses_are_bad_input(tmp_path: Path) -> None:
+    scene = bal_problem()
+    cameras = scene.cameras.copy()
+    cameras[:, :3] *= -1.0
+    cameras[:, 3:6] = -np.einsum("nij,nj->ni", so3.exp(cameras[:, :3]), scene.cameras[:, 3:6])
+    write_bal(tmp_path / "scene.txt", replace(scene, cameras=cameras))
+    result = call(tmp_path / "scene.txt", "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "if the poses are inverted" in " ".join(result.stderr.split())
+
+
+def test_examinations_are_shown_under_what_they_ask(tmp_path: Path) -> None:
+    scene = bal_problem()
+    pixels = scene.pixels + np.abs(scene.pixels).max(axis=0)
+    write_bal(tmp_path / "scene.txt", replace(scene, pixels=pixels))
+    result = call(tmp_path / "scene.txt", "-o", tmp_path / "out")
+    assert "examining the result: pixels from a corner?" in result.output.splitlines()

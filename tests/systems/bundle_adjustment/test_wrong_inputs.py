@@ -440,3 +440,15 @@ def test_swapped_pixels_of_either_direction_of_y_are_named():
     for sign in ([1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]):
         told = adjust_bundle(replace(start, pixels=start.pixels[:, ::-1] * sign)).doubt
         assert ("are x and y of the pixels swapped?" in told) == (sign[0] * sign[1] > 0.0)
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+def test_a_start_that_was_made_with_another_lens_is_told(format):
+    """Of two views, which do not tell it otherwise."""
+    for seed in (100, 102, 104):
+        start = turning(seed, 0.5, format, cameras=2, points=120)
+        lens = np.array([500.0, 500.0, 40.0, -30.0])
+        other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
+        told = note_of(other, "were made with another lens than the one that is held")
+        assert "is the lens wrong?" in told
+        assert not any("another lens" in note for note in adjust_bundle(start).notes)

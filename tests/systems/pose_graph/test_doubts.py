@@ -178,3 +178,33 @@ def test_a_graph_without_any_information_is_refused():
     graph = simulate_pose_graph(poses=60, loops=0).graph
     with pytest.raises(InputError, match="edges that carry information"):
         optimize_pose_graph(replace(graph, information=np.zeros_like(graph.information)))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_poses_that_slide_along_what_has_no_information_are_not_trusted(dimension: int) -> None:
+    for seed in (2, 4, 6):
+        graph = simulate_pose_graph(dimension=dimension, poses=150, loops=60, seed=seed).graph
+        information = graph.information.copy()
+        information[:, -1, :] = information[:, :, -1] = 0.0
+        told = optimize_pose_graph(replace(graph, information=information)).doubt
+        assert told is not None and "along what the edges do not determine the poses are anywhere" in told
+        assert optimize_pose_graph(graph).doubt is None
+
+
+def test_a_height_that_nothing_measures_and_that_stays_where_it_is_is_trusted() -> None:
+    """A robot on a floor, as 3D edges without information on height, roll and pitch."""
+    for seed in (2, 4, 6):
+        flat = simulate_pose_graph(dimension=2, poses=150, loops=60, seed=seed).graph
+        poses, measurements = (_in_space(values) for values in (flat.poses, flat.measurements))
+        information = np.zeros((len(flat.edges), 6, 6))
+        information[:, 2, 2], information[:, 3, 3] = flat.information[:, 0, 0], flat.information[:, 1, 1]
+        information[:, 4, 4] = flat.information[:, 2, 2]
+        graph = replace(flat, dimension=3, poses=poses, measurements=measurements, information=information)
+        result = optimize_pose_graph(graph)
+        assert any("do not determine all poses" in note for note in result.notes)
+        assert result.doubt is None
+
+
+def _in_space(flat: np.ndarray) -> np.ndarray:
+    half, none = 0.5 * flat[:, 0], np.zeros(len(flat))
+    return np.column_stack([np.cos(half), none, none, np.sin(half), flat[:, 1], flat[:, 2], none])
