@@ -240,8 +240,10 @@ def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment,
     try:
         found = align(estimate.p, truth.p)
     except InputError:
-        line = _OnLine.of(estimate, truth)
-        if line is not None and alignment.kind != "yaw" and line.rigid_m < min(_CLEARLY * rmse, _FITS * line.spread_m):
+        line = _OnLine.of(alignment.apply(estimate), truth)
+        if line is None or alignment.kind == "yaw" or not line.rigid_m < min(_CLEARLY * rmse, _FITS * line.spread_m):
+            return
+        if line.angle_deg > _CONSTANT_DEG or rmse > _FITS * line.spread_m:  # less a first pose with noise explains
             yield (
                 f"both ways are straight, in directions that differ by {line.angle_deg:.1f}°, and laid onto each other they are "
                 f"{line.rigid_m:.4g} m apart instead of {rmse:.4g} m: worlds, or first poses, of the files are not the same"

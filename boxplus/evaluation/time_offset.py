@@ -107,6 +107,7 @@ def estimate_time_offset(
         alike = [fit for fit in fits if pair.are_alike(fit.offset_s, _ALIKE)]
         found = [TimeOffset(fit.offset_s, fit.correlation, fit.signal, fit.deviation_s) for fit in alike]
         told = _not_refuted(pair, _distinct(found))
+    told = [one for one in told if math.isfinite(one.deviation_s)]
     if not told:
         return None
     nearest, *others = _distinct(sorted(told, key=lambda one: abs(one.offset_s)))
@@ -148,7 +149,7 @@ def _not_refuted(pair: MotionPair, found: list[TimeOffset]) -> list[TimeOffset]:
 def _correlated(
     t_estimate: NDArray[np.int64], estimate: Trajectory, t_ground_truth: NDArray[np.int64], ground_truth: Trajectory
 ) -> list[TimeOffset]:
-    """The offsets at which the speeds correlate about as well as they do anywhere, if they do; of the better signal."""
+    """The offsets at which the speeds correlate about as well as they do anywhere, if they do; by either signal."""
     begin, end = max(t_estimate[0], t_ground_truth[0]), min(t_estimate[-1], t_ground_truth[-1])
     step = max(
         float(np.median(np.diff(t_ground_truth))), 0.2 * float(np.median(np.diff(t_estimate))), float(end - begin) / _MOST_SAMPLES
