@@ -135,14 +135,15 @@ def lens_of_start(start: Reconstruction, used: NDArray[np.bool_], config: Bundle
     cameras, points = add_reconstruction(problem, start, used, free, Huber(off / config.sigma_px))
     problem.fix(cameras)
     problem.fix(points)
-    try:
-        solution = problem.solve(config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": None}))
-    except BoxplusError:
-        return None
+    options = config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": None})
     none = np.zeros(0)
-    other = adjusted_reconstruction(start, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-    seen = Sightings.of(other)
-    left = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+    try:
+        solution = problem.solve(options)
+        other = adjusted_reconstruction(start, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
+        seen = Sightings.of(other)
+        left = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+    except BoxplusError:  # a start that no lens explains
+        return None
     if not isinstance(other, ColmapModel) or not left < _OF_START * off:
         return None
     changes, most = _changes(start, other)

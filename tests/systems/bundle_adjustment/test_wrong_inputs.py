@@ -447,8 +447,17 @@ def test_a_start_that_was_made_with_another_lens_is_told(format):
     """Of two views, which do not tell it otherwise."""
     for seed in (100, 102, 104):
         start = turning(seed, 0.5, format, cameras=2, points=120)
-        lens = np.array([500.0, 500.0, 40.0, -30.0])
+        lens = np.array([500.0, 600.0, 0.0, 0.0])
         other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
         told = note_of(other, "were made with another lens than the one that is held")
         assert "is the lens wrong?" in told
         assert not any("another lens" in note for note in adjust_bundle(start).notes)
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+def test_a_start_that_no_lens_explains_is_not_refused_for_it(format):
+    rng = np.random.default_rng(0)
+    for seed in range(100, 110):
+        start = turning(seed, 0.5, format, cameras=4)
+        points = start.points.mean(axis=0) + rng.normal(size=start.points.shape) * [3.0, 3.0, 1.0]
+        assert adjust_bundle(replace(start, points=points)).solution.cost >= 0.0
