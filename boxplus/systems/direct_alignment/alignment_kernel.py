@@ -289,10 +289,13 @@ def align_level(
         if status == NO_GRADIENT:
             break
         if is_better:
-            T_21[:] = trial
+            for i in range(T_21.shape[0]):
+                T_21[i] = trial[i]
             gain, offset, count, cost, total, weights = new_gain, new_offset, new_count, new_cost, new_total, new_weights
-            H[:] = H_trial
-            g[:] = g_trial
+            for i in range(g.shape[0]):
+                g[i] = g_trial[i]
+                for j in range(g.shape[0]):
+                    H[i, j] = H_trial[i, j]
         if is_small or not is_better:
             status = CONVERGED
         if not is_better:
