@@ -68,8 +68,8 @@ def _run_odometry() -> None:
     from boxplus.simulation.live_recording import as_recording
 
     # A car in a map box so small that it slides: every kernel of a run is called.
-    odometry = {"threads": 2, "box_side": 40.0, "detection_range": 5.0, "extrinsic_estimation": "on"}
-    recording = as_recording(simulate("moving_start", duration_s=3.0, lidar=SpinningLidar(azimuth_steps=500)))
+    odometry = {"threads": 1, "box_side": 40.0, "detection_range": 5.0, "extrinsic_estimation": "on"}
+    recording = as_recording(simulate("moving_start", duration_s=2.5, lidar=SpinningLidar(azimuth_steps=500)))
     with tempfile.TemporaryDirectory() as folder:
         run_odometry(recording, Path(folder) / "run", load_run_config(overrides={"odometry": odometry}))
 
@@ -172,7 +172,7 @@ def _follow_camera_and_imu() -> None:
     # A start at rest and one in motion, and a window from which keyframes leave.
     config = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})
     for scenario in ("room", "room_moving"):
-        simulation = simulate_cameras(scenario, 1, duration_s=4.0, rig=make_rig("stereo", None, 0.3, 15.0))
+        simulation = simulate_cameras(scenario, 1, duration_s=2.5, rig=make_rig("stereo", None, 0.3, 12.0))
         with tempfile.TemporaryDirectory() as folder:
             run_visual_odometry(as_camera_recording(simulation), Path(folder) / "run", config)
 
