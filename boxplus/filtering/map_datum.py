@@ -222,8 +222,9 @@ def _follow(
     _turn_into(noise, rotation, turned)
     _turn_into(alone, rotation, prior)
     both, moved = np.zeros((12, 12)), np.empty((12, 12))
-    both[:6, :6] = move
-    both[6:, 6:] = move
+    for i in range(6):  # an assignment of slices would bring in a library for its message, seconds of compiling
+        for j in range(6):
+            both[i, j] = both[6 + i, 6 + j] = move[i, j]
     for k in range(2):
         _congruence(both, joint[k], work, moved)
         for i in range(6):

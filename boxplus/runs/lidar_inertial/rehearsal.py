@@ -2,7 +2,7 @@
 
 A filter refines the mounting while it runs, but the map of its first seconds was made with the first guess, and stays: the path
 keeps what the guess was off. The first minute is therefore run twice. The first time is for the mounting alone; the run that is
-kept begins with what it has found. Measured: docs/lidar_inertial_odometry.md, section 9.
+kept begins with what it has found. Measured: docs/lidar_inertial_odometry.md, section 11.
 """
 
 from __future__ import annotations

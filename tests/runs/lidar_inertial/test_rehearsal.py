@@ -35,37 +35,37 @@ def _guess(T: np.ndarray, rotation_deg: float, translation_m: float, seed: int) 
 
 
 @pytest.fixture(scope="module", params=[0, 1])
-def walk(request: pytest.FixtureRequest) -> Simulation:
-    return simulate(make_scenario("walk", seed=request.param), duration_s=10.0, lidar=LIDAR)
+def flight(request: pytest.FixtureRequest) -> Simulation:
+    return simulate(make_scenario("stress_fast", seed=request.param), duration_s=12.0, lidar=LIDAR)
 
 
-def test_the_mounting_at_its_end_is_better_and_as_good_as_it_claims(walk: Simulation) -> None:
-    config = _guess(walk.T_imu_lidar, 1.0, 0.1, seed=3)
-    found = rehearse(as_recording(walk), config)
+def test_the_mounting_at_its_end_is_better_and_as_good_as_it_claims(flight: Simulation) -> None:
+    config = _guess(flight.T_imu_lidar, 1.0, 0.1, seed=3)
+    found = rehearse(as_recording(flight), config)
     assert found is not None and config.T_imu_lidar is not None
-    before = np.array(config.T_imu_lidar)[:3, 3] - walk.T_imu_lidar[:3, 3]
-    after = found.T_imu_lidar[:3, 3] - walk.T_imu_lidar[:3, 3]
+    before = np.array(config.T_imu_lidar)[:3, 3] - flight.T_imu_lidar[:3, 3]
+    after = found.T_imu_lidar[:3, 3] - flight.T_imu_lidar[:3, 3]
     assert np.linalg.norm(after) < 0.3 * np.linalg.norm(before)
     assert (np.abs(after) < 3.0 * found.std_m).all()
-    turn = np.degrees(np.linalg.norm(so3.log(found.T_imu_lidar[:3, :3].T @ walk.T_imu_lidar[:3, :3])))
+    turn = np.degrees(np.linalg.norm(so3.log(found.T_imu_lidar[:3, :3].T @ flight.T_imu_lidar[:3, :3])))
     assert turn < 3.0 * found.std_deg.max() < 1.0
     assert found.seconds > 5.0
 
 
-def test_what_finds_no_start_says_nothing(walk: Simulation) -> None:
-    scans = list(as_recording(walk))[:4]
+def test_what_finds_no_start_says_nothing(flight: Simulation) -> None:
+    scans = list(as_recording(flight))[:4]
     assert rehearse(scans, LioConfig()) is None
 
 
-def test_a_run_that_the_sensors_contradict_says_nothing(walk: Simulation) -> None:
-    T = walk.T_imu_lidar.copy()
+def test_a_run_that_the_sensors_contradict_says_nothing(flight: Simulation) -> None:
+    T = flight.T_imu_lidar.copy()
     T[:3, :3] = T[:3, :3] @ so3.exp(np.array([0.0, 1.0, 0.0]))
     config = LioConfig(T_imu_lidar=tuple(map(tuple, T.tolist())), extrinsic_estimation="gated")
-    assert rehearse(as_recording(walk), config) is None
+    assert rehearse(as_recording(flight), config) is None
 
 
-def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(walk: Simulation, tmp_path) -> None:
-    recording: Recording = as_recording(walk)
+def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(flight: Simulation, tmp_path) -> None:
+    recording: Recording = as_recording(flight)
     recording.info.T_imu_lidar = None
     extrinsic = choose_extrinsic(recording, LioConfig())
     assert "in a first run over" in extrinsic.text
@@ -77,7 +77,7 @@ def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(walk: Sim
     def worst(folder: str, begun_with: object) -> float:
         run_odometry(recording, tmp_path / folder, extrinsic=begun_with)
         path = read_trajectory(tmp_path / folder / "trajectory.csv")
-        true = walk.ground_truth(path.time_ns)
+        true = flight.ground_truth(path.time_ns)
         return float(np.linalg.norm((path.p - path.p[0]) - (true.p_world_imu - true.p_world_imu[0]), axis=1).max())
 
     assert worst("twice", extrinsic) < worst("once", replace(decided, refine=True))
