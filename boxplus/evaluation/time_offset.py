@@ -23,7 +23,8 @@ _ALIKE = 0.95  # correlation of the places as a whole, from which on an offset i
 _SURE = 3.0  # of its standard deviations, that an offset has to be to show
 # How much more of the variance an offset may leave than the best one, to be held against the motions.
 _AS_GOOD, _LEAST_UNEXPLAINED = 2.0, 0.02
-_MOST_FOUND, _SAME_S = 20, 0.02  # offsets that are held against the motions, and how far apart they are at least
+# Offsets beyond the near ones that are held against the motions: the nearest, and the best; and how far apart they are at least.
+_NEAREST, _BEST, _SAME_S = 15, 5, 0.02
 _PARTS, _FEW = 5, 2.2  # of the way, by which an offset scatters; what Student's t makes of three deviations of so few, over three
 _NAMED = 3
 
@@ -173,7 +174,18 @@ def _correlated(
                 found.append(TimeOffset(lag * step * 1e-9, correlation, signal, deviation))
     best = max((one.correlation for one in found), default=0.0)
     able = [one for one in found if _unexplained(one.correlation) < _AS_GOOD * _unexplained(best) + _LEAST_UNEXPLAINED]
-    return _distinct(sorted(able, key=lambda one: -one.correlation))[:_MOST_FOUND]
+    return _chosen(_distinct(sorted(able, key=lambda one: -one.correlation)))
+
+
+def _chosen(found: list[TimeOffset]) -> list[TimeOffset]:
+    """Of offsets in order of their correlation all near ones, the nearest of the others and the best of these.
+
+    Where steps repeat themselves for minutes, noise decides which of a hundred peaks is the highest; the smallest is what counts.
+    """
+    near = [one for one in found if abs(one.offset_s) <= _NEAR[0]]
+    far = [one for one in found if abs(one.offset_s) > _NEAR[0]]
+    by_size = sorted(far[_BEST:], key=lambda one: abs(one.offset_s))
+    return [*near, *far[:_BEST], *by_size[:_NEAREST]]
 
 
 def _unexplained(correlation: float) -> float:

@@ -12,6 +12,7 @@ from boxplus.errors import InputError
 from boxplus.evaluation.association import associate
 from boxplus.evaluation.clock_fit import MotionPair
 from boxplus.formats.trajectory import Trajectory
+from boxplus.manifolds import quaternion, so3
 from tests.evaluation.smooth_paths import SmoothPath, disturbed
 
 stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=40, unique=True).map(sorted)
@@ -241,6 +242,25 @@ def test_laps_that_differ_tell_a_lap_from_the_next() -> None:
         estimate = Trajectory(truth.times[rows] + round(1e9 * late_s), truth.p[rows], truth.q_wxyz[rows])
         found = associate(disturbed(estimate, 1, sigma_m=0.01, sigma_rad=0.002), truth).time_offset
         assert found.offset_s == pytest.approx(-late_s, abs=0.01) and not found.others_s
+
+
+@pytest.mark.parametrize("offset", [0.1, 0.25, 0.0])
+def test_of_a_hundred_steps_that_fit_the_nearest_is_found(offset: float) -> None:
+    """Five minutes of even steps around a circle, whose peaks differ by noise only."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 300.0, 0.05)
+
+    def walk(t: np.ndarray, noise: float) -> Trajectory:
+        turn, step = 0.04 * np.pi * t, 2.0 * np.pi * t
+        p = np.stack([3.0 * np.cos(turn), 3.0 * np.sin(turn), 0.04 * np.sin(step)], axis=1)
+        R = so3.exp(np.stack([0.05 * np.sin(step), 0.03 * np.sin(step + 0.5), 0.0 * t], axis=1))
+        R = R @ so3.exp(noise * rng.normal(size=p.shape))
+        return Trajectory(time_ns, p + noise * rng.normal(size=p.shape), quaternion.from_matrix(R))
+
+    time_ns = np.round(t * 1e9).astype(np.int64)
+    found = associate(walk(t + offset, 1e-3), walk(t, 0.0)).time_offset
+    assert found is not None and found.offset_s == pytest.approx(offset, abs=0.002)
+    assert np.isclose(found.others_s, offset - 1.0, atol=0.01).any()
 
 
 def test_an_offset_that_is_not_refined_has_a_deviation_that_holds() -> None:
