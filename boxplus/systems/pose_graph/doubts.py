@@ -27,6 +27,7 @@ _WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an informa
 _ROUNDED, _DIGITS = 1e-9, 6  # by which numbers of edges that are there twice differ, and digits that they are sorted by
 _LISTED = 5
 _DRIFTED = 0.5  # of the median length of an edge, by which half of them may be off in what carries no information
+_NO_LENGTH = 1e-6  # of the extent of the poses: measured lengths up to that say nothing of where poses lie
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +246,8 @@ def drifted_doubt(graph: PoseGraph, poses: NDArray[np.float64]) -> str | None:
     way, measured = positions(graph, relative), positions(graph, graph.measurements)
     off = float(np.median(np.linalg.norm(way - measured, axis=1)))
     length = float(np.median(np.linalg.norm(measured, axis=1)))
-    if not off > _DRIFTED * length:
+    extent = float(np.ptp(positions(graph, poses), axis=0).max())
+    if not length > _NO_LENGTH * extent or not off > _DRIFTED * length:
         return None
     return (
         f"along what the edges do not determine the poses are anywhere: half of the edges end {off:.3g} m and more beside what "

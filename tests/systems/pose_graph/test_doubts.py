@@ -205,6 +205,19 @@ def test_a_height_that_nothing_measures_and_that_stays_where_it_is_is_trusted() 
         assert result.doubt is None
 
 
+@pytest.mark.parametrize("lies", ["anywhere", "in one place"])
+def test_rotations_alone_are_no_places_that_were_missed(lies: str) -> None:
+    """Averaging of rotations: translations are zeros that carry no information."""
+    for seed in (2, 3):
+        graph = simulate_pose_graph(dimension=3, poses=150, loops=20, seed=seed).graph
+        information, Z, poses = graph.information.copy(), graph.measurements.copy(), graph.poses.copy()
+        information[:, 3:] = information[:, :, 3:] = 0.0
+        Z[:, 4:] = 0.0
+        if lies == "in one place":
+            poses[:, 4:] = 0.0
+        assert optimize_pose_graph(replace(graph, poses=poses, measurements=Z, information=information)).doubt is None
+
+
 def _in_space(flat: np.ndarray) -> np.ndarray:
     half, none = 0.5 * flat[:, 0], np.zeros(len(flat))
     return np.column_stack([np.cos(half), none, none, np.sin(half), flat[:, 1], flat[:, 2], none])
