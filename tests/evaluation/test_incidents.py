@@ -40,6 +40,20 @@ def test_an_estimate_that_stops_is_told(alignment: str) -> None:
     assert "the estimate repeats one position from 40.00 s to 59.90 s" in told(moved(estimate, p), alignment=alignment)
 
 
+@pytest.mark.parametrize("alignment", KINDS)
+def test_a_start_that_stands_in_a_noisy_ground_truth_is_no_stop(alignment: str) -> None:
+    """Fifteen seconds on the ground, then a flight through a room; the noise adds up to more than the room's tenth."""
+    rng = np.random.default_rng(1)
+    stamps = 10_000_000 * np.arange(7500)
+    t = np.maximum(1e-9 * stamps - 15.0, 0.0)
+    p = np.stack([2.0 * np.sin(0.3 * t), 1.5 * np.sin(0.43 * t), 0.5 * np.sin(0.2 * t)], 1)
+    q = quaternion.from_matrix(so3.exp(np.stack([0.2 * np.sin(0.5 * t), 0.2 * np.sin(0.7 * t), 0.5 * np.sin(0.33 * t)], 1)))
+    truth = Trajectory(stamps, p + 1e-3 * rng.normal(size=p.shape), q)
+    drift = np.where(t[::10, None] > 0.0, rng.normal(size=(750, 3)), 0.0).cumsum(axis=0) * 2e-3
+    estimate = Trajectory(stamps[::10], p[::10] + drift, q[::10])
+    assert evaluate(estimate, truth, alignment=alignment).warnings == ()
+
+
 @pytest.mark.parametrize("alignment", ["none", "se3"])
 def test_paths_of_different_runs_are_told(alignment: str) -> None:
     rng = np.random.default_rng(5)
