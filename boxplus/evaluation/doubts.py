@@ -26,6 +26,7 @@ _FITS = 0.1  # of the size of the path: an error up to which the positions are o
 _CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
 _UNLIKE = 0.6  # of the size of the path, that an alignment leaves of one with which it has nothing in common
+_OVER_NOISE = 3.0  # times the noise of the estimate, over which the path has to spread for another one to show
 _STRAIGHT = 0.02  # second against first principal deviation, up to which a way is straight
 
 
@@ -123,10 +124,17 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
                 "nothing"
             )
             return
-    conjugate = _scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R)
-    if conjugate < _CLEARLY * scatter:
+    conjugates = {
+        "the estimate": _scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R),
+        "the ground truth": _scatter_deg(R @ estimate.R, truth.R.transpose(0, 2, 1)),
+    }
+    which = min(conjugates, key=lambda name: conjugates[name])
+    least, other_way = conjugates[which], max(conjugates.values())
+    if least < _CLEARLY * scatter:
+        if other_way < _AS_GOOD * least:  # of one world, either undoes it
+            which = "one file"
         yield (
-            f"the orientations scatter by {scatter:.0f}° as they were read, and by {conjugate:.1f}° if those of one file are "
+            f"the orientations scatter by {scatter:.0f}° as they were read, and by {least:.1f}° if those of {which} are "
             "inverted and its positions are not: conjugate its quaternions; rotation error and relative errors mean nothing"
         )
         return
@@ -269,13 +277,23 @@ def _unrelated_doubts(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
     except InputError:
         return
     # The median, as few poses far off are no other path.
-    error = float(np.median(np.linalg.norm(found.apply(estimate).p - truth.p, axis=1)))
+    moved = found.apply(estimate).p
+    error = float(np.median(np.linalg.norm(moved - truth.p, axis=1)))
     size = float(np.linalg.norm(found.spread_m))
-    if error > _UNLIKE * size:
+    if error > _UNLIKE * size and size > _OVER_NOISE * _noise(moved, truth.p):
         yield (
             f"laid onto each other as well as possible half of the poses are still {error:.4g} m apart, where the path spreads "
             f"over {size:.4g} m: the two have nothing in common, the estimate is lost, or the files are not of the same run"
         )
+
+
+def _noise(p: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """Root mean square of the noise of positions (M, 3), as their second differences exceed those of the motion [m].
+
+    Zero of fewer than three.
+    """
+    own, true = (float((np.diff(x, 2, axis=0) ** 2).sum()) for x in (p, truth))
+    return float(np.sqrt(max(own - true, 0.0) / (6.0 * max(len(p) - 2, 1))))  # of white noise: 1² + 2² + 1²
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,6 +77,37 @@ def test_conjugate_quaternions_are_told(alignment: str) -> None:
     assert "of the world in the body" not in told(conjugate, alignment=alignment)
 
 
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+def test_of_conjugate_quaternions_it_is_told_whose(alignment: str) -> None:
+    """Where the worlds differ, only those of the right file can be undone."""
+    truth, sound = path(), path(1, 0.03)
+    world = so3.exp(np.array([[0.3, 0.2, 1.2]]))[0]
+    estimate = moved(sound, sound.p @ world.T, world @ sound.R)
+    for one in ("estimate", "ground truth"):
+        files = {"estimate": estimate, "ground truth": truth}
+        if one == "ground truth":
+            files[one] = moved(truth, truth.p @ world.T, world @ truth.R)
+            files["estimate"] = sound
+        files[one] = replace(files[one], q_wxyz=files[one].q_wxyz * [1.0, -1.0, -1.0, -1.0])
+        said = " // ".join(evaluate(files["estimate"], files["ground truth"], alignment=alignment).warnings)
+        assert f"if those of the {one} are inverted and its positions are not: conjugate" in said
+
+
+def _hovering(noise_m: float) -> tuple[Trajectory, Trajectory]:
+    """An estimate of a minute within millimetres and the ground truth of that."""
+    rng = np.random.default_rng(1)
+    whole = path()
+    wander = 1e-4 * rng.normal(size=whole.p.shape).cumsum(axis=0)
+    truth = moved(whole, wander + 5e-4 * rng.normal(size=wander.shape))
+    return moved(whole, wander + noise_m * rng.normal(size=wander.shape)), truth
+
+
+@pytest.mark.parametrize("alignment", ["none", "se3"])
+def test_noise_in_hovering_is_no_other_path(alignment: str) -> None:
+    for noise_m in (3e-3, 1e-2, 5e-2):
+        assert "nothing in common" not in " ".join(evaluate(*_hovering(noise_m), alignment=alignment).warnings)
+
+
 @pytest.mark.parametrize("alignment", KINDS)
 def test_another_point_of_the_body_is_told_of_a_body_that_only_turns_about_one_axis(alignment: str) -> None:
     flat = path()
