@@ -244,7 +244,7 @@ def evaluate(
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
-        *incident_doubts(aligned, truth, translation, estimate),
+        *incident_doubts(aligned, truth, translation, estimate, ground_truth),
     ]
     relative = []
     for delta in deltas:

@@ -18,17 +18,19 @@ _ROUNDED_NS = (1_000_000_000, 100_000_000, 10_000_000)
 _OF_ROUNDING, _EVEN = 0.3, 0.8  # of the whole error, that rounded stamps explain; share of equal steps that are no rounding's
 
 
-def incident_doubts(aligned: Trajectory, truth: Trajectory, translation: NDArray[np.float64], estimate: Trajectory) -> list[str]:
+def incident_doubts(
+    aligned: Trajectory, truth: Trajectory, translation: NDArray[np.float64], estimate: Trajectory, ground_truth: Trajectory
+) -> list[str]:
     """What to know of an error that few poses make.
 
     Args:
         aligned, truth: (M) matched poses in the frame of the ground truth. translation: (M,) errors [m].
-        estimate: all poses, as they are in the file.
+        estimate, ground_truth: all poses, as they are in the files.
     """
     if len(translation) < _LEAST or rms(translation) < _ROUNDING * float(np.abs(truth.p).max()):
         return []
     found = [*_far_off(aligned, translation), *_jumps(aligned, truth, translation), *_stands(aligned, truth)]
-    return [*found, *_rounded(estimate, truth, translation)]
+    return [*found, *_rounded(estimate, ground_truth, truth, translation)]
 
 
 def _when(trajectory: Trajectory, row: int) -> str:
@@ -73,13 +75,17 @@ def _stands(aligned: Trajectory, truth: Trajectory) -> Iterator[str]:
         )
 
 
-def _rounded(estimate: Trajectory, truth: Trajectory, translation: NDArray[np.float64]) -> Iterator[str]:
-    if estimate.time_ns is None or truth.time_ns is None:
+def _rounded(
+    estimate: Trajectory, ground_truth: Trajectory, truth: Trajectory, translation: NDArray[np.float64]
+) -> Iterator[str]:
+    if estimate.time_ns is None or ground_truth.time_ns is None or truth.time_ns is None:
         return
     for unit in _ROUNDED_NS:
         steps = np.unique(np.diff(estimate.time_ns), return_counts=True)[1]
         if (estimate.time_ns % unit).any() or steps.max() > _EVEN * steps.sum():  # even steps are those of a clock
             continue
+        if not (ground_truth.time_ns % unit).any():  # of one clock, which some poses were dropped of
+            return
         t = (truth.time_ns - truth.time_ns[0]) * 1e-9
         speed = float(np.linalg.norm(np.diff(truth.p, axis=0), axis=1).sum() / max(t[-1], 1e-9))
         makes = speed * unit * 1e-9 / np.sqrt(12.0)

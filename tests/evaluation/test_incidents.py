@@ -140,7 +140,7 @@ def test_of_straight_ways_scale_and_direction_are_told(alignment: str) -> None:
 
 
 def test_rounded_stamps_are_told() -> None:
-    truth = path()
+    truth = replace(path(), time_ns=path().times + 12_345_678)
     fast = replace(truth, p=10.0 * truth.p)
     rows = np.arange(5, 590, 3)
     stamps = truth.time_ns[rows] + np.random.default_rng(0).integers(0, 150_000_000, len(rows))
@@ -150,6 +150,13 @@ def test_rounded_stamps_are_told() -> None:
     said = " ".join(evaluate(rounded, fast, method="interpolate").warnings)
     assert "all stamps of the estimate are multiples of 0.1 s" in said
     assert "multiples" not in " ".join(evaluate(estimate, fast, method="interpolate").warnings)
+
+
+@pytest.mark.parametrize("method", ["nearest", "interpolate"])
+def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(method: str) -> None:
+    truth, sound = (replace(one, p=10.0 * one.p) for one in (path(), path(1, 0.003)))
+    rows = np.flatnonzero(np.random.default_rng(0).random(600) < 0.7)
+    assert evaluate(sound.select(rows), truth, method=method).warnings == ()
 
 
 @pytest.mark.parametrize("alignment", KINDS)
