@@ -177,7 +177,7 @@ def adjust_bundle(
     left = _redundancy(problem, points, point_of)
     notes = [*input_notes(reconstruction), *cheirality.notes(reconstruction), *depth.notes(reconstruction)]
     ids = getattr(reconstruction, "point_ids", None)
-    by_start = None if other_axes else lens_of_start(sound.reconstruction, sound.used, config)
+    by_start = None if other_axes else lens_of_start(sound.reconstruction, sound.used, config, solution, watch)
     if by_start is not None:
         notes.append(by_start)
     notes += stray_notes(strayed, astray, ids)

@@ -114,13 +114,16 @@ def lens_finding(
     )
 
 
-def lens_of_start(start: Reconstruction, used: NDArray[np.bool_], config: BundleAdjustmentConfig) -> str | None:
+def lens_of_start(
+    start: Reconstruction, used: NDArray[np.bool_], config: BundleAdjustmentConfig, solved: Solution, watch: Watch
+) -> str | None:
     """A sentence where the cameras and points of the start were made with another lens than the one that is held.
 
     Few images hardly tell a lens: that one of two views is wrong shows in nothing that comes out.
 
     Args:
         used: (k,) observations that are adjusted.
+        solved: where bundle adjustment ended: who stopped it does not wait for this.
     """
     if isinstance(start, GbpProblem):
         used, start = used[np.argsort(start.camera_of, kind="stable")], _with_any_lens(start)
@@ -128,23 +131,25 @@ def lens_of_start(start: Reconstruction, used: NDArray[np.bool_], config: Bundle
         return None
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     seen, rows = Sightings.of(start), np.flatnonzero(used)
-    off = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+    off = _median_error(seen, rows)
     if not off > _ROUGH_PX:
         return None
     problem = Problem()
     cameras, points = add_reconstruction(problem, start, used, free, Huber(off / config.sigma_px))
     problem.fix(cameras)
     problem.fix(points)
-    options = config.solver.model_copy(update={"max_iterations": _STEPS, "time_limit_s": None})
+    options = examination_options(problem, len(cameras), solved, config, watch)
+    if options is None:
+        return None
+    options = options.model_copy(update={"max_iterations": _STEPS})  # few, of the lens alone
     none = np.zeros(0)
     try:
-        solution = problem.solve(options)
+        solution = problem.solve(options, callback=watch.of("the lens of the start?"))
         other = adjusted_reconstruction(start, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-        seen = Sightings.of(other)
-        left = float(np.nanmedian(seen.errors(rows, seen.points[seen.point_of[rows]])))
+        left = _median_error(Sightings.of(other), rows)
     except BoxplusError:  # a start that no lens explains
         return None
-    if not isinstance(other, ColmapModel) or not left < _OF_START * off:
+    if watch.is_stopped or not isinstance(other, ColmapModel) or not left < _OF_START * off:
         return None
     changes, most = _changes(start, other)
     if not most > _BENT:
@@ -154,6 +159,13 @@ def lens_of_start(start: Reconstruction, used: NDArray[np.bool_], config: Bundle
         f"cameras and points of the input were made with another lens than the one that is held: {told}; half of the points lie "
         f"within {left:.3g} px of where they were seen by that, and within {off:.3g} px as it is: is the lens wrong?"
     )
+
+
+def _median_error(seen: Sightings, rows: NDArray[np.intp]) -> float:
+    """Of the points before their cameras [px]; NaN where there are none."""
+    errors = seen.errors(rows, seen.points[seen.point_of[rows]])
+    errors = errors[~np.isnan(errors)]
+    return float(np.median(errors)) if len(errors) else np.nan
 
 
 def _with_any_lens(gbp: GbpProblem) -> ColmapModel:
