@@ -54,18 +54,18 @@ def reading_doubt(reconstruction: Reconstruction, *, is_lens_held: bool) -> str 
         InputError: poses that are inverted, or whose rotations are in degrees or in another order; points in another unit.
     """
     seen = Sightings.of(reconstruction)
-    rows = np.arange(len(seen.pixels))[:: max(1, len(seen.pixels) // _MOST)]
-    if len(rows) < _LEAST:
+    rows = slice(None, None, max(1, len(seen.pixels) // _MOST))
+    seen = replace(seen, camera_of=seen.camera_of[rows], point_of=seen.point_of[rows], pixels=seen.pixels[rows])
+    if len(seen.pixels) < _LEAST:
         return None
-    off, pixels = _typical(seen, rows), seen.pixels[rows]
-    spread = float(np.median(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)))
+    off = _typical(seen)
+    spread = float(np.median(np.linalg.norm(seen.pixels - np.median(seen.pixels, axis=0), axis=1)))
     if not off > _OFF * spread:
         return None
-    readings = [*_readings(reconstruction, seen)]
+    readings = _readings(reconstruction, seen)
     if is_lens_held:
-        readings += _of_other_size(seen, rows, _principal_points(reconstruction, seen))
-    ways = [(_typical(way.sightings, rows), way) for way in readings]
-    least, way = min(ways, key=lambda one: one[0])
+        readings = itertools.chain(readings, _of_other_size(seen, _principal_points(reconstruction, seen)))
+    least, way = min(((_typical(way.sightings), way) for way in readings), key=lambda one: one[0])
     if not (least < _FAR_BETTER * off and least < _NEAR * spread):
         return None
     as_read = f"within {off:.3g} px" if np.isfinite(off) else "behind their cameras"
@@ -79,10 +79,10 @@ def reading_doubt(reconstruction: Reconstruction, *, is_lens_held: bool) -> str 
     )
 
 
-def _typical(seen: Sightings, rows: NDArray[np.intp]) -> float:
+def _typical(seen: Sightings) -> float:
     """Median error [px]; infinite where half of the points are behind their cameras."""
     with np.errstate(all="ignore"):
-        errors = seen.errors(rows, seen.points[seen.point_of[rows]])
+        errors = seen.errors(np.arange(len(seen.pixels)), seen.points[seen.point_of])
     return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
 
 
@@ -105,15 +105,14 @@ def _readings(own: Reconstruction, seen: Sightings) -> Iterator[_Reading]:
         yield _Reading(replace(seen, pixels=seen.pixels + centre), "with the principal point added to the pixels", of_lens, True)
 
 
-def _of_other_size(seen: Sightings, rows: NDArray[np.intp], centre: NDArray[np.float64]) -> Iterator[_Reading]:
+def _of_other_size(seen: Sightings, centre: NDArray[np.float64]) -> Iterator[_Reading]:
     """Of pixels that are so many times as far apart as those of this lens."""
     for size in _SIZES:
         advice = "are the pixels those of an image of another size than the focal length?"
         yield _Reading(replace(seen, pixels=size * seen.pixels), f"with pixels {size:g} times as large", advice, True)
-    about = np.broadcast_to(centre, seen.pixels.shape)[rows]
     with np.errstate(all="ignore"):
-        projected = seen.projections(rows, seen.points[seen.point_of[rows]]) - about
-        ratios = ((seen.pixels[rows] - about) * projected).sum(axis=1) / (projected**2).sum(axis=1)
+        projected = seen.projections(np.arange(len(seen.pixels)), seen.points[seen.point_of]) - centre
+        ratios = ((seen.pixels - centre) * projected).sum(axis=1) / (projected**2).sum(axis=1)
     size = float(np.median(ratios[np.isfinite(ratios)])) if np.isfinite(ratios).any() else 1.0
     if size > 0.0 and abs(np.log(size)) > _RESIZED:
         advice = "is the focal length wrong, or that of an image of another size?"
@@ -125,12 +124,13 @@ def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:
     as_it_is = replace(seen, R_camera_world=so3.exp(own.cameras[:, :3]), t=own.cameras[:, 3:6])
     inverted = _inverse(as_it_is)
     yield _Reading(_turned(inverted), "if the poses are inverted", _INVERT)
-    for pixels in (seen.pixels, own.pixels):
+    upwards = seen.pixels * [1.0, -1.0]  # as the file has them
+    for pixels in (seen.pixels, upwards):
         forward = replace(inverted, pixels=pixels)
         yield _Reading(forward, "if the poses are inverted and look along +z", f"{_INVERT}; {_BAL_AXES}")
     degrees = so3.exp(np.radians(own.cameras[:, :3])) * _HALF_TURN[:, None]
     yield _Reading(replace(seen, R_camera_world=degrees), "if the rotations are in degrees", "give them in radians")
-    yield _Reading(replace(as_it_is, pixels=own.pixels), "by cameras that look along +z, y downwards", _BAL_AXES, True)
+    yield _Reading(replace(as_it_is, pixels=upwards), "by cameras that look along +z, y downwards", _BAL_AXES, True)
 
 
 def _with_quaternions(own: GbpProblem | ColmapModel, seen: Sightings) -> Iterator[_Reading]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 import warnings
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
 from boxplus.systems.bundle_adjustment.lens import lens_of_start
+from boxplus.systems.bundle_adjustment.readings import reading_doubt
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.small_problems import scene
@@ -506,3 +508,22 @@ def test_a_start_all_behind_its_cameras_tells_no_lens_and_warns_of_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert lens_of_start(behind, used, BundleAdjustmentConfig(), solved, Watch(None)) is None
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_other_readings_of_many_observations_are_tried_on_few(format):
+    """Of all of them there is at most one copy, that of pixels counted downwards."""
+    start = reconstruction(100, format)
+    times, of = 400_000 // len(start.pixels), "image_of" if format == "colmap" else "camera_of"
+    many = replace(
+        start,
+        point_of=np.repeat(start.point_of, times),
+        pixels=np.repeat(start.pixels[:, ::-1], times, axis=0),
+        **{of: np.repeat(getattr(start, of), times)},
+    )
+    tracemalloc.start()
+    told = reading_doubt(many, is_lens_held=format != "bal")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "are x and y of the pixels swapped?" in told
+    assert peak < 3 * many.pixels.nbytes
