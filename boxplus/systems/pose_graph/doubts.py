@@ -14,7 +14,7 @@ from boxplus._jit import kernel
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 from boxplus.optimization.solution import Solution
-from boxplus.systems.pose_graph.problem import positions
+from boxplus.systems.pose_graph.problem import positions, residual_of, with_edges
 from boxplus.systems.pose_graph.start import components
 from boxplus.systems.pose_graph.starts import Start
 
@@ -26,7 +26,7 @@ _SAME = 1e-3  # relative difference up to which two minima are one
 _WEAK = 1e-10  # pivot, as a share of its diagonal entry, below which an information matrix says nothing along some direction
 _ROUNDED, _DIGITS = 1e-9, 6  # by which numbers of edges that are there twice differ, and digits that they are sorted by
 _LISTED = 5
-_DRIFTED = 0.5  # of the median length of an edge, by which half of them may be off in what carries no information
+_DRIFTED = 0.5  # of the median length of an edge, by which half of those without information in a direction may be off there
 _NO_LENGTH = 1e-6  # of the extent of the poses: measured lengths up to that say nothing of where poses lie
 
 
@@ -240,18 +240,25 @@ def drifted_doubt(graph: PoseGraph, poses: NDArray[np.float64]) -> str | None:
     Args:
         poses: at the end.
     """
-    group = se3 if graph.dimension == 3 else se2
-    i, j = graph.edges.T
-    relative = group.compose(group.inverse(poses[i]), poses[j])
-    way, measured = positions(graph, relative), positions(graph, graph.measurements)
-    off = float(np.median(np.linalg.norm(way - measured, axis=1)))
-    length = float(np.median(np.linalg.norm(measured, axis=1)))
+    axes = slice(-graph.dimension, None)
+    weights, directions = np.linalg.eigh(graph.information[:, axes, axes])
+    is_free = weights <= _WEAK * weights[:, -1:]
+    is_judged = np.asarray(is_free.any(axis=1))
+    judged = np.flatnonzero(is_judged)
+    if not len(judged):
+        return None
+    i, j = graph.edges[judged].T
+    error = residual_of(with_edges(graph, is_judged)).evaluate(poses[i], poses[j])[:, axes]
+    beside = np.einsum("nab,na->nb", directions[judged], error) * is_free[judged]
+    off = float(np.median(np.linalg.norm(beside, axis=1)))
+    length = float(np.median(np.linalg.norm(positions(graph, graph.measurements[judged]), axis=1)))
     extent = float(np.ptp(positions(graph, poses), axis=0).max())
     if not length > _NO_LENGTH * extent or not off > _DRIFTED * length:
         return None
     return (
-        f"along what the edges do not determine the poses are anywhere: half of the edges end {off:.3g} m and more beside what "
-        f"they say, and are {length:.3g} m long; give every direction some information, or fix poses"
+        "along what the edges do not determine the poses are anywhere: half of the edges without information there end "
+        f"{off:.3g} m and more beside what they say, and are {length:.3g} m long; give every direction some information, or fix "
+        "poses"
     )
 
 

@@ -218,6 +218,30 @@ def test_rotations_alone_are_no_places_that_were_missed(lies: str) -> None:
         assert optimize_pose_graph(replace(graph, poses=poses, measurements=Z, information=information)).doubt is None
 
 
+def test_edges_that_are_off_where_they_have_information_do_not_slide() -> None:
+    """The height of a robot on a floor stays where it is, and half of its odometry goes backwards."""
+    for seed in (2, 4, 6):
+        flat = simulate_pose_graph(dimension=2, poses=150, loops=60, seed=seed, sigma_translation=1.5).graph
+        poses, measurements = (_in_space(values) for values in (flat.poses, flat.measurements))
+        measurements[::2, 4:] *= -0.2
+        information = np.zeros((len(flat.edges), 6, 6))
+        information[:, [2, 3, 4], [2, 3, 4]] = flat.information[:, [0, 1, 2], [0, 1, 2]]
+        graph = replace(flat, dimension=3, poses=poses, measurements=measurements, information=information)
+        assert "the poses are anywhere" not in (optimize_pose_graph(graph).doubt or "")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_few_edges_that_slide_are_told(dimension: int) -> None:
+    """The last fifth of a way measures nothing sideways, and no loop holds it."""
+    for seed in (2, 4, 6):
+        graph = simulate_pose_graph(dimension=dimension, poses=150, loops=60, seed=seed).graph
+        late = graph.edges.max(axis=1) > 120
+        information = graph.information.copy()
+        information[late, -1, :] = information[late, :, -1] = 0.0
+        told = optimize_pose_graph(replace(graph, information=information)).doubt
+        assert told is not None and "along what the edges do not determine the poses are anywhere" in told
+
+
 def _in_space(flat: np.ndarray) -> np.ndarray:
     half, none = 0.5 * flat[:, 0], np.zeros(len(flat))
     return np.column_stack([np.cos(half), none, none, np.sin(half), flat[:, 1], flat[:, 2], none])
