@@ -26,7 +26,7 @@ _FITS = 0.1  # of the size of the path: an error up to which the positions are o
 _CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
 _STILL_DEG, _TURNED_DEG = 0.1, 10.0
 _UNLIKE = 0.6  # of the size of the path, that an alignment leaves of one with which it has nothing in common
-_OVER_NOISE = 3.0  # times the noise of the estimate, over which the path has to spread for another one to show
+_OVER_NOISE = 1.5  # times the noise of the estimate, which alone leaves a median of 0.9, and no other path shows up to
 _STRAIGHT = 0.02  # second against first principal deviation, up to which a way is straight
 
 
@@ -280,7 +280,7 @@ def _unrelated_doubts(estimate: Trajectory, truth: Trajectory) -> Iterator[str]:
     moved = found.apply(estimate).p
     error = float(np.median(np.linalg.norm(moved - truth.p, axis=1)))
     size = float(np.linalg.norm(found.spread_m))
-    if error > _UNLIKE * size and size > _OVER_NOISE * _noise(moved, truth.p):
+    if error > max(_UNLIKE * size, _OVER_NOISE * _noise(moved, truth.p)):
         yield (
             f"laid onto each other as well as possible half of the poses are still {error:.4g} m apart, where the path spreads "
             f"over {size:.4g} m: the two have nothing in common, the estimate is lost, or the files are not of the same run"

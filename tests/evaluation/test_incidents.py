@@ -61,6 +61,15 @@ def test_paths_of_different_runs_are_told(alignment: str) -> None:
     assert "have nothing in common" in told(moved(path(), other), alignment=alignment)
 
 
+@pytest.mark.parametrize("alignment", ["none", "se3"])
+def test_few_poses_of_a_different_run_are_told(alignment: str) -> None:
+    """Far apart, so that the way between them looks like noise."""
+    for seed in range(4):
+        other = np.cumsum(np.random.default_rng(seed).normal(size=(600, 3)), axis=0)
+        few = moved(path(), other).select(np.arange(0, 600, 15))
+        assert "have nothing in common" in told(few, alignment=alignment)
+
+
 @pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
 def test_inverted_poses_are_told_however_the_frames_are_aligned(alignment: str) -> None:
     estimate = path(1, 0.03)
