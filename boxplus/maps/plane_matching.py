@@ -158,10 +158,13 @@ def settle_normals(
     """
     total, squares, count = 0.0, 0.0, 0
     for n in range(len(fate)):
-        if fate[n] == USED or fate[n] == NOT_A_PLANE:
-            variance = planes[n, 4] if fate[n] == USED else plane_threshold * plane_threshold
-            total += variance
-            squares += variance * variance
+        if fate[n] == USED:
+            total += planes[n, 4]
+            squares += planes[n, 4] * planes[n, 4]
+            count += 1
+        elif fate[n] == NOT_A_PLANE:  # its σ², not a value that scatters about it
+            total += plane_threshold * plane_threshold
+            squares += 2.0 * plane_threshold**4
             count += 1
     common = total / max(count, 1)
     # Variances that come from one σ² and two degrees of freedom scatter by their mean: squares / count = 2 common².

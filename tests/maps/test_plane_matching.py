@@ -189,7 +189,7 @@ def test_the_variance_of_a_normal_is_drawn_to_that_of_all(seed: int) -> None:
     own = match.planes[used, 4]
     common = (own.sum() + rough * THRESHOLD**2) / max(len(own) + rough, 1)
     settle_normals(x.pack(), points, THRESHOLD, match.planes, match.fate)
-    squares = ((own**2).sum() + rough * THRESHOLD**4) / max(len(own) + rough, 1)
+    squares = ((own**2).sum() + 2.0 * rough * THRESHOLD**4) / max(len(own) + rough, 1)
     excess = squares - 2.0 * common**2
     dof = min(2.0 + 4.0 * common**2 / excess, 100.0) if excess > 0.0 else 100.0
     variance = (2.0 * own + dof * common) / (2.0 + dof)
@@ -200,6 +200,20 @@ def test_the_variance_of_a_normal_is_drawn_to_that_of_all(seed: int) -> None:
     along = np.einsum("ni,ni->n", match.planes[used, :3], ray)
     tilt = np.einsum("ni,ni->n", match.planes[used, 5:8], ray) ** 2 + np.einsum("ni,ni->n", match.planes[used, 9:12], ray) ** 2
     np.testing.assert_array_equal(match.fate[used], np.where(along**2 < 4.0 * variance * tilt, ONE_LINE, USED))
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.5, 0.6])
+def test_what_is_no_plane_does_not_make_smooth_ground_rough(share: float) -> None:
+    """Half of the neighbourhoods in the grass beside a road: the more they differ, the less they say of each other."""
+    random = np.random.default_rng(0)
+    planes, fate = np.zeros((4000, PLANE)), np.full(4000, USED, dtype=np.uint8)
+    planes[:, 2], planes[:, 4] = 1.0, 0.02**2 * random.exponential(size=4000)
+    fate[: int(share * 4000)] = NOT_A_PLANE
+    settle_normals(NavState.identity().pack(), np.tile(np.float32([5.0, 0.0, -2.0]), (4000, 1)), THRESHOLD, planes, fate)
+    common = share * THRESHOLD**2 + (1.0 - share) * 0.02**2
+    smooth = planes[fate == USED, 13]
+    assert np.median(smooth) < 0.75 * common
+    assert smooth.max() - smooth.min() > 2.0 * 0.02**2  # a plane's own noise still counts
 
 
 @pytest.mark.parametrize("spacing", [0.1, 0.2, 0.3, 0.5])

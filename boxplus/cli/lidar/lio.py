@@ -178,7 +178,7 @@ def run(
         if standing != "finished":
             own = stack.enter_context(claim_run_folder(folder, overwrite=overwrite, resume=resume))
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
-            extrinsic = choose_extrinsic(opened, config.odometry)
+            extrinsic = choose_extrinsic(opened, config.odometry, should_stop=asked)
         if standing == "finished":
             summary = finished_run(own, opened, config, extrinsic)
             terminal.say(f"{folder.name}: finished before, and left as it is")

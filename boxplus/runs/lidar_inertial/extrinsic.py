@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.manifolds import so3
 from boxplus.recordings.recording import Event, Recording
 from boxplus.runs.lidar_inertial.rehearsal import rehearse
 from boxplus.sensors.imu import ImuSamples
@@ -28,6 +29,7 @@ _CHECK = 6.0, 20.0
 _WIDE_DEG, _WIDE_M = 10.0, 0.3
 _LEVER_EXPLAINED = 0.8
 _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
+_MOST_SIGMAS = 4.0  # of the estimate, that a first run may leave it by
 _LEAST_DEG = 0.3  # what the scans' own errors leave of the rotation
 _NOBODY_SAYS = "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted"
 _REMEDY = "give --T-imu-lidar for the best result"
@@ -79,13 +81,18 @@ class Extrinsic:
         return LioConfig.model_validate(config.model_dump() | changes)
 
 
-def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
+def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Callable[[], bool] | None = None) -> Extrinsic:
     """The extrinsic from the configuration, else from the recording's static transforms, else estimated.
 
     Either way gyroscope, accelerometer and LiDAR are compared over the first seconds of rotation (`compare_sensors`): without a
     given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations; with one,
     what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
     deviation. An estimate is then refined by a first run over the beginning (`rehearsal`).
+
+    Args:
+        recording: opened.
+        config: of the odometry.
+        should_stop: asked during that first run; True ends it, and the estimate stays as it was.
 
     Raises:
         RecordingError: nothing at all could be read.
@@ -106,7 +113,7 @@ def choose_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic:
                     f"angular velocities in {recording.info.gyro_unit}, as they are read", finding.text, _UNIT_ADVICE
                 )
         text = "; ".join(finding.text for finding in found)
-        chosen = _rehearsed(recording, config, _estimated(agreement)) if known is None else known
+        chosen = _rehearsed(recording, config, _estimated(agreement), should_stop or (lambda: False)) if known is None else known
         return replace(chosen, warning="; ".join(filter(None, [text, chosen.warning])), contradiction=text)
     return known if known is not None else _estimated(None)
 
@@ -170,14 +177,22 @@ def _guessed(
     return Extrinsic(T, "estimated", text, True, warning, sigma, unknown=unknown)
 
 
-def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic) -> Extrinsic:
+def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic, should_stop: Callable[[], bool]) -> Extrinsic:
     """An estimate as a first run over the beginning of the recording refines it, where it can."""
     begun_with = found.applied_to(config)
     if found.source != "estimated" or found.unknown or found.sigma is None or begun_with.extrinsic_estimation == "off":
         return found
-    rehearsal = rehearse(recording, begun_with)
-    if rehearsal is None or rehearsal.std_m.max() > found.sigma[1]:
-        return found
+    rehearsal = rehearse(recording, begun_with, should_stop)
+    if not isinstance(rehearsal, str):
+        turned = np.degrees(np.linalg.norm(so3.log(found.T_imu_lidar[:3, :3].T @ rehearsal.T_imu_lidar[:3, :3])))
+        moved = np.linalg.norm(rehearsal.T_imu_lidar[:3, 3] - found.T_imu_lidar[:3, 3])
+        if turned > _MOST_SIGMAS * found.sigma[0] or moved > _MOST_SIGMAS * found.sigma[1]:
+            rehearsal = f"it left the estimate by {turned:.1f} deg and {moved:.2f} m"
+        elif rehearsal.std_m.max() > found.sigma[1]:
+            rehearsal = "the motion showed nothing more of it"
+    if isinstance(rehearsal, str):
+        kept = f"{found.text}; a first run over the beginning made no more of it: {rehearsal}"
+        return replace(found, text=kept, warning=found.warning.replace(found.text, kept))
     how = f"{found.text.partition(':')[0]} and in a first run over {rehearsal.seconds:.0f} s"
     return _guessed(rehearsal.T_imu_lidar, how, rehearsal.std_deg, rehearsal.std_m, open_axes=False)
 

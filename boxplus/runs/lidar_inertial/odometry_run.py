@@ -102,7 +102,7 @@ def run_odometry(
         nullcontext(folder) if isinstance(folder, RunFolder) else claim_run_folder(folder, overwrite=overwrite, resume=resume)
     )
     with claimed as run_folder:
-        extrinsic = extrinsic or choose_extrinsic(recording, config.odometry)
+        extrinsic = extrinsic or choose_extrinsic(recording, config.odometry, should_stop=should_stop)
         config = config.model_copy(update={"odometry": extrinsic.applied_to(config.odometry)})
         run = _Run(recording, run_folder, config, extrinsic, progress or (lambda _: None), view, companion)
         if resume:

@@ -7,12 +7,13 @@ kept begins with what it has found. Measured: docs/lidar_inertial_odometry.md, s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import BoxplusError
 from boxplus.filtering.nav_state import T_P_L, T_THETA_L, TANGENT
 from boxplus.recordings.recording import Event
 from boxplus.sensors.scan import Scan
@@ -22,6 +23,7 @@ from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdomet
 
 _LENGTH_S = 60.0
 _CAUTION = 2.0  # the same scans are used again, and neighbouring ones share their errors, which the covariance does not know
+_FLOOR_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,29 +43,48 @@ class Rehearsal:
     seconds: float
 
 
-def rehearse(events: Iterable[Event], config: LioConfig) -> Rehearsal | None:
+def rehearse(events: Iterable[Event], config: LioConfig, should_stop: Callable[[], bool]) -> Rehearsal | str:
     """Run the odometry over the first minute.
 
     Args:
         events: of the recording, from its beginning.
         config: with the mounting as far as it is known, and how well.
+        should_stop: asked between events; True ends it.
 
     Returns:
-        The mounting at the end; None where the run found no start, was lost, or is not to be trusted.
+        The mounting at the end; why there is none, where the run found no start, was lost, or is not to be trusted.
     """
     odometry = LidarInertialOdometry(config)
-    first: Estimate | None = None
+    estimates: list[tuple[int, str]] = []
     last: Estimate | None = None
-    for event in events:
-        for estimate in odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event):
-            first, last = first or estimate, estimate
-        if first is not None and last is not None and last.time_ns - first.time_ns > _LENGTH_S * 1e9:
-            break
-    if first is None or last is None or last.status == "lost" or odometry.contradiction is not None:
-        return None
+    try:
+        for event in _first_minute(events):
+            if should_stop():
+                return "it was interrupted"
+            for last in odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event):
+                estimates.append((last.time_ns, last.status))
+    except BoxplusError as error:  # the run itself will meet it, with what it has written until then
+        return f"it ended with an error ({error})"
+    if last is None:
+        return "it found no start"
+    if any(status == "lost" for _, status in estimates):
+        return "it was lost"
+    if odometry.contradiction is not None:
+        return f"it was not to be trusted ({odometry.contradiction})"
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = last.state.R_imu_lidar, last.state.p_imu_lidar
     rotation = np.linalg.eigvalsh(last.covariance[T_THETA_L:T_P_L, T_THETA_L:T_P_L])
-    translation = np.diag(last.covariance)[T_P_L:TANGENT]
-    seconds = (last.time_ns - first.time_ns) * 1e-9
-    return Rehearsal(T, _CAUTION * np.degrees(np.sqrt(rotation)), _CAUTION * np.sqrt(translation), seconds)
+    translation = np.maximum(_CAUTION * np.sqrt(np.diag(last.covariance)[T_P_L:TANGENT]), _FLOOR_M)
+    seconds = (last.time_ns - estimates[0][0]) * 1e-9
+    return Rehearsal(T, _CAUTION * np.degrees(np.sqrt(rotation)), translation, seconds)
+
+
+def _first_minute(events: Iterable[Event]) -> Iterable[Event]:
+    first_ns = None
+    for event in events:
+        now_ns = event.end_ns if isinstance(event, Scan) else int(event.time_ns[-1]) if len(event) else None
+        if now_ns is not None:
+            first_ns = now_ns if first_ns is None else first_ns
+            if now_ns - first_ns > _LENGTH_S * 1e9:
+                return
+        yield event

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +15,17 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.rehearsal import rehearse
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, make_scenario, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 LIDAR = SpinningLidar(azimuth_steps=300)
+
+
+def _never() -> bool:
+    return False
 
 
 def _guess(T: np.ndarray, rotation_deg: float, translation_m: float, seed: int) -> LioConfig:
@@ -41,8 +49,8 @@ def flight(request: pytest.FixtureRequest) -> Simulation:
 
 def test_the_mounting_at_its_end_is_better_and_as_good_as_it_claims(flight: Simulation) -> None:
     config = _guess(flight.T_imu_lidar, 1.0, 0.1, seed=3)
-    found = rehearse(as_recording(flight), config)
-    assert found is not None and config.T_imu_lidar is not None
+    found = rehearse(as_recording(flight), config, _never)
+    assert not isinstance(found, str) and config.T_imu_lidar is not None
     before = np.array(config.T_imu_lidar)[:3, 3] - flight.T_imu_lidar[:3, 3]
     after = found.T_imu_lidar[:3, 3] - flight.T_imu_lidar[:3, 3]
     assert np.linalg.norm(after) < 0.3 * np.linalg.norm(before)
@@ -52,24 +60,56 @@ def test_the_mounting_at_its_end_is_better_and_as_good_as_it_claims(flight: Simu
     assert found.seconds > 5.0
 
 
-def test_what_finds_no_start_says_nothing(flight: Simulation) -> None:
+def test_what_finds_no_start_says_so(flight: Simulation) -> None:
     scans = list(as_recording(flight))[:4]
-    assert rehearse(scans, LioConfig()) is None
+    assert rehearse(scans, LioConfig(), _never) == "it found no start"
 
 
-def test_a_run_that_the_sensors_contradict_says_nothing(flight: Simulation) -> None:
+def test_a_run_that_the_sensors_contradict_says_so(flight: Simulation) -> None:
     T = flight.T_imu_lidar.copy()
     T[:3, :3] = T[:3, :3] @ so3.exp(np.array([0.0, 1.0, 0.0]))
     config = LioConfig(T_imu_lidar=tuple(map(tuple, T.tolist())), extrinsic_estimation="gated")
-    assert rehearse(as_recording(flight), config) is None
+    found = rehearse(as_recording(flight), config, _never)
+    assert isinstance(found, str)
+    assert "lost" in found or "not to be trusted" in found
 
 
-def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(flight: Simulation, tmp_path) -> None:
+def test_it_can_be_stopped_and_leaves_an_error_to_the_run(flight: Simulation) -> None:
+    asked: list[int] = []
+
+    def at_the_fifth() -> bool:
+        asked.append(1)
+        return len(asked) == 5
+
+    assert rehearse(as_recording(flight), LioConfig(), at_the_fifth) == "it was interrupted"
+    assert len(asked) == 5
+    scan = next(event for event in as_recording(flight) if isinstance(event, Scan))
+    damaged = replace(scan, time_ns=scan.time_ns + 10**12)
+    found = rehearse([damaged], LioConfig(), _never)
+    assert isinstance(found, str) and found.startswith("it ended with an error")
+
+
+def test_it_reads_a_minute_of_events_even_where_nothing_starts() -> None:
+    read: list[int] = []
+
+    def samples() -> Iterator[ImuSamples]:
+        for second in range(3600):
+            read.append(second)
+            yield ImuSamples(np.array([second * 10**9]), np.zeros((1, 3)), np.zeros((1, 3)))
+
+    assert rehearse(samples(), LioConfig(), _never) == "it found no start"
+    assert len(read) < 70
+
+
+def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(flight: Simulation, tmp_path: Path) -> None:
     recording: Recording = as_recording(flight)
     recording.info.T_imu_lidar = None
     extrinsic = choose_extrinsic(recording, LioConfig())
     assert "in a first run over" in extrinsic.text
     assert extrinsic.sigma is not None and extrinsic.sigma[1] < 0.05
+    stopped = choose_extrinsic(recording, LioConfig(), should_stop=lambda: True)
+    assert stopped.text.endswith("a first run over the beginning made no more of it: it was interrupted")
+    assert stopped.text in stopped.warning
     decided = choose_extrinsic(recording, LioConfig(extrinsic_estimation="off"))
     assert "in a first run over" not in decided.text
     assert decided.sigma is not None and decided.sigma[1] >= extrinsic.sigma[1]
