@@ -144,7 +144,9 @@ class Evaluation:
                 "largest_stamp_difference_s": float(a.difference_s.max()),
                 "gaps_s": [list(gap) for gap in a.gaps],
                 "applied_offset_s": a.offset_s,
-                "time_offset": None if a.time_offset is None else asdict(a.time_offset),
+                "time_offset": None
+                if a.time_offset is None
+                else asdict(a.time_offset) | {"others_s": list(a.time_offset.others_s)},
             },
             "alignment": {
                 "kind": self.alignment.kind,

@@ -54,7 +54,7 @@ class PoseDirections:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(6,) bool, neither weak nor, where the threshold is below 1, of a ratio that noise alone would have."""
+        """(6,) bool, left when noise is off: neither weak nor, with a threshold below 1, of a ratio of noise alone."""
         return ~self.weak & (self.ratios > 1.0)
 
     def weakened(self, weight: float = 0.0) -> NDArray[np.float64]:
@@ -156,14 +156,14 @@ def with_weak_axis(directions: PoseDirections, axis: NDArray[np.float64]) -> Pos
 
 
 def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
-    """The Gauss-Newton step (6,) of the pose alone, along the measured directions; zero if there are none."""
+    """The Gauss-Newton step (6,) of the pose alone, without the weak directions; zero if all are weak."""
     step: NDArray[np.float64] = -strong_covariance(A, directions) @ b[:6]
     return step
 
 
 def strong_covariance(A: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
-    """(6, 6) covariance of the pose from A alone, zero along the directions that are not measured."""
-    strong = directions.basis[:, directions.measured]
+    """(6, 6) covariance of the pose from A alone, zero along the weak directions."""
+    strong = directions.basis[:, ~directions.weak]
     reduced = strong.T @ A[:6, :6] @ strong
     covariance: NDArray[np.float64] = strong @ np.linalg.solve(reduced, strong.T)
     return covariance

@@ -29,7 +29,7 @@ Of a sensor that sees one way, neither is what it has turned away from by as muc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,8 @@ class Correction:
         """
         gain = cov[_POSE][:, MEASURED] @ A
         noise = gain @ cov[MEASURED][:, _POSE]
-        return cls(gain[:, _POSE], noise, strong_covariance(A, directions), directions.lever_arm, facing)
+        alone = strong_covariance(A, replace(directions, weak=~directions.measured))
+        return cls(gain[:, _POSE], noise, alone, directions.lever_arm, facing)
 
     def share_left(self, moved: NDArray[np.float64], turned: NDArray[np.float64]) -> float:
         """Of the points compared before, the share still compared after a motion of the IMU, 0 to 1.

@@ -59,7 +59,7 @@ def test_a_threshold_below_one_makes_no_use_of_what_noise_alone_gives(seed: int)
     A, b = np.eye(12), random.normal(size=12)
     A[:6, :6] = S
     left, _ = _taken(A, b, directions)
-    covariance = strong_covariance(left, directions)
+    covariance = strong_covariance(left, replace(directions, weak=~directions.measured))
     assert np.isfinite(covariance).all()
     assert np.linalg.matrix_rank(covariance, tol=1e-9 * max(np.abs(covariance).max(), 1.0)) <= np.count_nonzero(
         directions.ratios > 1.0

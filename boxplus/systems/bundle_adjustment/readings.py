@@ -128,8 +128,11 @@ def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:
     for pixels in (seen.pixels, upwards):
         forward = replace(inverted, pixels=pixels)
         yield _Reading(forward, "if the poses are inverted and look along +z", f"{_INVERT}; {_BAL_AXES}")
-    degrees = so3.exp(np.radians(own.cameras[:, :3])) * _HALF_TURN[:, None]
-    yield _Reading(replace(seen, R_camera_world=degrees), "if the rotations are in degrees", "give them in radians")
+    degrees = replace(seen, R_camera_world=so3.exp(np.radians(own.cameras[:, :3])) * _HALF_TURN[:, None])
+    nothing = replace(seen, R_camera_world=np.broadcast_to(np.eye(3) * _HALF_TURN[:, None], degrees.R_camera_world.shape))
+    # Rotations that are noise about none at all fit better in degrees, too: as well as none at all.
+    if _typical(degrees) < 0.5 * _typical(nothing):
+        yield _Reading(degrees, "if the rotations are in degrees", "give them in radians")
     yield _Reading(replace(as_it_is, pixels=upwards), "by cameras that look along +z, y downwards", _BAL_AXES, True)
 
 
