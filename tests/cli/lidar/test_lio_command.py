@@ -148,9 +148,9 @@ def test_a_signal_before_the_first_scan_leaves_a_word(bag: Path, tmp_path: Path)
     code = """
 import os, signal, boxplus.runs.lidar_inertial.extrinsic as module
 choose = module.choose_extrinsic
-def interrupted(*arguments):
+def interrupted(*arguments, **options):
     os.kill(os.getpid(), signal.SIGTERM)
-    return choose(*arguments)
+    return choose(*arguments, **options)
 module.choose_extrinsic = interrupted
 from boxplus.cli import main
 main()
