@@ -145,8 +145,8 @@ def accumulate_planes(
         tilt = 0.0
         for first in (5, 9):
             tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
-        weight /= 1.0 + plane[14] * tilt / _SURE_TILT
-        plane[15] = weight
+        weight /= 1.0 + plane[13] * tilt / _SURE_TILT
+        plane[14] = weight
         pose_row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
         for i in range(size):
             wh = weight * h[i]

@@ -169,5 +169,5 @@ def _fit_patch(
     bent[9], bent[10], bent[11] = second * fx, second * fy, second * fz
     bent[8] = bent[5] * y[0] + bent[6] * y[1] + bent[7] * y[2]
     bent[12] = bent[9] * y[0] + bent[10] * y[1] + bent[11] * y[2]
-    bent[13] = bent[14] = variance
+    bent[13] = variance
     return True

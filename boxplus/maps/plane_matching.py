@@ -16,10 +16,9 @@ from boxplus.maps.plane_fit import fit_plane_into
 NEIGHBOURS = 5
 # A matched plane: unit normal u (0 to 2), offset uᵀq in the world (3), variance of its points about it (4), and twice a
 # vector g with its offset gᵀq (5 to 8, 9 to 12): the uncertainty of the normal, see `_normal_uncertainty`; and the variance of
-# a point that counts for that uncertainty (13), and the one that the plane is weighed with (14), here the plane's own; the
-# weight that it was given last (WEIGHT).
-WEIGHT = 15
-PLANE = 16
+# a point that counts for that uncertainty (13), here the plane's own; the weight that it was given last (WEIGHT).
+WEIGHT = 14
+PLANE = 15
 # Where one ring of the LiDAR alone has seen a surface, the five points lie on a line, and range noise makes them span the
 # plane of the beams: it would tie the sensor to its own scan pattern. Far away, where such a plane has the longest lever and
 # the rings lie far apart, the neighbours must spread across their longest extent by this variance [m²].
@@ -31,11 +30,8 @@ _GRAZING = 0.04
 _DEVIATIONS = 2.0
 # Five points of one line say nothing across it; among so many neighbours are points of the next line.
 MANY = 15
-_OWN_DOF = 2.0  # the five points of a plane leave two
-# What a scan's neighbourhoods are like counts for two degrees of freedom more than it has, and for no more than so many.
-_MOST_PRIOR_DOF = 100.0
-# For the weight of a plane for one only: there it is to tell smooth surfaces from rough ones.
-_WEIGHT_DOF = 1.0
+# Degrees of freedom that what a scan's neighbourhoods are like counts for; the five points of a plane leave two.
+_PRIOR_DOF, _OWN_DOF = 1.0, 2.0
 # A bound computed from rounded coordinates is widened by this, so that a warm start never loses a neighbour.
 _SLACK = 1.0 + 1e-5
 
@@ -118,7 +114,7 @@ def match_planes(
         plane = planes[n]
         plane[0], plane[1], plane[2] = fit[0], fit[1], fit[2]
         plane[3] = fit[3] + fit[0] * origin[0] + fit[1] * origin[1] + fit[2] * origin[2]
-        plane[4] = plane[13] = plane[14] = fit[7]
+        plane[4] = plane[13] = fit[7]
         _normal_uncertainty(fitted, fit, plane)
         for g in (5, 9):
             plane[g + 3] = (
@@ -143,39 +139,31 @@ def settle_normals(
     planes: NDArray[np.float64],
     fate: NDArray[np.uint8],
 ) -> None:
-    """Say how uncertain the normals of a scan's planes are (columns 13, 14), and refuse those that may as well contain their ray.
+    """Say how uncertain the normals of a scan's planes are (column 13), and refuse those that may as well contain their ray.
 
     Two degrees of freedom say little: where surfaces are smaller than the distance of the points, five lie on a plane by chance
-    every so often, and the better they do, the more the chance would count; on a wall five close points lie on a plane across it.
-    What is known of all the neighbourhoods, those that are no planes included, tells how likely that is (empirical Bayes: Efron
-    and Morris, 1973), and the more alike they are, the more it tells: docs/lidar_inertial_odometry.md, section 5.
+    every so often, and the better they do, the more the chance would count. What is known of all the neighbourhoods, those that
+    are no planes included, tells how likely that is (empirical Bayes: Efron and Morris, 1973).
 
     Args:
         x, p_lidar, plane_threshold: of `match_planes`, which has matched all points.
-        planes: (n, PLANE); columns 13 and 14 are drawn from the plane's own variance towards that of all neighbourhoods: what
-            noise of the normals makes is counted with the first, a plane is weighed with the second.
+        planes: (n, PLANE); column 13 is drawn from the plane's own variance towards that of all neighbourhoods.
         fate: (n,); planes that are refused change from USED to ONE_LINE.
     """
-    total, squares, count = 0.0, 0.0, 0
+    total, count = 0.0, 0
     for n in range(len(fate)):
         if fate[n] == USED:
             total += planes[n, 4]
-            squares += planes[n, 4] * planes[n, 4]
             count += 1
-        elif fate[n] == NOT_A_PLANE:  # its σ², not a value that scatters about it
+        elif fate[n] == NOT_A_PLANE:
             total += plane_threshold * plane_threshold
-            squares += 2.0 * plane_threshold**4
             count += 1
     common = total / max(count, 1)
-    # Variances that come from one σ² and two degrees of freedom scatter by their mean: squares / count = 2 common².
-    excess = squares / max(count, 1) - 2.0 * common * common
-    prior_dof = min(2.0 + 4.0 * common * common / max(excess, 1e-300), _MOST_PRIOR_DOF) if excess > 0.0 else _MOST_PRIOR_DOF
     for n in range(len(fate)):
         if fate[n] != USED:
             continue
         plane = planes[n]
-        plane[13] = (_OWN_DOF * plane[4] + prior_dof * common) / (_OWN_DOF + prior_dof)
-        plane[14] = (_OWN_DOF * plane[4] + _WEIGHT_DOF * common) / (_OWN_DOF + _WEIGHT_DOF)
+        plane[13] = (_OWN_DOF * plane[4] + _PRIOR_DOF * common) / (_OWN_DOF + _PRIOR_DOF)
         lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
         ix, iy, iz = (
             x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz,

@@ -28,7 +28,7 @@ class RegistrationConfig(Settings):
     map_sigma: float = Field(0.02, ge=0, description="standard deviation of a map point along a plane's normal [m]")
     min_points: int = Field(20, ge=6, description="fewest used points for an update; with fewer the scan is lost")
     weak_threshold: float = Field(
-        1.1,
+        1.3,
         ge=0,
         description="a direction is only predicted when 2000 points say less about it than so many times what noise would; "
         "fewer ask for more",

@@ -38,8 +38,8 @@ _MOST_MAP_POINTS = 5000  # that it leaves in the map
 _MOST_RAW = 12_000  # that it is undistorted and filtered from
 _PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
 _NODES = 21  # within a scan, of a known turning
-# The steps of a path have a floor of noise: a direction may count that says no more than noise.
-_WEAK = 0.65
+# The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
+_WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
