@@ -28,10 +28,8 @@ _SLOPE_S = 0.1  # shortest time over which a velocity is taken
 _TURN_S = 0.5  # over which rotations are compared
 _GAP_S, _GAP_STEPS = 0.25, 5.0  # and that of median steps: what is farther apart is not interpolated
 _STEPS, _SETTLED_S = 10, 1e-5
-_CLEARLY, _WORSE = (
-    4.0,
-    2.0,
-)  # standard deviations and times (of squares) by which an offset fits worse than another that refutes it
+# Standard deviations, and times (of squares), by which an offset fits worse than another that refutes it.
+_CLEARLY, _WORSE = 4.0, 2.0
 _ROUNDING = 1e-9  # of the squared slopes, that an alignment leaves of those it explains
 
 

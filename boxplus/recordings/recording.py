@@ -22,6 +22,13 @@ _LOG = logging.getLogger(__name__)
 Event = Scan | ImuSamples
 
 
+def end_ns(event: Event) -> int | None:
+    """The last instant of an event [ns]; None of samples without any."""
+    if isinstance(event, Scan):
+        return event.end_ns
+    return int(event.time_ns[-1]) if len(event) else None
+
+
 @dataclass(slots=True)
 class Tally:
     """What a reader counts while it reads.

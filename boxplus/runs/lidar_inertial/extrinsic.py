@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.recordings.recording import Event, Recording
+from boxplus.recordings.recording import Event, Recording, end_ns
 from boxplus.runs.lidar_inertial.rehearsal import rehearse
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -203,7 +203,7 @@ def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) 
     blocks: list[ImuSamples] = []
     first_ns = begin_ns = None
     for event in events:
-        now_ns = event.end_ns if isinstance(event, Scan) else int(event.time_ns[-1]) if len(event) else None
+        now_ns = end_ns(event)
         if now_ns is None:
             continue
         first_ns = now_ns if first_ns is None else first_ns

@@ -7,7 +7,7 @@ kept begins with what it has found. Measured: docs/lidar_inertial_odometry.md, s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import BoxplusError
 from boxplus.filtering.nav_state import T_P_L, T_THETA_L, TANGENT
-from boxplus.recordings.recording import Event
+from boxplus.recordings.recording import Event, end_ns
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
@@ -55,34 +55,34 @@ def rehearse(events: Iterable[Event], config: LioConfig, should_stop: Callable[[
         The mounting at the end; why there is none, where the run found no start, was lost, or is not to be trusted.
     """
     odometry = LidarInertialOdometry(config)
-    estimates: list[tuple[int, str]] = []
+    first: Estimate | None = None
     last: Estimate | None = None
     try:
         for event in _first_minute(events):
             if should_stop():
                 return "it was interrupted"
             for last in odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event):
-                estimates.append((last.time_ns, last.status))
+                first = first or last
+                if last.status == "lost":
+                    return "it was lost"
     except BoxplusError as error:  # the run itself will meet it, with what it has written until then
         return f"it ended with an error ({error})"
-    if last is None:
+    if first is None or last is None:
         return "it found no start"
-    if any(status == "lost" for _, status in estimates):
-        return "it was lost"
     if odometry.contradiction is not None:
         return f"it was not to be trusted ({odometry.contradiction})"
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = last.state.R_imu_lidar, last.state.p_imu_lidar
     rotation = np.linalg.eigvalsh(last.covariance[T_THETA_L:T_P_L, T_THETA_L:T_P_L])
     translation = np.maximum(_CAUTION * np.sqrt(np.diag(last.covariance)[T_P_L:TANGENT]), _FLOOR_M)
-    seconds = (last.time_ns - estimates[0][0]) * 1e-9
+    seconds = (last.time_ns - first.time_ns) * 1e-9
     return Rehearsal(T, _CAUTION * np.degrees(np.sqrt(rotation)), translation, seconds)
 
 
-def _first_minute(events: Iterable[Event]) -> Iterable[Event]:
-    first_ns = None
+def _first_minute(events: Iterable[Event]) -> Iterator[Event]:
+    first_ns: int | None = None
     for event in events:
-        now_ns = event.end_ns if isinstance(event, Scan) else int(event.time_ns[-1]) if len(event) else None
+        now_ns = end_ns(event)
         if now_ns is not None:
             first_ns = now_ns if first_ns is None else first_ns
             if now_ns - first_ns > _LENGTH_S * 1e9:

@@ -12,6 +12,7 @@ from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.manifolds.se3 import SE3Left
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.small_problems import in_camera, scene
 
@@ -99,3 +100,10 @@ def turned_around(start: BalProblem | GbpProblem | ColmapModel, chosen: np.ndarr
     T[chosen, :4] = quaternion.from_matrix(quaternion.to_matrix(np.ascontiguousarray(T[chosen, :4])) * turn[:, None])
     T[chosen, 4:] *= turn
     return replace(start, T_camera_world=T)
+
+
+def note_of(start: Reconstruction, beginning: str, **settings) -> str:
+    notes = adjust_bundle(start, **settings).notes
+    found = [note for note in notes if beginning in note]
+    assert len(found) == 1, notes
+    return found[0]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import tracemalloc
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,30 +10,18 @@ import pytest
 
 import boxplus as bp
 from boxplus.errors import BoxplusError, InputError, NotFiniteError
-from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
-from boxplus.manifolds import se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
-from boxplus.systems.bundle_adjustment.lens import lens_of_start
-from boxplus.systems.bundle_adjustment.readings import reading_doubt
+from boxplus.systems.bundle_adjustment.examination import examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction
-from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.small_problems import scene
-from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, perturbed, reconstruction, turning
+from tests.systems.bundle_adjustment.scenes import FORMATS, SIGMA, note_of, perturbed, reconstruction
 
 
 def chosen(start: Reconstruction, rows: np.ndarray) -> Reconstruction:
     """Of the observations only some."""
     return replace(start, camera_of=start.camera_of[rows], point_of=start.point_of[rows], pixels=start.pixels[rows])
-
-
-def note_of(start: Reconstruction, beginning: str, **settings) -> str:
-    notes = adjust_bundle(start, **settings).notes
-    found = [note for note in notes if beginning in note]
-    assert len(found) == 1, notes
-    return found[0]
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -345,51 +331,6 @@ def test_wrong_matches_are_triangulated_without_a_warning_of_numpy():
         assert adjust_bundle(replace(start, point_of=of)).doubt is not None
 
 
-def inverted(start: Reconstruction) -> Reconstruction:
-    """Poses from camera to world, where the format has them from world to camera."""
-    if not isinstance(start, BalProblem):
-        return replace(start, T_camera_world=se3.inverse(start.T_camera_world))
-    cameras = start.cameras.copy()
-    cameras[:, :3] *= -1.0
-    cameras[:, 3:6] = -np.einsum("nij,nj->ni", so3.exp(cameras[:, :3]), start.cameras[:, 3:6])
-    return replace(start, cameras=cameras)
-
-
-@pytest.mark.parametrize("format", FORMATS)
-def test_inverted_poses_are_refused_by_name(format):
-    for seed in range(100, 108):
-        start = reconstruction(seed, format)
-        with pytest.raises(InputError, match=r"if the poses are inverted.*give poses from world to camera, R → Rᵀ"):
-            adjust_bundle(inverted(start))
-        assert adjust_bundle(start).doubt is None
-
-
-@pytest.mark.parametrize("name", ["trafalgar-21-11315-pre", "dubrovnik-16-22106-pre", "ladybug-49-7776-pre"])
-def test_published_sets_with_inverted_poses_are_refused(name, shared_data):
-    start = bp.formats.read_bal(shared_data / "bal" / f"{name}.txt.bz2")
-    with pytest.raises(InputError, match="if the poses are inverted"):
-        adjust_bundle(inverted(start))
-
-
-@pytest.mark.parametrize("format", ["gbp", "colmap"])
-def test_quaternions_in_another_order_are_refused_by_name(format):
-    start = reconstruction(100, format)
-    T = start.T_camera_world.copy()
-    T[:, :4] = T[:, [1, 2, 3, 0]]
-    with pytest.raises(InputError, match="if the quaternions have another order"):
-        adjust_bundle(replace(start, T_camera_world=T))
-
-
-def test_rotations_in_degrees_and_points_in_millimetres_are_refused_by_name():
-    start = reconstruction(100, "bal")
-    cameras = start.cameras.copy()
-    cameras[:, :3] = np.degrees(cameras[:, :3])
-    with pytest.raises(InputError, match=r"if the rotations are in degrees.*give them in radians"):
-        adjust_bundle(replace(start, cameras=cameras))
-    with pytest.raises(InputError, match=r"if the points are 0\.001 times as large.*in the same unit"):
-        adjust_bundle(replace(start, points=1000.0 * start.points))
-
-
 def test_a_wild_pixel_does_not_move_the_middle_that_pixels_are_counted_from():
     start = reconstruction(100, "bal")
     pixels = start.pixels + np.abs(start.pixels).max(axis=0)
@@ -424,106 +365,3 @@ def test_examinations_are_seen_and_can_be_stopped(purpose, format, change):
 def _wrong_matches(start: Reconstruction) -> np.ndarray:
     rng = np.random.default_rng(0)
     return np.where(rng.random((len(start.pixels), 1)) < 0.05, rng.uniform(-60.0, 60.0, start.pixels.shape), 0.0)
-
-
-@pytest.mark.parametrize("format", ["gbp", "colmap"])
-@pytest.mark.parametrize("wrong", [0.6, 1.6])
-def test_a_focal_length_that_contradicts_the_start_of_two_views_is_not_trusted(format, wrong):
-    """Two images hardly tell a focal length; a start that was made with the right one does."""
-    for seed in (100, 102):
-        start = turning(seed, 0.5, format, cameras=2, points=120)
-        lens = np.array([wrong, wrong, 1.0, 1.0]) * 500.0 * [1.0, 1.0, 0.0, 0.0]
-        other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
-        told = adjust_bundle(other).doubt
-        found = re.search(r"with a focal length (\S+) times as large", told)
-        assert float(found[1]) == pytest.approx(1.0 / wrong, rel=0.03)
-        assert adjust_bundle(start).doubt is None
-
-
-def test_swapped_pixels_of_either_direction_of_y_are_named():
-    start = reconstruction(100, "bal")
-    for sign in ([1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]):
-        told = adjust_bundle(replace(start, pixels=start.pixels[:, ::-1] * sign)).doubt
-        assert ("are x and y of the pixels swapped?" in told) == (sign[0] * sign[1] > 0.0)
-
-
-@pytest.mark.parametrize("format", ["gbp", "colmap"])
-def test_a_start_that_was_made_with_another_lens_is_told(format):
-    """Of two views, which do not tell it otherwise."""
-    for seed in (100, 102, 104):
-        start = turning(seed, 0.5, format, cameras=2, points=120)
-        lens = np.array([500.0, 600.0, 0.0, 0.0])
-        other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
-        told = note_of(other, "were made with another lens than the one that is held")
-        assert "is the lens wrong?" in told
-        assert not any("another lens" in note for note in adjust_bundle(start).notes)
-
-
-@pytest.mark.parametrize("format", ["gbp", "colmap"])
-def test_a_start_that_no_lens_explains_is_not_refused_for_it(format):
-    rng = np.random.default_rng(0)
-    for seed in range(100, 110):
-        start = turning(seed, 0.5, format, cameras=4)
-        points = start.points.mean(axis=0) + rng.normal(size=start.points.shape) * [3.0, 3.0, 1.0]
-        assert adjust_bundle(replace(start, points=points)).solution.cost >= 0.0
-
-
-def _of_another_lens() -> Reconstruction:
-    start = turning(100, 0.5, "colmap", cameras=2, points=120)
-    return replace(start, camera_params=(np.array([500.0, 600.0, 0.0, 0.0]),))
-
-
-def test_the_look_at_the_lens_of_the_start_is_seen_and_can_be_stopped():
-    seen, purpose = [], "the lens of the start?"
-
-    def stop(step):
-        seen.append(step.purpose)
-        return step.purpose == purpose
-
-    result = adjust_bundle(_of_another_lens(), callback=stop)
-    assert seen.count(purpose) == 1 and seen[-1] == purpose
-    assert any(f"stopped while the result was examined ({purpose})" in note for note in result.notes)
-    assert not any("were made with another lens" in note for note in result.notes)
-
-
-def test_an_adjustment_that_was_stopped_does_not_look_at_the_lens_of_the_start():
-    seen = []
-
-    def stop(step):
-        seen.append(step.purpose)
-        return step.number >= 1
-
-    result = adjust_bundle(_of_another_lens(), callback=stop)
-    assert result.solution.status == "stopped" and not any(seen)
-    assert not any("were made with another lens" in note for note in result.notes)
-
-
-def test_a_start_all_behind_its_cameras_tells_no_lens_and_warns_of_nothing():
-    start = _of_another_lens()
-    seen = Sightings.of(start)
-    behind = replace(start, points=2.0 * seen.centers.mean(axis=0) - start.points)
-    errors = Sightings.of(behind).errors(np.arange(len(seen.pixels)), behind.points[seen.point_of])
-    assert np.isnan(errors).all()
-    solved, used = adjust_bundle(start).solution, np.ones(len(start.point_of), dtype=np.bool_)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert lens_of_start(behind, used, BundleAdjustmentConfig(), solved, Watch(None)) is None
-
-
-@pytest.mark.parametrize("format", FORMATS)
-def test_other_readings_of_many_observations_are_tried_on_few(format):
-    """Of all of them there is at most one copy, that of pixels counted downwards."""
-    start = reconstruction(100, format)
-    times, of = 400_000 // len(start.pixels), "image_of" if format == "colmap" else "camera_of"
-    many = replace(
-        start,
-        point_of=np.repeat(start.point_of, times),
-        pixels=np.repeat(start.pixels[:, ::-1], times, axis=0),
-        **{of: np.repeat(getattr(start, of), times)},
-    )
-    tracemalloc.start()
-    told = reading_doubt(many, is_lens_held=format != "bal")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert "are x and y of the pixels swapped?" in told
-    assert peak < 3 * many.pixels.nbytes

@@ -1,0 +1,80 @@
+"""Whether the start of an adjustment was made with another lens than the one that is held."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from boxplus.formats.reconstructions.reconstruction import Reconstruction
+from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.examination import Watch
+from boxplus.systems.bundle_adjustment.lens import lens_of_start
+from boxplus.systems.bundle_adjustment.sightings import Sightings
+from tests.systems.bundle_adjustment.scenes import note_of, turning
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+def test_a_start_that_was_made_with_another_lens_is_told(format):
+    """Of two views, which do not tell it otherwise."""
+    for seed in (100, 102, 104):
+        start = turning(seed, 0.5, format, cameras=2, points=120)
+        lens = np.array([500.0, 600.0, 0.0, 0.0])
+        other = replace(start, intrinsics=lens) if format == "gbp" else replace(start, camera_params=(lens,))
+        told = note_of(other, "were made with another lens than the one that is held")
+        assert "is the lens wrong?" in told
+        assert not any("another lens" in note for note in adjust_bundle(start).notes)
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+def test_a_start_that_no_lens_explains_is_not_refused_for_it(format):
+    rng = np.random.default_rng(0)
+    for seed in range(100, 110):
+        start = turning(seed, 0.5, format, cameras=4)
+        points = start.points.mean(axis=0) + rng.normal(size=start.points.shape) * [3.0, 3.0, 1.0]
+        assert adjust_bundle(replace(start, points=points)).solution.cost >= 0.0
+
+
+def _of_another_lens() -> Reconstruction:
+    start = turning(100, 0.5, "colmap", cameras=2, points=120)
+    return replace(start, camera_params=(np.array([500.0, 600.0, 0.0, 0.0]),))
+
+
+def test_the_look_at_the_lens_of_the_start_is_seen_and_can_be_stopped():
+    seen, purpose = [], "the lens of the start?"
+
+    def stop(step):
+        seen.append(step.purpose)
+        return step.purpose == purpose
+
+    result = adjust_bundle(_of_another_lens(), callback=stop)
+    assert seen.count(purpose) == 1 and seen[-1] == purpose
+    assert any(f"stopped while the result was examined ({purpose})" in note for note in result.notes)
+    assert not any("were made with another lens" in note for note in result.notes)
+
+
+def test_an_adjustment_that_was_stopped_does_not_look_at_the_lens_of_the_start():
+    seen = []
+
+    def stop(step):
+        seen.append(step.purpose)
+        return step.number >= 1
+
+    result = adjust_bundle(_of_another_lens(), callback=stop)
+    assert result.solution.status == "stopped" and not any(seen)
+    assert not any("were made with another lens" in note for note in result.notes)
+
+
+def test_a_start_all_behind_its_cameras_tells_no_lens_and_warns_of_nothing():
+    start = _of_another_lens()
+    seen = Sightings.of(start)
+    behind = replace(start, points=2.0 * seen.centers.mean(axis=0) - start.points)
+    errors = Sightings.of(behind).errors(np.arange(len(seen.pixels)), behind.points[seen.point_of])
+    assert np.isnan(errors).all()
+    solved, used = adjust_bundle(start).solution, np.ones(len(start.point_of), dtype=np.bool_)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert lens_of_start(behind, used, BundleAdjustmentConfig(), solved, Watch(None)) is None
