@@ -25,7 +25,8 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.backwards import surer_path
-from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans
+from boxplus.systems.lidar_inertial_agreement.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for_all
@@ -60,6 +61,7 @@ class Agreement:
             unit.
         planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
         in_feet: the accelerations again with the points taken for feet; None where they are not as thick as feet would be.
+        astray: that the motion an estimator expected is not the one its scans show; None where it is, or none was given.
     """
 
     path: LidarPath
@@ -70,6 +72,7 @@ class Agreement:
     gyro_power: float
     planes: PlaneTilt | None = None
     in_feet: TranslationFit | None = None
+    astray: Finding | None = None
 
 
 def compare_sensors(
@@ -119,12 +122,14 @@ def _compare(
     path = lidar_path(scans, config, guesses, expected=expected)
     found = _compared(path, imu, T_guess, T_declared)
     surer: LidarPath | None = path
-    if expected is not None and not explains_scans(path, scans, expected, config):
+    explained = None if expected is None else explained_scans(path, scans, expected, config)
+    astray = None if explained is None else explained.astray
+    if explained is not None and not explained.by_path:
         surer = None
     elif _doubtful(found, T_declared):
         surer = surer_path(path, scans, config, guesses)
     if surer is None:
-        return replace(found, rotation=None, translation=None)
+        return replace(found, rotation=None, translation=None, astray=astray)
     if surer is not path:
         found = _compared(surer, imu, T_guess, T_declared)
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
@@ -144,9 +149,8 @@ def _compare(
         # The gyroscope agreed with the first path: where it does not agree with the second, that has gone astray.
         if again.rotation is not None and again.rotation.explained > _EXPLAINED:
             found = again
-    if T_declared is None:
-        return found
-    return replace(found, planes=plane_tilt(found.path, scans, imu, T_declared[:3, :3], config))
+    planes = None if T_declared is None else plane_tilt(found.path, scans, imu, T_declared[:3, :3], config)
+    return replace(found, planes=planes, astray=astray)
 
 
 def _as_thick_as_feet(found: Agreement) -> bool:

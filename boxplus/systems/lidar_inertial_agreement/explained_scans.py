@@ -3,12 +3,14 @@
 Rings or columns of points far apart fit their own pattern: a registration may stay with it while the platform moves on,
 with small residuals, scan after scan. Seconds apart it shows. Under the right motion surfaces of the first scans are where the
 last scans see them; under a wrong one points lie beside them, or where nothing was. A path that explains its scans clearly worse
-than another motion does has gone astray, and cannot contradict that motion.
+than another motion does has gone astray, and cannot contradict that motion. The other way round, an estimator whose motion
+explains them clearly worse, and which is somewhere else by the end, has gone astray: no sample of the IMU has caused that path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +20,34 @@ from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Poses, Twist
 from boxplus.systems.lidar_inertial_agreement.surfaces import surface_distances
 
 _WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, paths that ride with a pattern 1.6 to 6
+# An estimate is called astray where it ends this far from a path that the scene shows in all but a few scans.
+_ASTRAY_RAD, _ASTRAY_M, _ASTRAY_SHARE, _FEW_WEAK = 0.1, 0.2, 0.05, 0.1
 _FEWEST_SCANS = 9
 _FIRST, _LAST = 6, 4  # scans of the first and of the last third
 _MOST_MAP_POINTS, _POINTS, _VOXEL_M = 5000, 1500, 0.4
 _FEWEST_JUDGED = 60  # points on surfaces: with less of them nothing is explained
 
 
-def explains_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Twist], config: RegistrationConfig) -> bool:
-    """Whether every long segment of `path` explains its scans about as well as the expected motion.
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """Which of two motions explains the scans.
+
+    Attributes:
+        by_path: whether every long segment of the path explains its scans about as well as the expected motion.
+        astray: that the expected motion explains them clearly worse, and leads elsewhere; None where it does not.
+    """
+
+    by_path: bool
+    astray: Finding | None
+
+
+def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Twist], config: RegistrationConfig) -> Explained:
+    """Lay the scans upon one another as a path says, and as an estimator does.
 
     Args:
         path: of `scans`.
@@ -38,14 +56,34 @@ def explains_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Tw
         config: sizes of map cells, and how far a point may lie from its plane.
     """
     time_ns, R, p = _reckoned(scans, expected)
+    by_path, astray = True, None
     for segment in np.unique(path.segment):
         part = path.part(path.segment == segment)
         chosen = scans_of(part.time_ns, scans)
         numbers = np.searchsorted(time_ns, [scan.end_ns for scan in chosen])
         other = time_ns[numbers], R[numbers], p[numbers]
-        if not one_motion(part.poses, other) and other_explains_better(chosen, part.poses, other, config):
-            return False
-    return True
+        if len(chosen) < _FEWEST_SCANS or one_motion(part.poses, other):
+            continue
+        own_misfit, other_misfit = _misfit(chosen, part.poses, config), _misfit(chosen, other, config)
+        by_path = by_path and own_misfit <= _WORSE * other_misfit
+        elsewhere = not one_motion(part.poses, other, _ASTRAY_RAD, _ASTRAY_M + _ASTRAY_SHARE * _way(part.poses))
+        if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and other_misfit > _WORSE * own_misfit:
+            astray = _astray(part.poses, other, float(np.sqrt(other_misfit / own_misfit)))
+    return Explained(by_path, astray)
+
+
+def _astray(own: Poses, other: Poses, worse: float) -> Finding:
+    seconds = float(own[0][-1] - own[0][0]) * 1e-9
+    turn, turn_other = np.degrees(_turns(own, other))
+    moved, moved_other = _moves(own, other)
+    way, way_other, apart = (float(np.linalg.norm(move)) for move in (moved, moved_other, moved - moved_other))
+    return Finding(
+        "astray",
+        f"over {seconds:.1f} s the scans, laid upon one another without the IMU, show that the LiDAR moved by {way:.1f} m and "
+        f"turned by {turn:.0f} deg; the estimate moved by {way_other:.1f} m and turned by {turn_other:.0f} deg, ends {apart:.1f} "
+        f"m from there, and lays the scans {worse:.1f} times farther from one another: it has gone astray. The IMU is not that of "
+        "this LiDAR, or a unit, a sign, T_imu_lidar or a clock is wrong (see 'boxplus inspect')",
+    )
 
 
 def scans_of(time_ns: NDArray[np.int64], scans: Sequence[Scan]) -> list[Scan]:
@@ -79,11 +117,24 @@ def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
 
 def one_motion(own: Poses, other: Poses, angle_rad: float = 0.01, distance_m: float = 0.05) -> bool:
     """Whether two motions end alike: then neither has gone astray on its own."""
-    (_, R, p), (_, R_other, p_other) = own, other
-    turned, turned_other = R[0].T @ R[-1], R_other[0].T @ R_other[-1]
-    moved, moved_other = R[0].T @ (p[-1] - p[0]), R_other[0].T @ (p_other[-1] - p_other[0])
+    turned, turned_other = own[1][0].T @ own[1][-1], other[1][0].T @ other[1][-1]
+    moved, moved_other = _moves(own, other)
     angle = float(np.linalg.norm(so3.log(turned.T @ turned_other)))
     return angle < angle_rad and float(np.linalg.norm(moved - moved_other)) < distance_m
+
+
+def _moves(*motions: Poses) -> list[NDArray[np.float64]]:
+    """(3,) [m] of each, from its first pose to its last, along the axes of the first."""
+    return [R[0].T @ (p[-1] - p[0]) for _, R, p in motions]
+
+
+def _turns(*motions: Poses) -> list[float]:
+    """Angle [rad] of each between its first pose and its last."""
+    return [float(np.linalg.norm(so3.log(R[0].T @ R[-1]))) for _, R, _ in motions]
+
+
+def _way(motion: Poses) -> float:
+    return float(np.linalg.norm(np.diff(motion[2], axis=0), axis=1).sum())
 
 
 def _misfit(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig) -> float:

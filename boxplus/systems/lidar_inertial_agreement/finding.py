@@ -16,6 +16,7 @@ Cause = Literal[
     "clock_drift",
     "force_sign",
     "length_scale",
+    "astray",
 ]
 
 

@@ -74,6 +74,7 @@ class Watch:
         self._take_up_after = _TAKEN_UP_AFTER
         self._decided = 0
         self._doubted = False
+        self._astray: Finding | None = None
         self._blind_scans = 0
         self._T_last: NDArray[np.float64] | None = None
         self._T_compared: NDArray[np.float64] = np.eye(4)
@@ -166,6 +167,9 @@ class Watch:
         lengths = self._lengths(agreement) if not findings else None
         if lengths is not None:
             findings.append(lengths)
+        if agreement.astray is not None:
+            self._astray = agreement.astray
+            findings.append(agreement.astray)
         decisive = bool(findings) or judges_rotation(agreement)
         end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
         wait, news = _UNDECIDED_EVERY_S, None
@@ -179,7 +183,7 @@ class Watch:
             elif findings and findings[0].axis is not None:
                 self.contradiction = findings[0]  # a mounting that is being corrected: about the axis it is off now
             elif not findings and before is not None and _clears(before, agreement):
-                self.contradiction = None
+                self.contradiction = self._astray  # a position once lost is not found again by moving rightly
         self._due_ns = end_ns + round(wait * 1e9)
         return None if news is None else news.text
 

@@ -14,6 +14,7 @@ from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLi
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]
@@ -38,6 +39,21 @@ def data(simulation: Simulation, fault: Fault | None = None) -> Data:
     blocks = [event for event in events if isinstance(event, ImuSamples)]
     joined = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time_ns", "gyro", "accel"))
     return [event for event in events if isinstance(event, Scan)], ImuSamples(*joined)
+
+
+def true_poses(simulation: Simulation, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    motion, T = simulation.ground_truth(time_ns), simulation.T_imu_lidar
+    R = motion.R_world_imu @ T[:3, :3]
+    return R, motion.p_world_imu + motion.R_world_imu @ T[:3, 3]
+
+
+def true_twists(simulation: Simulation, scans: list[Scan], factor: float = 1.0) -> list[Twist]:
+    found = []
+    for scan in scans:
+        R, p = true_poses(simulation, np.array([scan.start_ns, scan.end_ns]))
+        seconds = (scan.end_ns - scan.start_ns) * 1e-9
+        found.append((factor * so3.log(R[0].T @ R[1]) / seconds, factor * R[1].T @ (p[1] - p[0]) / seconds))
+    return found
 
 
 def turned(T: NDArray[np.float64], degrees: float, seed: int) -> NDArray[np.float64]:

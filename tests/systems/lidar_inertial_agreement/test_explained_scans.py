@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,9 +15,9 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.backwards import lidar_path_backwards, surer_path
-from boxplus.systems.lidar_inertial_agreement.explained_scans import explains_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Twist, lidar_path
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
+from boxplus.systems.lidar_inertial_agreement.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_poses, true_twists
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
 """Its columns lie six degrees apart: at ten metres a metre, along a column a sixth of that."""
@@ -38,21 +39,6 @@ def true_path(simulation: Simulation, scans: list[Scan]) -> LidarPath:
     return LidarPath(time_ns, R, p, np.tile(1e6 * np.eye(6), (K, 1, 1)), zeros, flags, np.zeros(K), np.zeros(K), 0)
 
 
-def true_poses(simulation: Simulation, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    motion, T = simulation.ground_truth(time_ns), simulation.T_imu_lidar
-    R = motion.R_world_imu @ T[:3, :3]
-    return R, motion.p_world_imu + motion.R_world_imu @ T[:3, 3]
-
-
-def true_twists(simulation: Simulation, scans: list[Scan], factor: float = 1.0) -> list[Twist]:
-    found = []
-    for scan in scans:
-        R, p = true_poses(simulation, np.array([scan.start_ns, scan.end_ns]))
-        seconds = (scan.end_ns - scan.start_ns) * 1e-9
-        found.append((factor * so3.log(R[0].T @ R[1]) / seconds, factor * R[1].T @ (p[1] - p[0]) / seconds))
-    return found
-
-
 def frozen(path: LidarPath) -> LidarPath:
     """A path that has not left its first pose."""
     K = len(path)
@@ -63,14 +49,28 @@ def frozen(path: LidarPath) -> LidarPath:
 def test_a_path_that_stays_while_the_platform_moves_explains_less() -> None:
     simulation, scans = crossing()
     path, expected = true_path(simulation, scans), true_twists(simulation, scans)
-    assert explains_scans(path, scans, expected, CONFIG)
-    assert not explains_scans(frozen(path), scans, expected, CONFIG)
+    explained = explained_scans(path, scans, expected, CONFIG)
+    assert explained.by_path
+    assert explained.astray is None
+    explained = explained_scans(frozen(path), scans, expected, CONFIG)
+    assert not explained.by_path
+    assert explained.astray is None
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.3])
-def test_an_estimator_that_is_wrong_does_not_discredit_a_path_that_is_right(factor: float) -> None:
+def test_an_estimator_that_is_wrong_is_called_astray_and_does_not_discredit_the_path(factor: float) -> None:
     simulation, scans = crossing()
-    assert explains_scans(true_path(simulation, scans), scans, true_twists(simulation, scans, factor), CONFIG)
+    explained = explained_scans(true_path(simulation, scans), scans, true_twists(simulation, scans, factor), CONFIG)
+    assert explained.by_path
+    assert explained.astray is not None
+    assert f"moved by {3.0 * 2.8:.1f} m" in explained.astray.text
+    assert f"the estimate moved by {factor * 3.0 * 2.8:.1f} m" in explained.astray.text
+
+
+def test_where_the_scene_does_not_show_the_path_no_estimate_is_astray() -> None:
+    simulation, scans = crossing()
+    path = replace(true_path(simulation, scans), weak=np.ones(len(scans), dtype=bool))
+    assert explained_scans(path, scans, true_twists(simulation, scans, 0.5), CONFIG).astray is None
 
 
 def test_of_a_path_forwards_and_one_backwards_the_better_one_is_taken() -> None:

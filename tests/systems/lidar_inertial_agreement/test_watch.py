@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement import watch
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, turned
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_twists, turned
 
 
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
@@ -55,11 +56,10 @@ def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float
     scans, imu = data(simulation)
     in_use = turned(simulation.T_imu_lidar, degrees, seed=3)
     following = watch.Watch(CONFIG, None)
-    still = np.zeros(3), np.zeros(3)
-    for k, scan in enumerate(scans):
+    for k, (scan, twist) in enumerate(zip(scans, true_twists(simulation, scans), strict=True)):
         samples = imu.time_ns // 100_000_000 == scan.start_ns // 100_000_000
         block = replace(imu, time_ns=imu.time_ns[samples], gyro=imu.gyro[samples], accel=imu.accel[samples])
-        following.add(scan, imu if k == 0 else block, in_use, still)
+        following.add(scan, imu if k == 0 else block, in_use, twist)
     following.finish()
     assert following.mounting_borne_out == (degrees < 1.0)
     if degrees < 1.0:
@@ -67,6 +67,23 @@ def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float
     else:
         assert following.contradiction is not None and following.contradiction.cause == "extrinsic"
         assert "under the mounting in use, which nobody gave" in following.contradiction.text
+
+
+def test_an_estimate_that_has_gone_astray_stays_contradicted_when_it_moves_rightly_again() -> None:
+    simulation = handheld(5, 12.0)
+    scans, imu = data(simulation)
+    right, wrong = true_twists(simulation, scans), true_twists(simulation, scans, 0.5)
+    following = watch.Watch(CONFIG, simulation.T_imu_lidar)
+    said = []
+    for k, scan in enumerate(scans):
+        said.append(following.add(scan, imu if k == 0 else _no(imu), simulation.T_imu_lidar, wrong[k] if k < 50 else right[k]))
+    following.finish()
+    assert [text for text in said if text is not None and "it has gone astray" in text]
+    assert following.contradiction is not None and following.contradiction.cause == "astray"
+
+
+def _no(imu: ImuSamples) -> ImuSamples:
+    return ImuSamples(imu.time_ns[:0], imu.gyro[:0], imu.accel[:0])
 
 
 def test_a_guess_that_was_corrected_does_not_stay_contradicted(monkeypatch: pytest.MonkeyPatch) -> None:
