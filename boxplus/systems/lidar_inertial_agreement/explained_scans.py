@@ -81,8 +81,8 @@ def _astray(own: Poses, other: Poses, worse: float) -> Finding:
         "astray",
         f"over {seconds:.1f} s the scans, laid upon one another without the IMU, show that the LiDAR moved by {way:.1f} m and "
         f"turned by {turn:.0f} deg; the estimate moved by {way_other:.1f} m and turned by {turn_other:.0f} deg, ends {apart:.1f} "
-        f"m from there, and lays the scans {worse:.1f} times farther from one another: it has gone astray. The IMU is not that of "
-        "this LiDAR, or a unit, a sign, T_imu_lidar or a clock is wrong (see 'boxplus inspect')",
+        f"m from there, and lays the scans {worse:.1f} times farther from one another: it has gone astray. The IMU is not that "
+        "of this LiDAR, or a unit, a sign, T_imu_lidar or a clock is wrong (see 'boxplus inspect')",
     )
 
 
