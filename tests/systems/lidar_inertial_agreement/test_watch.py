@@ -72,7 +72,7 @@ def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float
 def test_an_estimate_that_has_gone_astray_stays_contradicted_when_it_moves_rightly_again() -> None:
     simulation = handheld(5, 12.0)
     scans, imu = data(simulation)
-    right, wrong = true_twists(simulation, scans), true_twists(simulation, scans, 0.5)
+    right, wrong = true_twists(simulation, scans), true_twists(simulation, scans, 3.0)
     following = watch.Watch(CONFIG, simulation.T_imu_lidar)
     said = []
     for k, scan in enumerate(scans):
