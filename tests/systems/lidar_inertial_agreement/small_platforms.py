@@ -19,18 +19,19 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]
 LIDAR = SpinningLidar(channels=12, azimuth_steps=150)
+FINE = SpinningLidar(channels=32, azimuth_steps=400)
 LOW, HIGH = (-3.0, -2.0, 1.0), (3.0, 2.0, 2.5)
 
 Data = tuple[list[Scan], ImuSamples]
 
 
 @lru_cache(maxsize=8)
-def handheld(seed: int, seconds: float = 6.0, speed: float = 1.0, rate: float = 1.5) -> Simulation:
-    """A hand that swings and carries a LiDAR with 1800 rays a scan through a room of 12 x 9 x 4 m, mounted anyhow."""
+def handheld(seed: int, seconds: float = 6.0, speed: float = 1.0, rate: float = 1.5, lidar: SpinningLidar = LIDAR) -> Simulation:
+    """A hand that swings and carries a LiDAR through a room of 12 x 9 x 4 m, mounted anyhow."""
     random = np.random.default_rng(seed)
     T = mounting(*random.uniform(-180.0, 180.0, 3), tuple(random.uniform(-0.2, 0.2, 3)))
     motion = manoeuvres.handheld(seconds, LOW, HIGH, speed, rate, standstill_s=0.0, seed=seed)
-    return Simulation(Scenario("handheld", worlds.room(seed=seed), motion, LIDAR, ImuModel(), T), seed, seconds)
+    return Simulation(Scenario("handheld", worlds.room(seed=seed), motion, lidar, ImuModel(), T), seed, seconds)
 
 
 def data(simulation: Simulation, fault: Fault | None = None) -> Data:

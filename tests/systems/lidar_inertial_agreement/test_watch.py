@@ -17,7 +17,7 @@ from boxplus.systems.lidar_inertial_agreement import watch
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_twists, turned
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, FINE, data, handheld, true_poses, true_twists, turned
 
 
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
@@ -70,9 +70,12 @@ def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float
 
 
 def test_an_estimate_that_has_gone_astray_stays_contradicted_when_it_moves_rightly_again() -> None:
-    simulation = handheld(5, 12.0)
+    simulation = handheld(5, 12.0, lidar=FINE)
     scans, imu = data(simulation)
-    right, wrong = true_twists(simulation, scans), true_twists(simulation, scans, 3.0)
+    right = true_twists(simulation, scans)
+    R_world_lidar, _ = true_poses(simulation, np.array([scan.end_ns for scan in scans]))
+    runaway = np.array([2.0, 0.0, 0.0])  # m/s
+    wrong = [(rate, velocity + R.T @ runaway) for (rate, velocity), R in zip(right, R_world_lidar, strict=True)]
     following = watch.Watch(CONFIG, simulation.T_imu_lidar)
     said = []
     for k, scan in enumerate(scans):
