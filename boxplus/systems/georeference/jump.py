@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import SingularProblemError
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.fit import Fit
 
@@ -32,7 +33,7 @@ _LEAST_M = 0.1  # between two datums: less than that is no reason to distrust a 
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """Where the datum jumps: time since the first fix [s], and distance on the ground [m]."""
+    """Where the datum jumps: time since the first fix [s], and distance on the ground [m], by the fit with two datums."""
 
     seconds: float
     metres: float
@@ -65,12 +66,16 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         if left[largest] == 0.0:
             return None
         after = np.arange(len(attached)) >= at[largest]
-        split = refit(after)
+        left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
+        try:
+            split = refit(after)
+        except SingularProblemError:  # what two datums leave undetermined is none
+            continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
         if gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before:
-            return Jump(float(seconds[at[largest]]), float(steps[largest]))
-        left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
+            # Of the map that lies bent between both the errors step by less: it goes along.
+            return Jump(float(seconds[at[largest]]), float(np.linalg.norm(split.datum_step[:2])))
     return None
 
 

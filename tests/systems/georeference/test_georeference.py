@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig
@@ -14,8 +15,9 @@ from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import doubts_of
-from boxplus.systems.georeference.fit import level
+from boxplus.systems.georeference.fit import Fit, level
 from boxplus.systems.georeference.georeference import Georeference, georeference
+from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.start import find_start
 from tests.systems.georeference.drives import LAPS, Drive, drive
 
@@ -85,6 +87,25 @@ def test_a_map_between_two_datums_is_not_to_be_trusted(laps: Drive, receiver: di
     jumped = found(laps, GOOD.model_copy(update=receiver))
     assert jumped.refusal is None and jumped.contradiction is not None
     assert jumped.contradiction.startswith("fixes jump by ") and "the map lies between the two" in jumped.contradiction
+
+
+def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
+    """Of the map that lies between them the errors step by less."""
+    between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))
+    assert between.fit is not None
+    split = replace(between.fit, errors=np.zeros_like(between.fit.errors), datum_step=np.array([1.2, 0.9, -5.0]))
+    jump = jump_of(between.attached, between.fit, lambda after: split)
+    assert jump is not None and jump.metres == pytest.approx(1.5)
+
+
+def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
+    """And no reason to refuse the map, which is."""
+
+    def undetermined(after: np.ndarray) -> Fit:
+        raise SingularProblemError("nothing holds the second datum")
+
+    between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))
+    assert between.fit is not None and jump_of(between.attached, between.fit, undetermined) is None
 
 
 @pytest.mark.parametrize(

@@ -80,9 +80,7 @@ def test_covariances_that_are_none_are_refused() -> None:
     with pytest.raises(InputError, match=r"covariances of the poses of a run with weak or lost scans – got none, and 10 of them"):
         OdometryRows(np.arange(20), [], status)
     P[15, 3, 3] = np.nan
-    with pytest.raises(
-        InputError, match=r"a finite covariance of every pose – got 1 with NaN.*at 15 ns"
-    ):
+    with pytest.raises(InputError, match=r"a finite covariance of every pose – got 1 with NaN.*at 15 ns"):
         OdometryRows(np.arange(20), [], status, P)
 
 
