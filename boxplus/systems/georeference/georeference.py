@@ -240,7 +240,7 @@ def _other_antenna(
     given, fitting = (f"({arm[0]:.2f}, {arm[1]:.2f}) m" for arm in (lever, free.lever))
     return (
         f"the lever arm is wrong: its x and y are given as {given}, and the fixes follow an antenna at {fitting} in the IMU "
-        f"frame, from which they scatter {free.noise_scale:.1f} times as much as they claim and not {found.noise_scale:.1f}; look "
+        f"frame, from which they scatter {free.noise_scale:.1f} times as much as they claim, not {found.noise_scale:.1f}; look "
         "at its sign and its frame, or leave it out to have it estimated"
     )
 
