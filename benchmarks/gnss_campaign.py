@@ -11,7 +11,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from boxplus.systems.georeference.georeference import georeference
 from boxplus.systems.slam.graph import MapGraph
 
+Floats = NDArray[np.float64]
+
 ORIGIN = EnuFrame(49.01, 8.43, 116.0)
 LEVER = (0.6, 0.0, 1.2)
 SCANS_OF_A_MAP = 20
@@ -31,20 +34,56 @@ SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Case:
-    """A receiver; whether the right answer is a map, a refusal, or either with a warning."""
+    """A receiver; whether the right answer is a map, a refusal, or either with a warning.
+
+    Attributes:
+        lever: what is told of the antenna, over where it is; None: nothing.
+        spoil: what becomes of positions (N, 3) [m] at times (N,) [s] beside what the simulation of a receiver does.
+        climbs: the way goes up and down.
+    """
 
     gnss: dict[str, object]
     expected: str
-    with_lever: bool = True
+    lever: float | None = 1.0
+    spoil: Callable[[Floats, Floats], Floats] | None = None
+    climbs: bool = False
 
 
+def _jumps_early(p: Floats, seconds: Floats) -> Floats:
+    return p + np.where(seconds < 0.3 * seconds[-1], 0.0, 1.0)[:, None] * [2.4, 1.8, 0.0]
+
+
+def _stuck(begin: float, duration_s: float) -> Callable[[Floats, Floats], Floats]:
+    """The same position from a share of the recording on, for a time."""
+
+    def spoil(p: Floats, seconds: Floats) -> Floats:
+        first = begin * seconds[-1]
+        inside = (seconds >= first) & (seconds < first + duration_s)
+        return np.where(inside[:, None], p[np.searchsorted(seconds, first)], p)
+
+    return spoil
+
+
+def _in_feet(p: Floats, seconds: Floats) -> Floats:
+    return np.column_stack([p[:, :2], (p[:, 2] + ORIGIN.altitude) / 0.3048 - ORIGIN.altitude])
+
+
+RTK: dict[str, object] = {"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02}
 CASES = {
     "good": Case({}, "map"),
-    "RTK": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02}, "map"),
+    "RTK": Case(RTK, "map"),
     "poor": Case({"sigma": 2.0, "slow_sigma": 2.0, "claimed": 3.0}, "map"),
     "states nothing": Case({"claimed": None}, "map"),
     "claims 1 cm": Case({"claimed": 0.01}, "map"),
-    "no lever arm": Case({}, "map", with_lever=False),
+    "no lever arm": Case({}, "map", lever=None),
+    "hills": Case({}, "map", climbs=True),
+    "hills, heights in feet": Case({}, "said", spoil=_in_feet, climbs=True),
+    "RTK, hills, in feet": Case(RTK, "said", spoil=_in_feet, climbs=True),
+    "RTK, lever arm reversed": Case(RTK, "said", lever=-1.0),
+    "datum jumps 3 m early": Case({}, "said", spoil=_jumps_early),
+    "stuck for 20 s": Case({}, "said", spoil=_stuck(0.4, 20.0)),
+    "stuck at the end": Case({}, "said", spoil=_stuck(0.7, np.inf)),
+    "stuck throughout": Case({}, "refusal", spoil=_stuck(0.0, np.inf)),
     "multipath": Case({"multipath": 3, "multipath_s": 6.0}, "map"),
     "much multipath": Case({"multipath": 10, "multipath_s": 10.0}, "said"),
     "small multipath": Case({"multipath": 3, "multipath_s": 6.0, "multipath_m": 4.0}, "map"),
@@ -54,8 +93,8 @@ CASES = {
     "swapped": Case({"swapped": True}, "refusal"),
     "radians": Case({"unit": "rad"}, "refusal"),
     "datum jumps 5 m": Case({"jump": (4.0, 3.0, 0.0)}, "said"),
-    "RTK, datum jumps 0.5 m": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02, "jump": (0.4, 0.3, 0.0)}, "said"),
-    "RTK, datum jumps 1.5 m": Case({"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02, "jump": (1.2, 0.9, 0.0)}, "said"),
+    "RTK, datum jumps 0.5 m": Case({**RTK, "jump": (0.4, 0.3, 0.0)}, "said"),
+    "RTK, datum jumps 1.5 m": Case({**RTK, "jump": (1.2, 0.9, 0.0)}, "said"),
     "datum jumps 50 m": Case({"jump": (40.0, 30.0, 0.0)}, "said"),
     "other vehicle": Case({}, "refusal"),
 }
@@ -75,7 +114,11 @@ def route(seed: int) -> NDArray[np.float64]:
 def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
     """Verdict, a line about it, root mean square errors of the odometry, which begins at the truth, and of the map; seconds."""
     case = CASES[name]
-    time_ns, truth, odometry, covariance = simulate_drift(route(seed), DriftConfig(), seed)
+    corners = route(seed)
+    if case.climbs:
+        up = np.cumsum(np.random.default_rng([seed, 77]).normal(0.0, 5.0, len(corners)))
+        corners = np.column_stack([corners, up])
+    time_ns, truth, odometry, covariance = simulate_drift(corners, DriftConfig(), seed)
     random = np.random.default_rng([seed, 32])
     yaw = random.uniform(-np.pi, np.pi)
     T_enu = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), *random.uniform(-50.0, 50.0, 3)])
@@ -92,8 +135,12 @@ def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
         seen = se3.compose(T_enu, other)
     receiver = GnssConfig(**{"lever": LEVER, **case.gnss})
     fixes = simulate_gnss(seen_ns, seen, ORIGIN, receiver, seed)
+    if case.spoil is not None:
+        p = case.spoil(ORIGIN.to_enu(fixes.lat_lon_alt), (fixes.time_ns - fixes.time_ns[0]) * 1e-9)
+        fixes = replace(fixes, lat_lon_alt=ORIGIN.to_geodetic(p))
     began = time.perf_counter()
-    found = georeference(graph, fixes, time_ns, odometry, None, np.array(LEVER) if case.with_lever else None)
+    lever = None if case.lever is None else case.lever * np.array(LEVER)
+    found = georeference(graph, fixes, time_ns, odometry, None, lever)
     seconds = time.perf_counter() - began
     before = _rms(se3.compose(T_enu, odometry)[at, 4:6] - T_enu_imu[at, 4:6])
     if found.fit is None or found.frame is None:
@@ -112,7 +159,7 @@ def run(name: str, seed: int) -> tuple[str, str, float, float, float]:
 
 def _serious(warnings: list[str]) -> bool:
     """That the lever arm is not known is said of every such run and speaks against none."""
-    return any(not text.startswith("the lever arm") for text in warnings)
+    return any(not text.startswith("the lever arm of the antenna") for text in warnings)
 
 
 def _rms(errors: NDArray[np.float64]) -> float:

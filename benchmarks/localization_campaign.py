@@ -12,10 +12,10 @@ moved, and another sensor (half the rings, other angles and height; `--sensor fo
 found, or with its drive, of 10 to 13 s. It is false where any pose that is given out is off by more than a metre or 5°.
 
 `--wrong` looks in the map of another world of the same kind; hall, warehouse and storey are then the same but for what is in it.
-`--map mirrored`, `scaled` (by a tenth) and `upside-down` look in what is no map of any place. In all of these nothing should be
-found: there, any pose that is given out is false. `--map cloud` gives the points without the drive. `--kidnap` carries the
-sensor, once it was found, to another start of the same day without its odometry noticing; poses off by as much are counted for
-how long they are given out. Settings were chosen on even seeds.
+`--map mirrored`, `scaled` (by a tenth, or `--scale`) and `upside-down` look in what is no map of any place. In all of these
+nothing should be found: there, any pose that is given out is false. `--map cloud` gives the points without the drive. `--kidnap`
+carries the sensor, once it was found, to another start of the same day without its odometry noticing; poses off by as much are
+counted for how long they are given out. Settings were chosen on even seeds.
 """
 
 from __future__ import annotations
@@ -51,7 +51,6 @@ FALSE_M, FALSE_RAD, WITHIN_S, FOLLOWED_S, MOVED, HOUSE_M = 1.0, np.deg2rad(5.0),
 OTHER_SENSOR = {"channels": 16, "vertical_fov_deg": (-15.0, 15.0), "height": 1.3, "range_sigma": 0.03}
 NARROW_SENSOR = {"channels": 40, "vertical_fov_deg": (-38.0, 38.0), "height": 1.3, "range_sigma": 0.03}
 AHEAD = {"rings": np.pi, "forward": np.deg2rad(60.0), "narrow": np.deg2rad(35.0)}
-SCALE = 1.1
 INDOORS = {"speed": 1.5, "step_m": 0.3, "corner_radius": 0.8, "max_range": 40.0, "vertical_fov_deg": (-25.0, 25.0), "height": 1.6}
 OUTDOORS = {"speed": 8.0, "step_m": 1.0}
 
@@ -169,7 +168,7 @@ def another_day(world: World, seed: int) -> World:
     return World(list(solids))
 
 
-def map_of(drive: DriftingDrive, config: LocalMapConfig, kind: str = "right") -> SavedMap:
+def map_of(drive: DriftingDrive, config: LocalMapConfig, kind: str = "right", scale: float = 1.1) -> SavedMap:
     """The map that a perfect run over a drive leaves, or what was made of it."""
     world = [se3.act(T, scan.astype(np.float64)) for T, scan in zip(drive.T_world_body, drive.scans, strict=True)]
     poses, points = drive.T_world_body.copy(), np.concatenate(world)
@@ -177,8 +176,8 @@ def map_of(drive: DriftingDrive, config: LocalMapConfig, kind: str = "right") ->
         points[:, 1] *= -1.0
         poses *= np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
     elif kind == "scaled":
-        points *= SCALE
-        poses[:, 4:] *= SCALE
+        points *= scale
+        poses[:, 4:] *= scale
     elif kind == "upside-down":
         T_turned = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         points, poses = se3.act(T_turned, points), se3.compose(T_turned, poses)
@@ -274,7 +273,7 @@ def run(name: str, seed: int, options: argparse.Namespace) -> list[Start]:
     site, results = SITES[name], []
     world = site.world(seed)
     map_drive = simulate_drifting_drive(world, site.route, DriftConfig(**site.sensor), seed)
-    saved = map_of(map_drive, LocalMapConfig(max_range=50.0), options.map)
+    saved = map_of(map_drive, LocalMapConfig(max_range=50.0), options.map, options.scale)
     sensor = DriftConfig(**{**site.sensor, **(NARROW_SENSOR if options.sensor == "narrow" else OTHER_SENSOR)})
     is_nowhere = options.wrong or options.map in ("mirrored", "scaled", "upside-down")
     for number in range(options.starts):
@@ -318,6 +317,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=25, help="in each world")
     parser.add_argument("--sensor", choices=tuple(AHEAD), default="rings")
     parser.add_argument("--map", choices=("right", "mirrored", "scaled", "upside-down", "cloud"), default="right")
+    parser.add_argument("--scale", type=float, default=1.1, help="of --map scaled; 3.28 is feet")
     parser.add_argument("--wrong", action="store_true", help="look in the map of another world")
     parser.add_argument("--kidnap", action="store_true", help="carry the sensor away once it was found")
     parser.add_argument("--verbose", action="store_true", help="a line for each start")

@@ -33,7 +33,7 @@ from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdomet
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.refinement import refine
-from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
+from boxplus.systems.refinement.unshown import is_mostly_unshown
 
 Floats = NDArray[np.float64]
 
@@ -92,8 +92,7 @@ def run(recorded: tuple[str, Simulation, float], config: RefinementConfig) -> tu
     if len(estimates) < 30:
         return f"{name} no run: {odometry.start_problem}", np.nan, np.nan
     times = np.array([e.time_ns for e in estimates])
-    status, of_rows = np.array([e.status for e in estimates]), np.stack([e.pose_covariance for e in estimates])
-    rows = OdometryRows(times, [e.state for e in estimates], status, of_rows)
+    rows, of_rows = OdometryRows.of(estimates), np.stack([e.pose_covariance for e in estimates])
     if is_mostly_unshown(rows.status):
         return f"{name} refused: {np.count_nonzero(rows.status != 'ok')} of {len(times)} scans weak or lost", np.nan, np.nan
     began = time.process_time()
@@ -110,12 +109,7 @@ def run(recorded: tuple[str, Simulation, float], config: RefinementConfig) -> tu
     truth = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
     before, after = finished.T_world_imu[ends], found.after.T_world_imu[ends]
     errors = [_ate(T[:, 4:], truth[:, 4:]) for T in (before, after)]
-    of_run = of_rows[at]
-    unshown = after_unshown(rows.status)[at]
-    own = [
-        _nees(before, truth, of_run),
-        _nees(after, truth, np.where(unshown[:, None, None], of_run, found.pose_covariance[ends])),
-    ]
+    own = [_nees(before, truth, of_rows[at]), _nees(after, truth, found.pose_covariance[ends])]
     accepted = found.refusal is None
     ratio, said = (errors[1] / errors[0], own[1]) if accepted else (1.0, own[0])
     thickness = [1e3 * s.thickness for s in found.sharpness]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from boxplus.errors import InputError
 from boxplus.filtering.nav_state import T_BA, T_BW, T_P_L, T_THETA_L, T_V
 from boxplus.manifolds import quaternion
 from boxplus.runs.storage.row_log import Columns, RowLog, RowLogWriter, read_row_log, xyz
@@ -29,6 +32,9 @@ SCAN_COLUMNS = Columns(
 )
 """Columns of `scans.csv`. SI units (m, s, rad) but for milliseconds where the name says so; `rejected` and `timing_ms` hold
 `name=value` pairs, `weak_directions` and `warnings` sentences, all separated by `; `."""
+
+
+_POSITION = re.compile(r"position along \(([^)]*)\)")  # as `WeakDirection` says it
 
 
 class ScanLogWriter(RowLogWriter):
@@ -79,3 +85,20 @@ def read_scan_log(path: str | Path) -> RowLog:
         InputError: not such a file.
     """
     return read_row_log(path, SCAN_COLUMNS)
+
+
+def unmeasured(log: RowLog) -> NDArray[np.float64]:
+    """(N, 3, 3) sums of t tᵀ over the directions that each scan left open, t the part along the world's axes; see `OdometryRows`.
+
+    Raises:
+        InputError: a direction is none.
+    """
+    sums = np.zeros((len(log), 3, 3))
+    for row, text in enumerate(log.texts["weak_directions"]):
+        for vector in _POSITION.findall(text):
+            try:
+                t = np.array([float(part) for part in vector.split(",")])
+                sums[row] += np.outer(t, t)
+            except ValueError as error:
+                raise InputError("directions of three numbers in scans.csv", f"({vector})", "run 'boxplus lio' again") from error
+    return sums

@@ -25,7 +25,7 @@ from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.recordings.open import open_recording
 from boxplus.runs.lidar_inertial.config import RunConfig, load_run_config
-from boxplus.runs.lidar_inertial.scan_log import read_scan_log
+from boxplus.runs.lidar_inertial.scan_log import read_scan_log, unmeasured
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.refinement.closed_run import ClosedRun, read_closed_run
 from boxplus.runs.refinement.config import RefineRunConfig, dump_refine_config
@@ -41,7 +41,7 @@ from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.refinement import Refinement, refine
 from boxplus.systems.refinement.sightings import lidar_poses
 from boxplus.systems.refinement.state import RefinedState
-from boxplus.systems.refinement.unshown import after_unshown, is_mostly_unshown
+from boxplus.systems.refinement.unshown import is_mostly_unshown
 
 Floats = NDArray[np.float64]
 
@@ -114,6 +114,10 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     if summary.scans < _FEWEST_SCANS:
         raise InputError(f"a run of {_FEWEST_SCANS} scans at least", f"{summary.scans}", "refine a longer one")
     trajectory, log = read_trajectory(run.trajectory), read_scan_log(run.scans)
+    meant = trajectory if closed is None else closed.trajectory
+    if meant.covariance is None or not np.isfinite(meant.covariance).all():
+        said = "none" if meant.covariance is None else "NaN or infinity"
+        raise InputError("a covariance of every pose in trajectory.csv", f"{said} in {folder}", "run it again")
     times = trajectory.times
     if len(times) != len(log) or not np.array_equal(times, log.time_ns):
         raise InputError("the same scans in trajectory.csv and scans.csv", f"others in {path}", "run 'boxplus lio' again")
@@ -127,10 +131,8 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     R_L = quaternion.to_matrix(log.matrix(("imu_lidar_qw", "imu_lidar_qx", "imu_lidar_qy", "imu_lidar_qz")))
     v, b_w, b_a, g, p_L = [log.column(name) for name in ("velocity", "bias_gyro", "bias_accel", "gravity", "imu_lidar_p")]
     states = [NavState(R[k], trajectory.p[k], v[k], b_w[k], b_a[k], g[k], R_L[k], p_L[k]) for k in range(len(times))]
-    rows = OdometryRows(times, states, log.status, trajectory.covariance)
-    return OdometryRun(
-        run, summary, load_run_config(run.config), trajectory if closed is None else closed.trajectory, rows, closed
-    )
+    rows = OdometryRows(times, states, log.status, trajectory.covariance, unmeasured(log))
+    return OdometryRun(run, summary, load_run_config(run.config), meant, rows, closed)
 
 
 def refine_run(
@@ -223,19 +225,21 @@ class _RefineRun:
             )  # fmt: skip
             if closed is None:
                 return found
-            return replace(found.corrected(closed.outcome.placed), loops=closed.loops(), fixes=closed.fixes(opened))
+            run, rows = self._run.trajectory, np.searchsorted(self._run.trajectory.times, found.time_ns)
+            placed = found.corrected(closed.outcome.placed)
+            covariance = None if run.covariance is None else run.covariance[rows]
+            return replace(placed, covariance=covariance, loops=closed.loops(), fixes=closed.fixes(opened))
 
     def _write_trajectory(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64], accepted: bool) -> None:
         """The refined poses, or those of the run; status is the run's."""
         trajectory = self._run.trajectory
         rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
         T = (found.after if accepted else found.before).T_world_imu[scans]
-        of_run = after_unshown(self._run.rows.status)[rows] | (not accepted)
         R = quaternion.to_matrix(T[:, :4])
         with TrajectoryWriter(self._folder.path) as writer:
             for k, (scan, row) in enumerate(zip(scans.tolist(), rows.tolist(), strict=True)):
-                own = np.zeros((6, 6)) if trajectory.covariance is None else trajectory.covariance[row]
-                covariance = own if of_run[k] else found.pose_covariance[scan]
+                own = None if accepted else trajectory.covariance
+                covariance = found.pose_covariance[scan] if own is None else own[row]
                 status = "ok" if trajectory.status is None else trajectory.status[row]
                 writer.append(int(finished.time_ns[scan]), R[k], T[k, 4:], covariance, status)
 

@@ -21,6 +21,9 @@ from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]
 
+_SCALE_SIGMAS = 3.5
+_LEAST_SCALE = 0.002  # of a length: LiDARs are no better than that
+
 
 def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequence[str | None]) -> MergeSummary:
     """Where the sessions are, and what keeps those apart that are in no joint map.
@@ -48,6 +51,12 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
             rigid = se3.compose(np.broadcast_to(T, session.T_session_map.shape), session.T_session_map)
             bend = np.linalg.norm(world.T_world_map[row][:, 4:] - rigid[:, 4:], axis=1).max()
             sigma = np.sqrt(np.diag(world.covariance[row]))
+            ratio, deviation = world.scale[row].tolist()
+            if abs(ratio - 1.0) > max(_SCALE_SIGMAS * deviation, _LEAST_SCALE):
+                warnings.append(
+                    f"{session.name} has another scale: it fits the others best with its lengths times {ratio:.4f} "
+                    f"(± {deviation:.4f}); the ranges of one of the LiDARs are wrong, and the joint map is bent between them"
+                )
             facts = facts.model_copy(
                 update={"T_world_session": T.tolist(), "sigma": sigma.tolist(), "largest_bend_m": float(bend)}
             )

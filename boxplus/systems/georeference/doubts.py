@@ -19,7 +19,7 @@ _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
-_NOISY = 1.5
+NOISY = 1.5
 _BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
 
 
@@ -53,10 +53,12 @@ def contradiction_of(jump: Jump | None, found: Fit) -> str | None:
 
 
 def _of_jump(jump: Jump) -> str:
-    return (
-        f"fixes jump by {jump.metres:.1f} m against the odometry at {jump.seconds:.0f} s: another datum or base station from "
-        "there on, or multipath too small to be told; the map lies between the two"
+    what = (
+        "another datum or base station from there on, or multipath too small to be told"
+        if jump.lasts
+        else "multipath that lasts to the begin or the end of the recording, or another datum or base station on one side"
     )
+    return f"fixes jump by {jump.metres:.1f} m against the odometry at {jump.seconds:.0f} s: {what}; the map lies between the two"
 
 
 def doubts_of(
@@ -93,7 +95,7 @@ def doubts_of(
             )
     if jump is not None and not jump.is_beyond(found):
         warnings.append(_of_jump(jump))
-    if found.noise_scale > _NOISY:
+    if found.noise_scale > NOISY:
         warnings.append(
             f"fixes scatter {found.noise_scale:.1f} times as much as they claim, or the odometry does between two local maps; "
             "they are believed that much less"

@@ -49,6 +49,7 @@ class Fit:
         fix_covariance: (N, 3, 3) of a fix as it was believed, beside those near to it in time [m²].
         noise_scale: factor of the standard deviations that the fixes needed, at least 1.
         tension: mean square of the odometry's errors, in variances per direction; far below 1 where nothing bends it.
+        datum_step: (3,) what the second datum is shifted by against the first, east, north, up [m]; zero where there is one.
     """
 
     T_map: Floats
@@ -64,6 +65,7 @@ class Fit:
     fix_covariance: Floats
     noise_scale: float
     tension: float
+    datum_step: Floats
 
 
 def level(T_odo: Floats) -> Floats:
@@ -172,6 +174,7 @@ def _result(
         fix_covariance=fix_covariance,
         noise_scale=noise_scale,
         tension=tension,
+        datum_step=T_enu[-1, 4:] - T_enu[0, 4:],
     )
 
 

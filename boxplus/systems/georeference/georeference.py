@@ -16,12 +16,13 @@ from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
-from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches, of_gated
+from boxplus.systems.georeference.doubts import NOISY, contradiction_of, doubts_of, gated_stretches, of_gated
 from boxplus.systems.georeference.fit import Fit, antennas, fit, level
+from boxplus.systems.georeference.heights import climb_of
 from boxplus.systems.georeference.hypotheses import other_clock, other_readings
 from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.start import Start, extent_of, find_start
-from boxplus.systems.slam.graph import MapGraph
+from boxplus.systems.slam.graph import MapGraph, mean_up
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +34,8 @@ _WIDEST = 0.3  # of the extent, the tolerance of a fix at most: with more, anyth
 _LEAST_SHARE = 0.5
 _EXPLAINS = 0.8  # of the fixes, for a mistake to be named
 _STRETCHED = 0.1  # a path of another scale than this is another path
+_OTHER_ANTENNA = 5.0  # standard deviations of an estimated lever arm, by which the given one is another
+_QUIETER = 0.5  # of the scatter of the fixes, what another antenna leaves of it at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +119,7 @@ def _start(
             f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not "
             "determined; record a longer way"
         )
-    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + _drift(graph)[attached.map_of] ** 2
+    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + _drift(graph)[0][attached.map_of] ** 2
     speed = np.linalg.norm(attached.v_map, axis=1)
     allowed += (2.0 * config.delay_sigma * speed) ** 2
     allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2
@@ -187,6 +190,11 @@ def _judged(
             f"{math.degrees(config.largest_yaw_sigma):.1f}° of gnss.largest_yaw_sigma: record a longer way"
         )
     used = found.is_used
+    doubts = [
+        _heights(graph, attached, p_enu, lever, config),
+        _other_antenna(graph, attached, p_enu, T_enu_map, start, found, lever, config),
+    ]
+    warnings = warnings + [text for text in doubts if text is not None]
     jump = jump_of(attached, found, lambda after: fit(graph, attached, p_enu, found.T_enu_map, used, lever, config, after))
     left_out = Counter(attached.left_out) + of_gated(attached, found)
     return Georeference(
@@ -201,16 +209,53 @@ def _judged(
     )
 
 
+def _heights(
+    graph: MapGraph, attached: AttachedFixes, p_enu: Floats, lever: Floats | None, config: GeoreferenceConfig
+) -> str | None:
+    """What is wrong with the heights of the fixes."""
+    p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
+    seconds = float(attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
+    drift = _drift(graph)[1][attached.map_of] / _SIGMAS
+    climb = climb_of(p_level, p_enu[:, 2], drift, seconds, config.correlation)
+    return None if climb is None else climb.doubt
+
+
+def _other_antenna(
+    graph: MapGraph,
+    attached: AttachedFixes,
+    p_enu: Floats,
+    T_enu_map: Floats,
+    start: Start,
+    found: Fit,
+    lever: Floats | None,
+    config: GeoreferenceConfig,
+) -> str | None:
+    """Whether fixes that scatter with the lever arm that was given follow the path of an antenna elsewhere."""
+    if lever is None or found.noise_scale <= NOISY:
+        return None
+    free = fit(graph, attached, p_enu, T_enu_map, start.inliers, None, config)
+    off = np.abs(free.lever - lever)[:2] > _OTHER_ANTENNA * free.lever_sigma[:2]
+    if not off.any() or free.noise_scale > _QUIETER * found.noise_scale:
+        return None
+    given, fitting = (f"({arm[0]:.2f}, {arm[1]:.2f}) m" for arm in (lever, free.lever))
+    return (
+        f"the lever arm is wrong: its x and y are given as {given}, and the fixes follow an antenna at {fitting} in the IMU "
+        f"frame, from which they scatter {free.noise_scale:.1f} times as much as they claim, not {found.noise_scale:.1f}; look "
+        "at its sign and its frame, or leave it out to have it estimated"
+    )
+
+
 def _scatter(p_level: Floats, p_enu: Floats) -> float:
     """Noise of a fix that does not last [m], from the lengths of successive steps: both have the same but for it."""
     a, b = (np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1) for p in (p_level, p_enu))
     return 1.4826 * float(np.median(np.abs(a - b))) / math.sqrt(2.0)
 
 
-def _drift(graph: MapGraph) -> Floats:
-    """(n,) three standard deviations of each map's position against the middle one, by the odometry alone [m]."""
+def _drift(graph: MapGraph) -> tuple[Floats, Floats]:
+    """(n,) three standard deviations of each map's position and height against the middle one, by the odometry alone [m]."""
     middle = len(graph.T_odo) // 2
-    sigma = np.zeros(len(graph.T_odo))
+    sigma, of_height = np.zeros(len(graph.T_odo)), np.zeros(len(graph.T_odo))
+    up = np.swapaxes(quaternion.to_matrix(graph.T_odo[:, :4]), 1, 2) @ mean_up(graph.T_odo)
     for order in (range(middle + 1, len(sigma)), range(middle, 0, -1)):
         P = np.zeros((6, 6))
         for k in order:
@@ -223,7 +268,8 @@ def _drift(graph: MapGraph) -> Floats:
             Ad = se3.adjoint(se3.inverse(Z))
             P = Ad @ P @ Ad.T + own
             sigma[to] = _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(P[3:, 3:])[-1]), 0.0))
-    return sigma
+            of_height[to] = _SIGMAS * math.sqrt(max(float(up[to] @ P[3:, 3:] @ up[to]), 0.0))
+    return sigma, of_height
 
 
 def _ratio(p_level: Floats, p_enu: Floats) -> float:

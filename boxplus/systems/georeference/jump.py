@@ -2,6 +2,9 @@
 
 At the jump the errors of the fixes step, whatever the map makes of it before and after. So do those where multipath begins and
 ends. But where it is the datum, and all fixes from there on may be shifted by the same, the step is gone.
+
+Near to the begin or the end of a recording it may be multipath as well that began before, or goes on after it: one side of the
+step is wrong all the same, and the map is bent between the two. That is said, though it is no proof of another datum.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.errors import SingularProblemError
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.fit import Fit
 
@@ -26,24 +30,33 @@ _GONE = 0.4  # of a step, what another datum leaves of it
 _LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
 _TRIED = 4  # steps, the largest first
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
+_SIDE_USED = 0.5  # of the fixes on the short side of a step, for the map to be bent by them
 _SIGMAS = 3.0
 _LEAST_M = 0.1  # between two datums: less than that is no reason to distrust a map
 
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """Where the datum jumps: time since the first fix [s], and distance on the ground [m]."""
+    """Where the datum jumps: time since the first fix [s], and distance on the ground [m], by the fit with two datums.
+
+    Attributes:
+        lasts: both sides of it last longer than multipath does.
+    """
 
     seconds: float
     metres: float
+    lasts: bool = True
 
     def is_beyond(self, found: Fit) -> bool:
-        """Whether a map between the two datums is off by more than it claims, and by more than matters."""
-        return self.metres > max(_SIGMAS * float(np.median(found.sigma)), _LEAST_M)
+        """Whether a map between two datums is off by more than it claims, and by more than matters."""
+        return self.lasts and self.metres > max(_SIGMAS * float(np.median(found.sigma)), _LEAST_M)
 
 
 def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.bool_]], Fit]) -> Jump | None:
     """The largest step in the errors of the fixes that another datum from there on explains; None where none stands out.
+
+    One between two stretches that last goes before one near to the begin or the end. There the fixes on the short side have to be
+    among those that the map rests on: where they are not used, they do not bend it.
 
     Args:
         refit: the fit with a datum of their own for fixes (N,).
@@ -56,22 +69,34 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     lasts = seconds[at + _WINDOW - 1] - seconds[at - _WINDOW]
     is_near = lasts <= max(2.0 * float(np.median(lasts)), _LASTING)  # in a longer gap the odometry drifts
     lasting = (seconds[at] >= _LASTING) & (seconds[-1] - seconds[at] >= _LASTING)
-    enough = lasting & (at >= _FEWEST) & (at <= len(attached) - _FEWEST)
+    enough = (at >= _FEWEST) & (at <= len(attached) - _FEWEST)
     noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
     least = max(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
     left = np.where(is_near & enough & (steps >= least), steps, 0.0)
+    short: Jump | None = None
     for _ in range(_TRIED):
         largest = int(np.argmax(left))
         if left[largest] == 0.0:
-            return None
+            break
+        is_short, at_end = not lasting[largest], 2 * int(at[largest]) > len(attached)
+        left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
+        side = found.is_used[at[largest] :] if at_end else found.is_used[: at[largest]]
+        if is_short and (short is not None or float(side.mean()) < _SIDE_USED):
+            continue
         after = np.arange(len(attached)) >= at[largest]
-        split = refit(after)
+        try:
+            split = refit(after)
+        except SingularProblemError:  # what two datums leave undetermined is none
+            continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
         if gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before:
-            return Jump(float(seconds[at[largest]]), float(steps[largest]))
-        left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
-    return None
+            # Of the map that lies bent between both the errors step by less: it goes along.
+            jump = Jump(float(seconds[at[largest]]), float(np.linalg.norm(split.datum_step[:2])), not is_short)
+            if jump.lasts:
+                return jump
+            short = jump
+    return short
 
 
 def _steps(errors: Floats) -> Floats:

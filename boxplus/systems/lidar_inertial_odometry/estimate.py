@@ -18,6 +18,7 @@ Status = Literal["ok", "weak", "lost"]
 AXES = ("rotation x", "rotation y", "rotation z", "position x", "position y", "position z")
 WAITED = "sensors compared"
 """The stage of a scan in which a run over a recording waits for what goes on beside it."""
+_PART = 0.3  # of a unit direction, a smaller part of which is none to speak of
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +40,11 @@ class WeakDirection:
     translation_world: NDArray[np.float64]
     information_ratio: float
 
+    @property
+    def moves(self) -> NDArray[np.float64]:
+        """(3,) `translation_world`, or zero where the direction is one of rotation."""
+        return self.translation_world if np.linalg.norm(self.translation_world) > _PART else np.zeros(3)
+
     @classmethod
     def all_of(cls, directions: PoseDirections) -> tuple[WeakDirection, ...]:
         """Those of a scan."""
@@ -48,7 +54,7 @@ class WeakDirection:
     def __str__(self) -> str:
         parts = []
         for name, vector, frame in (("position", self.translation_world, "world"), ("rotation", self.rotation_imu, "IMU")):
-            if np.linalg.norm(vector) > 0.3:
+            if np.linalg.norm(vector) > _PART:
                 parts.append(f"{name} along ({vector[0]:+.2f}, {vector[1]:+.2f}, {vector[2]:+.2f}) in the {frame} frame")
         return " with ".join(parts)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +16,13 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.point_store import PointStore
 from boxplus.systems.refinement.slices import Slice, cut, slices_that_fit
-from boxplus.systems.refinement.unshown import open_steps
+from boxplus.systems.refinement.unshown import after_unshown, open_steps
 
 _LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has
 
@@ -32,13 +33,50 @@ class OdometryRows:
 
     Attributes:
         time_ns: (R,) int64, ascending; states: R of them; status: (R,) text.
-        covariance: (R, 6, 6) of the poses, [θ, p], relative to the first one; None where nothing is known of it.
+        covariance: (R, 6, 6) of the poses, [θ, p], relative to the first one; None where nothing is known of it, which is enough
+            as long as every scan is "ok".
+        unmeasured: (R, 3, 3) sums of t tᵀ over the directions that each scan left open, t the part of a direction that moves
+            along the world's axes; None: nobody knows, and any may be.
+
+    Raises:
+        InputError: a covariance is missing or not finite.
     """
 
     time_ns: NDArray[np.int64]
     states: list[NavState]
     status: NDArray[np.str_]
     covariance: NDArray[np.float64] | None = None
+    unmeasured: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        again = "run the odometry again: what it was not shown no refinement can tell"
+        if self.covariance is None:
+            if (not_ok := int(np.count_nonzero(self.status != "ok"))) > 0:
+                raise InputError(
+                    "covariances of the poses of a run with weak or lost scans", f"none, and {not_ok} of them", again
+                )
+            return
+        unknown = np.flatnonzero(~np.isfinite(self.covariance).all(axis=(1, 2)))
+        if len(unknown):
+            at = f"{len(unknown)} with NaN or infinity, the first of the scan at {self.time_ns[unknown[0]]} ns"
+            raise InputError("a finite covariance of every pose", at, again)
+
+    @classmethod
+    def of(cls, estimates: Sequence[Estimate]) -> OdometryRows:
+        """What an odometry said, scan after scan."""
+        moves = [[direction.moves for direction in e.weak_directions] for e in estimates]
+        return cls(
+            np.array([e.time_ns for e in estimates], dtype=np.int64),
+            [e.state for e in estimates],
+            np.array([e.status for e in estimates], dtype=np.str_),
+            np.array([e.pose_covariance for e in estimates]).reshape(-1, 6, 6),
+            np.array([sum((np.outer(t, t) for t in own), np.zeros((3, 3))) for own in moves]).reshape(-1, 3, 3),
+        )
+
+    @property
+    def is_unshown(self) -> NDArray[np.bool_]:
+        """(R,) see `unshown.after_unshown`."""
+        return after_unshown(self.status)
 
     @property
     def open_steps(self) -> NDArray[np.float64]:
@@ -47,7 +85,8 @@ class OdometryRows:
             return np.zeros((len(self.time_ns), 3, 3))
         R = np.stack([state.R_world_imu for state in self.states])
         T = np.hstack([quaternion.from_matrix(R), [state.p_world_imu for state in self.states]])
-        return open_steps(self.status, T, self.covariance)
+        any_ = np.broadcast_to(np.eye(3), (len(T), 3, 3))
+        return open_steps(self.status, T, self.covariance, any_ if self.unmeasured is None else self.unmeasured)
 
 
 def collect(
@@ -86,6 +125,7 @@ class _Collector:
         self._is_end: list[bool] = []
         self._open_of_row = rows.open_steps
         self._open: list[NDArray[np.float64]] = []
+        self._row: list[int] = []
         self._newest: NDArray[np.float32] | None = None  # points of the latest slice, to which the next one adds
         self._next = 0
 
@@ -125,6 +165,7 @@ class _Collector:
                 self._state.append(np.concatenate([part.v_world, after.bias_accel, after.bias_gyro]))
                 self._is_end.append(part.is_end)
                 self._open.append(self._open_of_row[number])
+                self._row.append(number)
                 self._keep(part, is_placed=self._rows.status[number] != "lost")
 
     def _keep(self, part: Slice, *, is_placed: bool) -> None:
@@ -158,4 +199,6 @@ class _Collector:
             noise=ImuNoise(gyro=gyro, accel=accel, gyro_walk=gyro_walk, accel_walk=accel_walk),
             is_end=np.array(self._is_end),
             open_steps=np.stack(self._open),
+            is_unshown=self._rows.is_unshown[self._row],
+            covariance=None if self._rows.covariance is None else self._rows.covariance[self._row],
         )

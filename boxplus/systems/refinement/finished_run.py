@@ -31,6 +31,8 @@ class FinishedRun:
         noise: of the IMU as it is mounted.
         is_end: (N,) bool, whether a slice is the last one of its scan.
         open_steps: (N, 3, 3) projectors, in the world, on what the step to a slice leaves open (`unshown.open_steps`).
+        is_unshown: (N,) bool, from the first scan on that left something open (`unshown.after_unshown`).
+        covariance: (N, 6, 6) that the run gives its poses, [θ, p], relative to the first one; None as long as all is shown.
         loops, fixes: that were closed, and that the world is laid onto the Earth by; None without.
     """
 
@@ -44,6 +46,8 @@ class FinishedRun:
     noise: ImuNoise
     is_end: NDArray[np.bool_]
     open_steps: Floats
+    is_unshown: NDArray[np.bool_]
+    covariance: Floats | None
     loops: RunLoops | None = None
     fixes: RunFixes | None = None
 
@@ -54,6 +58,11 @@ class FinishedRun:
         """The same where closed loops put it."""
         T = correction.apply(self.time_ns, self.T_world_imu)
         turned = quaternion.to_matrix(T[:, :4]) @ np.swapaxes(quaternion.to_matrix(self.T_world_imu[:, :4]), 1, 2)
+        covariance = self.covariance
+        if covariance is not None:
+            to_new = np.tile(np.eye(6), (len(T), 1, 1))
+            to_new[:, 3:, 3:] = turned
+            covariance = to_new @ covariance @ np.swapaxes(to_new, 1, 2)
         velocity = np.einsum("nij,nj->ni", turned, self.velocity_bias[:, :3])
         down = (turned @ self.gravity_world).mean(axis=0)
         return replace(
@@ -61,5 +70,6 @@ class FinishedRun:
             T_world_imu=T,
             velocity_bias=np.hstack([velocity, self.velocity_bias[:, 3:]]),
             open_steps=turned @ self.open_steps @ np.swapaxes(turned, 1, 2),
+            covariance=covariance,
             gravity_world=down * np.linalg.norm(self.gravity_world) / np.linalg.norm(down),
         )

@@ -42,7 +42,8 @@ class Refinement:
 
     Attributes:
         before, after: the states.
-        pose_covariance: (N, 6, 6) of the poses after, [θ, p], relative to the first one.
+        pose_covariance: (N, 6, 6) of the poses after, [θ, p], relative to the first one. From the first scan on that left
+            something open it is that of the run, whose steps are kept along it.
         sharpness: of the map of points that took no part, before and after.
         keyframes, planes: how many.
         costs: (rounds, 2) of the keyframes' problem, at its begin and end.
@@ -119,7 +120,7 @@ def refine(
     return Refinement(
         before=before,
         after=_anchored(state, before.T_world_imu[0]),
-        pose_covariance=_relative_to_first(state.T_world_imu, moved.covariance + own, own[0]),
+        pose_covariance=_where_shown(run, _relative_to_first(state.T_world_imu, moved.covariance + own, own[0])),
         sharpness=judge(run, T_before, T_after, judging, config.threads),
         keyframes=len(keyframes),
         planes=int(np.count_nonzero(moved.is_held)),
@@ -145,6 +146,11 @@ def _bending(run: FinishedRun) -> Floats:
     turn = (run.noise.gyro / MARGIN) ** 2 * seconds / 12.0  # half of the points on either side
     covariance[:, np.arange(3), np.arange(3)] = turn[:, None]
     return covariance
+
+
+def _where_shown(run: FinishedRun, covariance: Floats) -> Floats:
+    """Covariances (N, 6, 6) as long as the run was shown everything: a step that is held is held, and is not known any better."""
+    return covariance if run.covariance is None else np.where(run.is_unshown[:, None, None], run.covariance, covariance)
 
 
 def _relative_to_first(T: Floats, covariance: Floats, first: Floats) -> Floats:

@@ -48,20 +48,23 @@ def is_mostly_unshown(status: ArrayLike) -> bool:
     return float(np.mean(np.asarray(status) != "ok")) > _MOST
 
 
-def open_steps(status: ArrayLike, T_world_imu: Floats, covariance: Floats) -> Floats:
+def open_steps(status: ArrayLike, T_world_imu: Floats, covariance: Floats, unmeasured: Floats) -> Floats:
     """(N, 3, 3) projectors, in the world, on the directions that the step to each scan leaves open; zero where it is shown.
 
-    These are the directions in which the covariance of a run grows over a spell of weak scans, beyond what is known of the turns
-    before. Over a lost scan nothing is placed, and nothing claims to show anything.
+    These are, of the directions that scans of a spell left open, those in which the covariance of the run grows over it, beyond
+    what is known of the turns before: where scans are weak in rotation alone, it grows by what they did measure, and no step is
+    open. Over a lost scan nothing is placed, and nothing claims to show anything.
 
     Args:
         status: (N,) text, of the scans of a run in order of time.
         T_world_imu: (N, 7) poses; covariance: (N, 6, 6) of them, [θ, p], relative to the first one.
+        unmeasured: (N, 3, 3) of each scan, as in `OdometryRows`.
 
     Example:
         >>> T = np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1))
         >>> P = np.stack([np.diag([0.0, 0, 0, x, 1e-6, 1e-6]) for x in (0.0, 1e-4, 0.04)])
-        >>> np.diagonal(open_steps(["ok", "ok", "weak"], T, P), axis1=1, axis2=2).tolist()
+        >>> along_x = np.stack([np.zeros((3, 3)), np.zeros((3, 3)), np.diag([1.0, 0, 0])])
+        >>> np.diagonal(open_steps(["ok", "ok", "weak"], T, P, along_x), axis1=1, axis2=2).tolist()
         [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
     weak, R = np.asarray(status) == "weak", quaternion.to_matrix(T_world_imu[:, :4])
@@ -71,8 +74,12 @@ def open_steps(status: ArrayLike, T_world_imu: Floats, covariance: Floats) -> Fl
         begin = begin if k and weak[k - 1] else k
         first = max(begin - 1, k - _WINDOW, 0)
         J = np.hstack([-so3.hat(T_world_imu[k, 4:] - T_world_imu[first, 4:]) @ R[first], np.eye(3)])
-        growth, axes = np.linalg.eigh(covariance[k, 3:, 3:] - J @ covariance[first] @ J.T)
-        open_ = axes[:, growth > _AS_OPEN * growth[-1]] if growth[-1] > _LEAST_M**2 else axes[:, :0]
+        said, axes = np.linalg.eigh(unmeasured[first : k + 1].sum(axis=0))
+        axes = axes[:, said > _AS_OPEN * said[-1]]
+        if not axes.size:
+            continue
+        growth, within = np.linalg.eigh(axes.T @ (covariance[k, 3:, 3:] - J @ covariance[first] @ J.T) @ axes)
+        open_ = axes @ within[:, (growth > _AS_OPEN * growth[-1]) & (growth[-1] > _LEAST_M**2)]
         found[k] = open_ @ open_.T
     return found
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from boxplus.systems.slam.loop import Floats
 
 _INLIER = 0.999  # of true encounters within the threshold
 _DAMPING = 1e-9
+_STRETCH = 0.005  # of a session, to see how its cost grows
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -44,6 +45,8 @@ class JoinedGraph:
         T_world_session: (s, 7) anchors; covariance: (s, 6, 6) on their right, of the first zero.
         T_world_map: for each session (n, 7), its local maps.
         is_kept: (encounters,) which of them the result rests on; errors: what each is off by, in standard deviations.
+        scale: (s, 2) what each session's lengths would be multiplied by to fit the others best, and its standard deviation; 1 and
+            0 of the first one.
     """
 
     T_world_session: Floats
@@ -51,6 +54,7 @@ class JoinedGraph:
     T_world_map: list[Floats]
     is_kept: NDArray[np.bool_]
     errors: Floats
+    scale: Floats
 
 
 def join(sessions: Sequence[Session], encounters: Sequence[Encounter], T_start: Floats, gravity_sigma: float) -> JoinedGraph:
@@ -65,13 +69,41 @@ def join(sessions: Sequence[Session], encounters: Sequence[Encounter], T_start: 
     anchors = solution[graph.anchors]
     ends = np.cumsum([len(session.maps) for session in sessions])[:-1]
     within = np.split(solution[graph.poses], ends)
+    scales = [_scale_of(k, sessions, encounters, anchors, gravity_sigma, kept) for k in range(1, len(sessions))]
     return JoinedGraph(
         anchors,
         solution.covariance(graph.anchors[np.arange(len(sessions))]),
         [se3.compose(np.broadcast_to(A, T.shape), T) for A, T in zip(anchors, within, strict=True)],
         kept,
         np.sqrt(graph.encounters.squares(solution.values)),
+        np.array([(1.0, 0.0), *scales]),
     )
+
+
+def _scale_of(
+    number: int,
+    sessions: Sequence[Session],
+    encounters: Sequence[Encounter],
+    T_start: Floats,
+    gravity_sigma: float,
+    kept: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """The scale of a session against the others, and its standard deviation: where the least cost is, and how fast it grows.
+
+    With a scale s of the session alone, whatever else is free takes its best value, and the cost is a parabola about its minimum:
+    c(s) = c₀ + (s − ŝ)² / 2σ² (profile likelihood), told by three values of it.
+    """
+    cost = []
+    for scale in (1.0 - _STRETCH, 1.0, 1.0 + _STRETCH):
+        own = sessions[number]
+        T = own.T_session_map.copy()
+        T[:, 4:] *= scale
+        stretched = [*sessions[:number], replace(own, T_session_map=T), *sessions[number + 1 :]]
+        cost.append(_Graph(stretched, encounters, T_start, gravity_sigma).cost(kept))
+    curvature = (cost[0] - 2.0 * cost[1] + cost[2]) / _STRETCH**2
+    if curvature <= 0.0:
+        return 1.0, math.inf
+    return 1.0 - 0.5 * (cost[2] - cost[0]) / (_STRETCH * curvature), 1.0 / math.sqrt(curvature)
 
 
 class _Graph:
@@ -132,3 +164,8 @@ class _Graph:
         kept = found.inliers["encounters"]
         self.problem.set_weights(self.encounters, kept.astype(np.float64))
         return kept, self.problem.solve(options, start=found.solution)
+
+    def cost(self, kept: NDArray[np.bool_]) -> float:
+        """The least cost with some of the encounters."""
+        self.problem.set_weights(self.encounters, kept.astype(np.float64))
+        return self.problem.solve(SolverOptions(initial_damping=_DAMPING)).cost

@@ -39,6 +39,7 @@ class JointWorld:
         T_world_session: (s, 7) the session's own frame in the world; covariance: (s, 6, 6) of [w, v] [rad, m] on its right.
         T_world_map: for each session (n, 7), its local maps.
         encounters: what the result rests on, numbers of sessions as they were given.
+        scale: (s, 2) what each session's lengths would be multiplied by to fit the others, and its standard deviation.
     """
 
     members: tuple[int, ...]
@@ -46,6 +47,7 @@ class JointWorld:
     covariance: Floats
     T_world_map: list[Floats]
     encounters: list[Encounter]
+    scale: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +201,7 @@ def _world(
     """The joint graph of some sessions, and the meetings most of whose encounters it does not keep."""
     if len(members) == 1:
         T = sessions[members[0]].T_session_map
-        return JointWorld(members, _START[None], np.zeros((1, 6, 6)), [T], []), set()
+        return JointWorld(members, _START[None], np.zeros((1, 6, 6)), [T], [], np.array([[1.0, 0.0]])), set()
     row = {number: k for k, number in enumerate(members)}
     start = np.stack([anchors.between(members[0], number)[0] if number != members[0] else _START for number in members])
     encounters, source = [], []
@@ -212,7 +214,7 @@ def _world(
     of, kept = np.array(source), graph.is_kept
     doubted = {k for k in set(source) if np.count_nonzero(kept[of == k]) < 0.5 * np.count_nonzero(of == k)}
     chosen = [e for e, is_kept in zip(encounters, kept, strict=True) if is_kept]
-    world = JointWorld(members, graph.T_world_session, graph.covariance, graph.T_world_map, chosen)
+    world = JointWorld(members, graph.T_world_session, graph.covariance, graph.T_world_map, chosen, graph.scale)
     return world, doubted
 
 

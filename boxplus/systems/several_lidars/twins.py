@@ -7,6 +7,7 @@ another one, cut or thinned out, has none but the other's.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from boxplus.sensors.scan import Scan
 
 _SAME_M = 1e-3  # apart, each in the frame of its LiDAR, points are one
 _SHARE = 0.9  # of its points, that another LiDAR has too
-_LOOKED = 5  # scans
+_LOOKED = 5  # scans in which both have points
 _POINTS = 200  # of a LiDAR, in each
 
 
@@ -28,31 +29,27 @@ class Twins:
 
     def __init__(self, T_first_lidar: Sequence[NDArray[np.float64]]) -> None:
         self._T = T_first_lidar
-        self._looked = [0] * len(T_first_lidar)
-        self._same = np.zeros((len(T_first_lidar), len(T_first_lidar)), dtype=np.int64)
+        self._looked = np.zeros((len(T_first_lidar), len(T_first_lidar)), dtype=np.int64)
+        self._same = np.zeros_like(self._looked)
 
     def add(self, scan: Scan) -> None:
-        """Look at a merged scan; at a LiDAR of which enough has been seen no more."""
+        """Look at a merged scan; at two LiDARs of which enough has been seen together no more."""
         from scipy.spatial import cKDTree
 
         if scan.lidar is None:
             return
-        seen = set(np.unique(scan.lidar).tolist())
-        ask = [number for number in range(1, len(self._T)) if self._looked[number] < _LOOKED and number in seen]
-        if not ask:
-            return
-        own = [self._own(scan, number) for number in range(max(ask) + 1)]
-        trees = {number: cKDTree(points) for number, points in enumerate(own[:-1]) if len(points)}
-        for number in ask:
-            self._looked[number] += 1
+        seen = np.unique(scan.lidar).tolist()
+        ask = [(number, earlier) for earlier, number in combinations(seen, 2) if self._looked[number, earlier] < _LOOKED]
+        own = {number: self._own(scan, number) for number in {number for pair in ask for number in pair}}
+        trees = {earlier: cKDTree(own[earlier]) for earlier in {earlier for _, earlier in ask}}
+        for number, earlier in ask:
             some = own[number][:: -(-len(own[number]) // _POINTS)]
-            for earlier in range(number):
-                if earlier in trees:
-                    distance, _ = trees[earlier].query(some, distance_upper_bound=_SAME_M)
-                    self._same[number, earlier] += float(np.isfinite(distance).mean()) >= _SHARE
+            distance, _ = trees[earlier].query(some, distance_upper_bound=_SAME_M)
+            self._looked[number, earlier] += 1
+            self._same[number, earlier] += float(np.isfinite(distance).mean()) >= _SHARE
 
     def of(self, number: int) -> int | None:
-        """The LiDAR before it that this one repeats, in all of the scans that were looked at; None where it repeats none."""
+        """The LiDAR before it that this one repeats, in all of the scans that were looked at; None if there is none."""
         same = np.flatnonzero(self._same[number] == _LOOKED)
         return int(same[0]) if len(same) else None
 

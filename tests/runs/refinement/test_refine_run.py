@@ -116,6 +116,18 @@ def test_runs_that_cannot_be_believed_are_refused(folders: tuple[Path, Path], tm
         assert code == 2 and words in err
 
 
+def test_a_pose_without_a_covariance_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Once a bare LinAlgError of NumPy."""
+    run = with_weak_scans(folders[0], tmp_path / "spoilt", range(30, 33))
+    lines = (run / "trajectory.csv").read_text().splitlines()
+    cells = lines[32].split(",")
+    lines[32] = ",".join([*cells[:-21], *["nan"] * 21])
+    (run / "trajectory.csv").write_text("\n".join(lines) + "\n")
+    code, _, err = call("refine", run, "-o", tmp_path / "out", "--recording", folders[1])
+    assert code == 2 and "expected a covariance of every pose in trajectory.csv – got NaN or infinity" in err, err
+    assert not (tmp_path / "out").exists()
+
+
 def with_weak_scans(run: Path, folder: Path, weak: range) -> Path:
     """A copy of a run that says of some scans that they left a direction open."""
     shutil.copytree(run, folder)

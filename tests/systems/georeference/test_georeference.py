@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig
@@ -14,10 +15,11 @@ from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import doubts_of
-from boxplus.systems.georeference.fit import level
+from boxplus.systems.georeference.fit import Fit, level
 from boxplus.systems.georeference.georeference import Georeference, georeference
+from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.start import find_start
-from tests.systems.georeference.drives import LAPS, Drive, drive
+from tests.systems.georeference.drives import LAPS, ORIGIN, Drive, drive
 
 LEVER = (0.8, -0.3, 1.1)
 GOOD = GnssConfig(sigma=0.3, slow_sigma=0.1, claimed=0.3, lever=LEVER)
@@ -85,6 +87,25 @@ def test_a_map_between_two_datums_is_not_to_be_trusted(laps: Drive, receiver: di
     jumped = found(laps, GOOD.model_copy(update=receiver))
     assert jumped.refusal is None and jumped.contradiction is not None
     assert jumped.contradiction.startswith("fixes jump by ") and "the map lies between the two" in jumped.contradiction
+
+
+def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
+    """Of the map that lies between them the errors step by less."""
+    between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))
+    assert between.fit is not None
+    split = replace(between.fit, errors=np.zeros_like(between.fit.errors), datum_step=np.array([1.2, 0.9, -5.0]))
+    jump = jump_of(between.attached, between.fit, lambda after: split)
+    assert jump is not None and jump.metres == pytest.approx(1.5)
+
+
+def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
+    """And no reason to refuse the map, which is."""
+
+    def undetermined(after: np.ndarray) -> Fit:
+        raise SingularProblemError("nothing holds the second datum")
+
+    between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))
+    assert between.fit is not None and jump_of(between.attached, between.fit, undetermined) is None
 
 
 @pytest.mark.parametrize(
@@ -205,3 +226,48 @@ def test_a_world_that_leans_is_set_upright() -> None:
     R = level(maps)
     np.testing.assert_allclose(R @ up, [0.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(level(maps[:, :] * 1.0) @ R.T, np.eye(3), atol=1e-12)
+
+
+def shifted(fixes: GnssFixes, metres: np.ndarray, at: np.ndarray) -> GnssFixes:
+    p = ORIGIN.to_enu(fixes.lat_lon_alt)
+    p[at] += metres
+    return replace(fixes, lat_lon_alt=ORIGIN.to_geodetic(p))
+
+
+def test_a_step_near_to_the_begin_is_said_and_none_that_is_gated(laps: Drive) -> None:
+    """Multipath at the begin, or another datum: nobody knows, and the map is bent by it."""
+    fixes = laps.fixes(GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.2, "claimed": 0.7}))
+    early = (fixes.time_ns - fixes.time_ns[0]) * 1e-9 < 22.0
+    for metres, is_bent in ((2.5, True), (40.0, False), (0.0, False)):
+        moved = shifted(fixes, np.array([0.8 * metres, -0.6 * metres, 0.0]), early)
+        result = georeference(laps.graph, moved, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
+        assert result.contradiction is None
+        said = [text for text in result.warnings if "multipath that lasts to the begin or the end" in text]
+        assert len(said) == is_bent, (metres, result.warnings)
+
+
+HILLS = np.column_stack([np.array(LAPS, float), [0.0, 12.0, -3.0, 9.0, 0.0, 12.0, 3.0]])
+
+
+@pytest.mark.parametrize(("unit", "says"), [(1.0, None), (0.3048, "they are in feet"), (np.inf, "the receiver gives none")])
+@pytest.mark.parametrize("climbs", [True, False])
+def test_heights_that_do_not_go_along_are_named_where_the_way_climbs(climbs: bool, unit: float, says: str | None) -> None:
+    there = drive(HILLS if climbs else LAPS, seed=2)
+    fixes = there.fixes(GOOD)
+    lla = fixes.lat_lon_alt.copy()
+    lla[:, 2] /= unit
+    given = replace(fixes, lat_lon_alt=lla)
+    result = georeference(there.graph, given, there.time_ns, there.T_odo_imu, None, np.array(LEVER))
+    assert result.refusal is None
+    said = [text for text in result.warnings if text.startswith("heights of the fixes go")]
+    assert len(said) == (says is not None and climbs)
+    assert all(says is not None and says in text for text in said)
+
+
+def test_a_lever_arm_with_the_wrong_sign_is_named(laps: Drive) -> None:
+    precise = GOOD.model_copy(update={"sigma": 0.02, "slow_sigma": 0.0, "claimed": 0.02})
+    wrong = found(laps, precise, lever=(-LEVER[0], -LEVER[1], LEVER[2]))
+    said = [text for text in wrong.warnings if text.startswith("the lever arm is wrong")]
+    assert len(said) == 1 and "given as (-0.80, 0.30) m" in said[0] and "look at its sign" in said[0]
+    for right in (found(laps, precise), found(laps, precise.model_copy(update={"claimed": 0.002}))):
+        assert not any(text.startswith("the lever arm is wrong") for text in right.warnings)

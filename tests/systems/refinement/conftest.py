@@ -34,7 +34,7 @@ def case() -> Case:
     ]
     estimates += odometry.flush()
     times = np.array([e.time_ns for e in estimates])
-    rows = OdometryRows(times, [e.state for e in estimates], np.array([e.status for e in estimates]))
+    rows = OdometryRows.of(estimates)
     motion = simulation.ground_truth(times)
     T_true = np.hstack([quaternion.from_matrix(motion.R_world_imu), motion.p_world_imu])
     refinement = RefinementConfig()  # type: ignore[call-arg]

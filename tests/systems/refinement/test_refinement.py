@@ -140,7 +140,8 @@ def test_keyframes_begin_after_a_way_a_turn_or_a_time() -> None:
 def test_steps_along_what_is_open_are_those_of_the_run_and_others_are_refined(case: Case) -> None:
     open_steps = np.zeros((len(case.run), 3, 3))
     open_steps[len(case.run) // 2 :, 0, 0] = 1.0
-    run = replace(case.run, open_steps=open_steps)
+    is_unshown = open_steps[:, 0, 0] > 0.0
+    run = replace(case.run, open_steps=open_steps, is_unshown=is_unshown)
     found = refine(run, RefinementConfig(rounds=1))  # type: ignore[call-arg]
     later = np.flatnonzero(open_steps[:, 0, 0])
 
@@ -155,3 +156,7 @@ def test_steps_along_what_is_open_are_those_of_the_run_and_others_are_refined(ca
     held, free = found.after.T_world_imu, case.refined.after.T_world_imu
     assert 5.0 * off(held, 0) < min(off(free, 0), off(held, 1), off(free, 1))
     assert found.refusal is None and case.error(held) < case.error(run.T_world_imu)
+    # A step that is held is as good as that of the run, and not known to the ten micrometres it is held by.
+    assert run.covariance is not None
+    np.testing.assert_array_equal(found.pose_covariance[is_unshown], run.covariance[is_unshown])
+    assert (found.pose_covariance[~is_unshown][1:, 3, 3] < run.covariance[~is_unshown][1:, 3, 3]).mean() > 0.5

@@ -37,6 +37,8 @@ def slab_from_both_sides(before: int, behind: int) -> FinishedRun:
         noise=ImuNoise(gyro=1e-3, accel=1e-2, gyro_walk=1e-5, accel_walk=1e-4),
         is_end=np.ones(count, dtype=np.bool_),
         open_steps=np.zeros((count, 3, 3)),
+        is_unshown=np.zeros(count, dtype=np.bool_),
+        covariance=None,
     )
 
 

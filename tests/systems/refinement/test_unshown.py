@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
+from boxplus.systems.lidar_inertial_odometry.estimate import WeakDirection
+from boxplus.systems.refinement.collecting import OdometryRows
 from boxplus.systems.refinement.unshown import after_unshown, between, is_mostly_unshown, kept_steps, open_steps
 
+ANY = np.tile(np.eye(3), (20, 1, 1))
 STATUS = st.lists(st.sampled_from(["ok", "weak", "lost"]), min_size=1, max_size=30)
 
 
@@ -41,17 +45,48 @@ def run(turned: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 def test_the_direction_along_which_a_spell_of_weak_scans_grows_is_open(turned: float) -> None:
     T, P = run(turned)
     axis = np.array([np.cos(turned), np.sin(turned), 0.0])
-    found = open_steps(["ok"] * 10 + ["weak"] * 10, T, P)
+    found = open_steps(["ok"] * 10 + ["weak"] * 10, T, P, ANY)
     assert not found[:10].any()
     np.testing.assert_allclose(found[10:], np.broadcast_to(np.outer(axis, axis), (10, 3, 3)), atol=0.05)
-    assert not open_steps(["ok"] * 20, T, P).any()
-    lost = open_steps(["ok"] * 10 + ["weak"] * 5 + ["lost"] * 5, T, P)
+    assert not open_steps(["ok"] * 20, T, P, ANY).any()
+    lost = open_steps(["ok"] * 10 + ["weak"] * 5 + ["lost"] * 5, T, P, ANY)
     assert lost[10:15].any() and not lost[15:].any()  # nothing that was seen there has a place
+
+
+def test_scans_that_are_weak_in_rotation_alone_leave_no_step_open() -> None:
+    """Poses become less sure of where they are in every direction, as they do on any way; the scans measured all of these."""
+    T, P = run()
+    P[10:, 3:, 3:] += (np.linspace(0.01, 0.2, 10) ** 2)[:, None, None] * np.eye(3)
+    status = ["ok"] * 10 + ["weak"] * 10
+    assert open_steps(status, T, P, ANY)[10:].any()
+    assert not open_steps(status, T, P, np.zeros((20, 3, 3))).any()
+    across = np.zeros((20, 3, 3))
+    across[10:, 1, 1] = 1.0
+    along_y = open_steps(status, T, P, across)
+    np.testing.assert_allclose(along_y[11:], np.broadcast_to(np.diag([0.0, 1.0, 0.0]), (9, 3, 3)), atol=1e-9)
+
+
+def test_rows_know_which_directions_move() -> None:
+    turn = WeakDirection(np.array([0.0, 0.0, 0.99]), np.array([0.1, 0.0, 0.1]), 1.0)
+    move = WeakDirection(np.array([0.0, 0.0, 0.6]), np.array([0.8, 0.0, 0.0]), 1.0)
+    np.testing.assert_array_equal(turn.moves, np.zeros(3))
+    np.testing.assert_array_equal(move.moves, [0.8, 0.0, 0.0])
+
+
+def test_covariances_that_are_none_are_refused() -> None:
+    """Weak scans without a covariance, or with one that is not finite, cannot say which steps they leave open."""
+    _, P = run()
+    status = np.array(["ok"] * 10 + ["weak"] * 10)
+    with pytest.raises(InputError, match=r"covariances of the poses of a run with weak or lost scans – got none, and 10 of them"):
+        OdometryRows(np.arange(20), [], status)
+    P[15, 3, 3] = np.nan
+    with pytest.raises(InputError, match=r"a finite covariance of every pose – got 1 with NaN.*at 15 ns"):
+        OdometryRows(np.arange(20), [], status, P)
 
 
 def test_steps_are_kept_along_what_is_open_and_free_across() -> None:
     T, P = run(0.7)
-    open_ = open_steps(["ok"] * 10 + ["weak"] * 10, T, P)
+    open_ = open_steps(["ok"] * 10 + ["weak"] * 10, T, P, ANY)
     numbers, along = between(np.array([0, 6, 12, 19]), open_)
     assert numbers.tolist() == [1, 2]
     axis = np.array([np.cos(0.7), np.sin(0.7), 0.0])

@@ -14,11 +14,12 @@ from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.optimization.problem import Problem
+from boxplus.runs.sessions.joined import merge_facts
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import join
 from boxplus.systems.sessions.session import OwnLoop, Session
-from boxplus.systems.sessions.sessions import align_sessions, place_sessions
+from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions, place_sessions
 from tests.systems.sessions.sessions import drawn, measured
 
 GRAVITY = 0.005
@@ -171,3 +172,22 @@ def test_what_makes_no_session_is_refused() -> None:
         align_sessions([a, drawn("a", A)])
     with pytest.raises(InputError, match="two sessions at least"):
         align_sessions([a])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.994, 1.006])
+def test_a_session_of_another_scale_is_named(scale: float) -> None:
+    """Encounters are where both sessions truly are; the steps of one are too long, as its LiDAR's ranges are."""
+    T = lane(10, 0.1)
+    stretched = T.copy()
+    stretched[:, 4:] *= scale
+    encounters = [Encounter(0, 1, measured(k, k, turned(0.0, 0.0, 0.0), 0.2)) for k in range(10)]
+    start = np.stack([turned(0.0, 0.0, 0.0)] * 2)
+    sessions = [drawn("a", T), drawn("b", stretched)]
+    graph = join(sessions, encounters, start, GRAVITY)
+    fits, sigma = graph.scale[1]
+    assert graph.is_kept.all() and fits == pytest.approx(1.0 / scale, abs=2e-4) and 1e-4 < sigma < 5e-3
+    np.testing.assert_array_equal(graph.scale[0], [1.0, 0.0])
+    world = JointWorld((0, 1), graph.T_world_session, graph.covariance, graph.T_world_map, encounters, graph.scale)
+    warnings = merge_facts(SessionAlignment(sessions, [world], []), ["a", "b"], [None, None]).warnings
+    assert len(warnings) == (scale != 1.0)
+    assert all("b has another scale" in text and f"times {fits:.4f}" in text for text in warnings)

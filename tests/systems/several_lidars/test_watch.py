@@ -84,10 +84,13 @@ def test_what_could_not_be_checked_is_said() -> None:
     assert len(told) == 1 and f"{REAR} could not be checked" in told[0]
 
 
-def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0) -> tuple[LidarWatch, list[str]]:
-    """The first LiDAR, and its points once more, every so many of them, as those of another one declared at T."""
+def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0, silent: int = 0) -> tuple[LidarWatch, list[str]]:
+    """The first LiDAR, and its points once more, every so many of them, as those of another one declared at T.
+
+    In the second of the first `silent` scans the first LiDAR has no points, as where a packet is lost.
+    """
     random = np.random.default_rng(3)
-    watch, told = LidarWatch([REAR], [T]), list[str]()
+    watch, told, scans = LidarWatch([REAR], [T]), list[str](), 0
     for event in simulation():
         if isinstance(event, Scan):
             again = event.p_lidar[::every].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
@@ -95,6 +98,9 @@ def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0) -> tuple[LidarWa
             p = np.concatenate([event.p_lidar, again.astype(np.float32)])
             lidar = np.repeat(np.array([0, 1], np.uint8), [len(event), len(again)])
             merged = replace(event, p_lidar=p, time_ns=np.concatenate([event.time_ns, event.time_ns[::every]]), lidar=lidar)
+            if scans < silent and scans % 2:
+                merged = replace(merged, p_lidar=p[lidar == 1], time_ns=merged.time_ns[lidar == 1], lidar=lidar[lidar == 1])
+            scans += 1
             watch.add_scan(replace(merged, intensity=None))
             told += watch.add_estimate(estimate(replace(merged, intensity=None)))
     return watch, told + watch.finish()
@@ -110,6 +116,13 @@ def test_a_lidar_that_is_given_twice_is_named(T: np.ndarray, every: int) -> None
     )
     judgement, _, _ = watch.judgements()[REAR]
     assert judgement is not None and (judgement.verdict, judgement.cause) == ("contradicted", "the same")
+
+
+def test_a_lidar_that_is_given_twice_is_named_though_the_first_one_drops_out() -> None:
+    """A scan in which one of the two has no points says nothing of them."""
+    watch, told = repeated(np.eye(4), silent=8)
+    assert watch.contradiction is not None and told == [watch.contradiction]
+    assert "its points are those of the first one" in watch.contradiction
 
 
 def test_what_measures_the_same_surfaces_is_another_lidar() -> None:
