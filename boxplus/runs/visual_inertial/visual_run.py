@@ -291,7 +291,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
 
 
 def _length_facts(longer: float, sigma: float) -> LengthFacts:
-    return LengthFacts(longer=longer, sigma=sigma if np.isfinite(sigma) else None)
+    return LengthFacts(longer=longer, sigma=sigma) if np.isfinite(sigma) else LengthFacts(longer=None, sigma=None)
 
 
 def _start_facts(start: Start) -> StartFacts:

@@ -55,6 +55,7 @@ _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find aga
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _SEEN_PX = 0.5  # a motion of the image that shows
 _AGAIN = Verdict("lost", ("the image is the one before, to the bit, while the camera moves: the last pose stays",), np.nan)
+_RECENT_S = 0.25  # within which a motion is that of an instant
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
 
 
@@ -98,7 +99,7 @@ class DirectOdometry:
         self._reference: WindowKeyframe | None = None
         self._frames = FrameOrder()
         self._seen_ns: int | None = None
-        self._watch, self._sensor = Watch(self.config), SensorWatch()
+        self._watch, self._sensor = Watch(self.config), SensorWatch(stereo)
         self._start: TwoViewStart | None = None
 
     @property
@@ -163,7 +164,9 @@ class DirectOdometry:
         if self._reference is not None:
             return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
         self._frames.take(time_ns, grey)
-        watch, self._start = Stopwatch(), self._start or TwoViewStart(self.camera)
+        watch = Stopwatch()
+        if self._start is None:
+            self._start, self._sensor = TwoViewStart(self.camera), SensorWatch(is_alone=True)
         views = self._start.push(time_ns, grey)
         begun = None if views is None else self._begin_alone(self._start, views, watch)
         if begun is not None or self._seen_ns is None:
@@ -193,9 +196,9 @@ class DirectOdometry:
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            if self._is_sensed:
-                self._sensor.frame(keyframe, image, depth, alignment)
-                self._watch.contradiction = self._sensor.contradiction
+            velocity = self._velocity_at(time_ns, T)
+            self._sensor.frame(keyframe, image, depth, alignment, velocity)
+            self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
             if added is not None:
@@ -203,9 +206,7 @@ class DirectOdometry:
                 self.window.add(added, covariance)
                 if self.config.adjustments:
                     self.window.adjust(self.config.adjustments)
-                if self._is_sensed:
-                    moved = se3.compose(se3.inverse(self._T), T)
-                    self._sensor.keyframe(self.window.keyframes, depth, moved, self._unseen_s(time_ns))
+                self._sensor.keyframe(self.window.keyframes, depth, velocity)
                 T, covariance = added.T_world_camera, self.window.covariance(added)
                 self._reference = added
                 watch.lap("adjustment")
@@ -217,9 +218,11 @@ class DirectOdometry:
             self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
 
-    @property
-    def _is_sensed(self) -> bool:  # depths of a stereo pair or by the motion change with the intrinsics
-        return self.stereo is None and self._start is None
+    def _velocity_at(self, time_ns: int, T_world_camera: Matrix) -> Matrix | None:
+        """(6,) [w, v] of the camera, in itself, since the frame before [rad/s, m/s]; None where that is too long ago."""
+        elapsed_s = self._unseen_s(time_ns)
+        moved = se3.compose(se3.inverse(self._T), T_world_camera)
+        return se3.log(moved) / elapsed_s if 0.0 < elapsed_s < _RECENT_S else None
 
     def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
         """Where a sensor measures little, with depths by the motion."""

@@ -31,7 +31,7 @@ def watched(camera: Pinhole, seed: int) -> CalibrationWatch:
         assert keyframe is not None
         alignment = track(keyframe.tracker, images[1], T_21=se3.inverse(T))
         assert alignment.status == "converged"
-        watch.add(Leftover(keyframe, images[1].grey, alignment), camera)
+        watch.add(Leftover(keyframe, images[1].grey, alignment), camera, SHAPE[0], (np.zeros(6), np.zeros(6)))
     return watch
 
 
