@@ -145,7 +145,13 @@ class DirectOdometry:
             raise InputError("the second camera", "none", "give it as DirectOdometry(camera, stereo=StereoPair(…))")
         stereo = self.stereo
         one, two = as_image(left), as_image(right)
-        return self._push(time_ns, one, lambda *_: stereo.depth(one, two, self.camera))
+
+        def depth_of(*_: object) -> SensedDepth:
+            depth = stereo.depth(one, two, self.camera)
+            self._sensor.pair(one, two, depth, self.camera)
+            return depth
+
+        return self._push(time_ns, one, depth_of)
 
     def push_mono(self, time_ns: int, image: Image | ArrayLike) -> Estimate | None:
         """A frame of one camera alone. Lengths are in units that nothing tells: about the median depth of the first view.

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.cameras.pinhole import Pinhole
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
@@ -14,6 +15,7 @@ from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, Ster
 from boxplus.systems.direct_odometry.depth_watch import DepthWatch, Surfaces
 from boxplus.systems.direct_odometry.leftover import Leftover
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.stereo_watch import StereoWatch
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
@@ -32,8 +34,14 @@ class SensorWatch:
         depths = "motion" if is_alone else "sensed" if stereo is None else "stereo"
         self._calibration = CalibrationWatch(depths, stereo)
         self._depths, self._registration = DepthWatch(), RegistrationWatch()
+        self._pair = None if stereo is None else StereoWatch(stereo)
         self._surfaces: dict[int, Surfaces] = {}
         self._velocities: dict[int, Matrix] = {}
+
+    def pair(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole) -> None:
+        """Both images of a keyframe of a stereo pair, and the depths that were found in them."""
+        if self._pair is not None:
+            self._pair.add(left, right, depth, camera)
 
     def frame(
         self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment, velocity: Matrix | None
@@ -74,7 +82,8 @@ class SensorWatch:
     @property
     def contradiction(self) -> str:
         """What contradicts the calibration, in a sentence; empty where nothing does."""
-        return self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
+        pair = "" if self._pair is None else self._pair.contradiction
+        return pair or self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
 
 
 def _measured(depth: SensedDepth) -> NDArray[np.float32]:
