@@ -5,6 +5,7 @@
     python benchmarks/camera_campaign.py --only fault=rolling_shutter --seeds 0:400
     python benchmarks/camera_campaign.py --vio --seeds 0:40            # the odometry in place of the data doctor
     python benchmarks/camera_campaign.py --vo --seeds 0:40             # direct odometry, without IMU, on recordings of its own
+    python benchmarks/camera_campaign.py --vo --seeds 0:40 --fault wrong_focal_length
     python benchmarks/camera_campaign.py --merge odd.jsonl
 
 A seed draws world, motion, light, cameras, IMU and, in three of five, one fault (vio_campaign/draws.py). Verdicts, of the
@@ -77,11 +78,11 @@ def run(seed: int) -> dict[str, Any]:
     }
 
 
-def run_vio(seed: int) -> dict[str, Any]:
-    """A line about a seed through the odometry."""
+def run_vio(seed: int, fault: str | None = None) -> dict[str, Any]:
+    """A line about a seed through the odometry, with a fault of another name where one is given."""
     from vio_campaign.judge import judge_run, run_odometry
 
-    drawn = draw(seed)
+    drawn = draw(seed, fault)
     began = time.perf_counter()
     outcome, facts = run_odometry(drawn)
     error = None if outcome.error_m is None else round(outcome.error_m, 4)
@@ -89,12 +90,13 @@ def run_vio(seed: int) -> dict[str, Any]:
     wrong += [["flag", "", text] for text in outcome.flags]
     verdict = judge_run(drawn, outcome)
     elapsed = round(time.perf_counter() - began, 1)
-    return {"seed": seed, **asdict(drawn.kinds), "verdict": verdict, "wrong": wrong, **facts, "time_s": elapsed}
+    about = "" if drawn.fault is None else drawn.fault.description
+    return {"seed": seed, **asdict(drawn.kinds), "about": about, "verdict": verdict, "wrong": wrong, **facts, "time_s": elapsed}
 
 
-def run_vo(seed: int) -> dict[str, Any]:
-    """A line about a seed through direct odometry."""
-    drawn, began = draw_direct(seed), time.perf_counter()
+def run_vo(seed: int, fault: str | None = None) -> dict[str, Any]:
+    """A line about a seed through direct odometry, with a fault of another name where one is given."""
+    drawn, began = draw_direct(seed, fault), time.perf_counter()
     told = run_direct(drawn)
     text = "" if drawn.fault is None else drawn.fault.description
     return {"seed": seed, **asdict(drawn.kinds), "about": text, **told, "time_s": round(time.perf_counter() - began, 1)}
@@ -115,6 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0:20", help="begin:end or begin:end:step")
     parser.add_argument("--only", action="append", default=[], help="KIND=VALUE, for example fault=darkness")
+    parser.add_argument("--fault", help="in every recording, in place of what a seed draws; with --vio and --vo")
     parser.add_argument("--vio", action="store_true", help="run the odometry")
     parser.add_argument("--vo", action="store_true", help="run direct odometry")
     parser.add_argument("--out", type=Path, help="append a JSON line for each run")
@@ -126,12 +129,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(table([line for line in lines if all(line[key] == value for key, value in only.items())]))
         return
     kinds_of = draw_direct_kinds if options.vo else draw_kinds
-    run_of = run_vo if options.vo else run_vio if options.vio else run
+    odometry = run_vo if options.vo else run_vio if options.vio else None
     lines = []
     for seed in range(*map(int, options.seeds.split(":"))):
         if not kinds_of(seed).matches(only):
             continue
-        lines.append(run_of(seed))
+        lines.append(run(seed) if odometry is None else odometry(seed, options.fault))
         line = lines[-1]
         said = "; ".join(f"{key} {value or text[:70]}" for key, value, text in line["wrong"])
         print(

@@ -36,13 +36,14 @@ MOTIONS = {
 }
 RIGS, LENSES = ("stereo", "mono"), ("radtan", "equidistant", "pinhole")
 FAULTY_SHARE = 0.6
-STEREO_FAULTS = ("swapped_cameras", "wrong_baseline", "bent_rig")
+STEREO_FAULTS = ("swapped_cameras", "wrong_baseline", "bent_rig", "wrong_second_focal_length")
 ROOM_FAULTS = ("rotation_at_start", "constant_velocity_start", "bare_walls")
 """Faults that bring their own motion or world, which belongs into a room."""
 FAULT_KINDS = (
-    "covered_lens", "darkness", "drop_frames", *STEREO_FAULTS, "inverted_extrinsic", "imu_clock_offset", "other_imu",
-    "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg", "flip_gyro",
+    "covered_lens", "darkness", "drop_frames", "swapped_cameras", "wrong_baseline", "bent_rig", "inverted_extrinsic",
+    "imu_clock_offset", "other_imu", "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg", "flip_gyro",
 )  # fmt: skip
+"""That seeds draw from; what came later is asked for by name, so that a seed stays what it was."""
 _SPANS = {
     "room": (ROOM_LOW, ROOM_HIGH),
     "warehouse": (np.array([-12.0, -1.0, 1.2]), np.array([12.0, 1.0, 2.2])),
@@ -109,7 +110,9 @@ def draw_kinds(seed: int) -> Kinds:
 def draw(seed: int, fault: str | None = None) -> Draw:
     """Everything about a seed, with a fault of another name where one is given."""
     kinds = draw_kinds(seed)
-    return draw_of(seed, kinds if fault is None else replace(kinds, fault=fault))
+    if fault is not None:
+        kinds = replace(kinds, fault=fault, rig="stereo" if fault in STEREO_FAULTS else kinds.rig)
+    return draw_of(seed, kinds)
 
 
 def draw_of(seed: int, kinds: Kinds) -> Draw:
@@ -180,6 +183,10 @@ _FAULTS: dict[str, Maker] = {
     "drop_frames": lambda begin, random, _: camera_faults.drop_frames(begin, float(random.uniform(0.4, 2.0))),
     "wrong_baseline": lambda _, random, __: camera_faults.wrong_baseline(float(np.exp(off_by(random, 0.1, 0.5)))),
     "bent_rig": lambda _, random, __: camera_faults.bent_rig(off_by(random, 0.7, 3.0)),
+    "wrong_focal_length": lambda _, random, __: camera_faults.wrong_focal_length(float(np.exp(off_by(random, 0.04, 0.25)))),
+    "wrong_second_focal_length": lambda _, random, __: camera_faults.wrong_focal_length(
+        float(np.exp(off_by(random, 0.04, 0.25))), camera=1
+    ),
     "imu_clock_offset": lambda _, random, __: camera_faults.imu_clock_offset(off_by(random, 0.02, 0.12)),
     "other_imu": lambda _, random, __: camera_faults.other_imu(int(random.integers(1000, 2000))),
     "rolling_shutter": lambda _, random, __: camera_faults.rolling_shutter(float(random.uniform(0.012, 0.03))),

@@ -18,7 +18,7 @@ class LengthFacts(Part):
     """What the IMU says of the cameras' lengths, which come from a baseline or, of one camera, from the IMU itself."""
 
     longer: float | None = Field(
-        description="by what share lengths of the cameras are longer than those of the IMU; null where too little acceleration tells"
+        description="by what share lengths of the cameras are longer than those of the IMU; null where no acceleration tells"
     )
     sigma: float | None = Field(description="standard deviation of that; null likewise")
 

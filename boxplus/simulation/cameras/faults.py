@@ -169,9 +169,7 @@ def wrong_focal_length(factor: float = 1.1, camera: int | None = None) -> Camera
             lens = cameras[index].sensor.lens
             fx, fy, cx, cy = lens.intrinsics
             lens = lens.model_copy(update={"intrinsics": (factor * fx, factor * fy, cx, cy)})
-            cameras[index] = cameras[index].model_copy(
-                update={"sensor": cameras[index].sensor.model_copy(update={"lens": lens})}
-            )
+            cameras[index] = cameras[index].model_copy(update={"sensor": cameras[index].sensor.model_copy(update={"lens": lens})})
         return rig.model_copy(update={"cameras": tuple(cameras)})
 
     whose = "every camera" if camera is None else f"cam{camera}"
@@ -370,6 +368,7 @@ CAMERA_FAULTS: dict[str, Callable[[], CameraFault]] = {
     "swapped_cameras": swapped_cameras,
     "wrong_baseline": wrong_baseline,
     "bent_rig": bent_rig,
+    "wrong_focal_length": wrong_focal_length,
     "inverted_extrinsic": inverted_extrinsic,
     "imu_clock_offset": imu_clock_offset,
     "other_imu": other_imu,

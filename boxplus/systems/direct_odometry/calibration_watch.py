@@ -1,4 +1,4 @@
-"""Whether the grey values contradict the calibration: a wrong focal length bends the images of a turn, a rolling shutter shears them.
+"""Whether the grey values contradict the calibration: wrong focal lengths bend the images of a turn, rolling shutters shear them.
 
 What is asked for depends on where depths come from (`calibration_causes.py`). Depths of a sensor do not change with the
 intrinsics. Those of a stereo pair do, with the focal lengths of both cameras, and with a turn of the second one as well, which
@@ -85,24 +85,31 @@ class CalibrationWatch:
     @property
     def contradiction(self) -> str:
         """What of the calibration must be wrong, in a sentence; empty where nothing is."""
-        found = self._found.strongest([_LEAST[cause] for cause in self._causes], _LEAST_SIGMAS)
-        if found is None:
-            return ""
-        k, q, sigma = found
-        return _sentence(self._causes[k], q, sigma)
+        return self._said([cause for cause in self._causes if cause != "readout"])
+
+    @property
+    def remark(self) -> str:
+        """A rolling shutter, in a sentence, which makes poses worse and not wrong; empty where there is none."""
+        return self._said(["readout"])
+
+    def _said(self, causes: list[Cause]) -> str:
+        least = [_LEAST[cause] if cause in causes else np.inf for cause in self._causes]
+        found = self._found.strongest(least, _LEAST_SIGMAS)
+        return "" if found is None else _sentence(self._causes[found[0]], *found[1:])
 
 
 def _sentence(cause: Cause, q: float, sigma: float) -> str:
     if cause == "readout":
         return (
-            f"grey values look like those of a rolling shutter with {1e3 * q:.0f} ms from the first row to the last, with a standard "
-            f"deviation of {1e3 * sigma:.1f} ms: state line_delay, or use a camera with a global shutter"
+            f"grey values look like those of a rolling shutter with {1e3 * q:.0f} ms from the first row to the last, with a "
+            f"standard deviation of {1e3 * sigma:.1f} ms, and direct odometry takes images for taken at once: where the camera "
+            "moves fast, it errs; use a camera with a global shutter, or 'boxplus vio' with line_delay"
         )
     if cause == "turn of the second camera":
         return (
             f"depths by the motion contradict those of the stereo pair: they ask for a second camera that is turned by "
-            f"{np.degrees(abs(q)):.2f} degrees in the plane of the baseline, with a standard deviation of {np.degrees(sigma):.2f}; check the "
-            "stereo calibration"
+            f"{np.degrees(abs(q)):.2f} degrees in the plane of the baseline, with a standard deviation of "
+            f"{np.degrees(sigma):.2f}; check the stereo calibration"
         )
     name = "the focal length" if cause == "focal length" else f"the principal point {cause}"
     kind = "" if cause == "focal length" else " of the focal length"

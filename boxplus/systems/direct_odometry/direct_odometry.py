@@ -113,6 +113,11 @@ class DirectOdometry:
         return self._watch.contradiction
 
     @property
+    def remark(self) -> str:
+        """What makes poses worse, though not wrong: a rolling shutter; empty where nothing does."""
+        return self._sensor.remark
+
+    @property
     def start_problem(self) -> str:
         """Why one camera alone had no pose before its start, with the number that was not met."""
         return "" if self._start is None else self._start.problem

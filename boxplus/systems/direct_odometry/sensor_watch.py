@@ -80,6 +80,11 @@ class SensorWatch:
             self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), velocity)
 
     @property
+    def remark(self) -> str:
+        """What makes poses worse than they have to be, in a sentence; empty where nothing does."""
+        return self._calibration.remark
+
+    @property
     def contradiction(self) -> str:
         """What contradicts the calibration, in a sentence; empty where nothing does."""
         pair = "" if self._pair is None else self._pair.contradiction

@@ -1,13 +1,14 @@
 """Whether two cameras fit their stereo calibration: what one sees lies on its epipolar line in the other.
 
-A patch of the left image was found at π'(Y'), Y' = R' m + ρ t', by a search along its epipolar line alone. What it differs by there,
+A patch of the left image was found at π'(Y'), Y' = R' m + ρ t', by a search along its epipolar line alone. What it differs by
+there,
 
     e = I'(π'(Y')) − I(p),      e ≈ −∇I' (P' t' δρ + Σ q ∂π'/∂q) + o
 
-asks, beside its own inverse depth and an offset, for what moves pixels across these lines: another focal length of the second camera
-(∂π'/∂q = p' − c'), and turns of it about the baseline and about its axis (P' (axis × Y')). A turn in the plane of the two looks
-like other depths, and only a motion tells it (`calibration_causes.py`). As in `leftover.py` the covariance is that of the scatter
-between cells of the image, and frames are combined by their information.
+asks, beside its own inverse depth and an offset, for what moves pixels across these lines: another focal length of the second
+camera (∂π'/∂q = p' − c'), and turns of it about the baseline and about its axis (P' (axis × Y')). A turn in the plane of the two
+looks like other depths, and only a motion tells it (`calibration_causes.py`). As in `leftover.py` the covariance is that of the
+scatter between cells of the image, and frames are combined by their information.
 
 Source: docs/direct_odometry.md, "What bad input shows as".
 """
@@ -32,7 +33,7 @@ _BORDER = 3  # pixels
 _MOST, _FEWEST = 1000, 100  # patches that are looked at, and at least
 _CUT = 3.0  # times the median of the patches' errors beyond which one shows something else
 _CELLS = 6  # across and down
-_LEAST_PX, _LEAST_SIGMAS = 0.75, 6.0  # of a contradiction: calibrations leave some tenths of a pixel
+_LEAST_PX, _LEAST_SIGMAS = 0.25, 6.0  # of a contradiction; what is off by more than a pixel is not found, and looks smaller
 _OWN_ERROR = 0.0005  # standard deviation of one frame that its scatter does not show
 _WHAT = (
     "a focal length of the second camera that is {:+.1f} % off",
@@ -86,7 +87,9 @@ class StereoWatch:
     def _moved(self, Y: Matrix, there: Matrix, P: Matrix) -> Matrix:
         """(n, K, 3, 2) pixels by each cause."""
         axis = self._t / np.linalg.norm(self._t)
-        turns = [np.einsum("nkij,nkj->nki", P, np.cross(np.broadcast_to(a, Y.shape), Y)) for a in (axis, np.array([0.0, 0.0, 1.0]))]
+        turns = [
+            np.einsum("nkij,nkj->nki", P, np.cross(np.broadcast_to(a, Y.shape), Y)) for a in (axis, np.array([0.0, 0.0, 1.0]))
+        ]
         return np.stack([there - np.array([self._camera.cx, self._camera.cy]), *turns], axis=2)
 
     @property
@@ -106,8 +109,8 @@ class StereoWatch:
 
 
 def _explained(e: Matrix, by_depth: Matrix, J: Matrix, cell: NDArray[np.int64]) -> tuple[Matrix, Matrix] | None:
-    """q (3,) and its covariance, of patches' errors (n, K) with offset and inverse depth of their own; None where nothing says it."""
-    e, by_depth, J = e - e.mean(axis=1, keepdims=True), by_depth - by_depth.mean(axis=1, keepdims=True), J - J.mean(axis=1, keepdims=True)
+    """q (3,) and its covariance, of errors (n, K) of patches with offsets and depths of their own; None where nothing says it."""
+    e, by_depth, J = (x - x.mean(axis=1, keepdims=True) for x in (e, by_depth, J))
     square = np.maximum((by_depth**2).sum(axis=1), 1e-12)
     e = e - by_depth * ((by_depth * e).sum(axis=1) / square)[:, None]
     J = J - by_depth[:, :, None] * (np.einsum("nk,nkq->nq", by_depth, J) / square[:, None])[:, None]

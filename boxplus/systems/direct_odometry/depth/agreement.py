@@ -1,8 +1,8 @@
-"""Inverse depths of pixels as those around them agree on: the mean by information of the neighbours that a pixel does not contradict.
+"""Inverse depths of pixels as those around them agree on: the mean by information of neighbours that are not contradicted.
 
-Where the base between two views is short by the distance, one pixel tells its inverse depth to a fifth or worse. Chosen by how large
-they turned out, such depths are too near in the mean, and a motion that is told by the product of depth and error comes out
-too short (errors in variables). Surfaces are smooth: a pixel i takes
+Where the base between two views is short by the distance, one pixel tells its inverse depth to a fifth or worse. Chosen by how
+large they turned out, such depths are too near in the mean, and a motion by them is too short (errors in variables). Surfaces
+are smooth: a pixel i takes
 
     ρ̂ = Σ_j ρ_j/σ_j² / Σ_j 1/σ_j²   over the j in the cells around it with (ρ_j − ρ_i)² < 4 (σ_i² + σ_j²)
 

@@ -84,8 +84,8 @@ def search(
 ) -> Found:
     """Where the pixels `centres` (n, 2) of an image lie in another one, for inverse depths between `far` and `near` (n,).
 
-    At half the resolution along all of the line, then around what was found there. What moves by less than `least_disparity` [px] is
-    not known.
+    At half the resolution along all of the line, then around what was found there. What moves by less than `least_disparity`
+    [px] is not known.
     """
     contrast = float(np.ptp(image.grey))
     half = View(view.image.half(), half_camera(view.camera), view.T_view_image)
