@@ -41,7 +41,8 @@ ROOM_FAULTS = ("rotation_at_start", "constant_velocity_start", "bare_walls")
 """Faults that bring their own motion or world, which belongs into a room."""
 FAULT_KINDS = (
     "covered_lens", "darkness", "drop_frames", "swapped_cameras", "wrong_baseline", "bent_rig", "inverted_extrinsic",
-    "imu_clock_offset", "other_imu", "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg", "flip_gyro",
+    "imu_clock_offset", "other_imu", "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg",
+    "flip_gyro",
 )  # fmt: skip
 """That seeds draw from; what came later is asked for by name, so that a seed stays what it was."""
 _SPANS = {

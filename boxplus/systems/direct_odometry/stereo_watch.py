@@ -33,14 +33,14 @@ _BORDER = 3  # pixels
 _MOST, _FEWEST = 1000, 100  # patches that are looked at, and at least
 _CUT = 3.0  # times the median of the patches' errors beyond which one shows something else
 _CELLS = 6  # across and down
-_LEAST_PX, _LEAST_SIGMAS = 0.25, 6.0  # of a contradiction; what is off by more than a pixel is not found, and looks smaller
+_LEAST_PX, _LEAST_SIGMAS = 0.15, 6.0  # of a contradiction; what is off by more than a pixel is not found, and looks smaller
 _OWN_ERROR = 0.0005  # standard deviation of one frame that its scatter does not show
 _WHAT = (
-    "a focal length of the second camera that is {:+.1f} % off",
-    "a second camera that is turned by {:+.2f} degrees about the baseline",
-    "a second camera that is turned by {:+.2f} degrees about its axis",
+    "a focal length of the second camera that is stated {:+.1f} % off or more",
+    "a second camera that is turned by {:.2f} degrees or more about the baseline",
+    "a second camera that is turned by {:.2f} degrees or more about its axis",
 )
-_UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
+_UNITS = np.array([-100.0, np.degrees(1.0), np.degrees(1.0)])
 
 
 class StereoWatch:
@@ -103,7 +103,7 @@ class StereoWatch:
         k, q, sigma = found
         return (
             "the stereo calibration does not fit these images: what both cameras see lies beside its epipolar lines, as with "
-            f"{_WHAT[k].format(_UNITS[k] * q)} ({abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes); "
+            f"{_WHAT[k].format(_UNITS[k] * (q if k == 0 else abs(q)))} ({abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes); "
             "check the focal lengths and sizes of the images, which camera is which, and T_imu_camera"
         )
 
