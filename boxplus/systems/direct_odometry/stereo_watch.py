@@ -101,9 +101,10 @@ class StereoWatch:
         if found is None:
             return ""
         k, q, sigma = found
+        what = _WHAT[k].format(_UNITS[k] * (q if k == 0 else abs(q)))
         return (
             "the stereo calibration does not fit these images: what both cameras see lies beside its epipolar lines, as with "
-            f"{_WHAT[k].format(_UNITS[k] * (q if k == 0 else abs(q)))} ({abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes); "
+            f"{what} ({abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes); "
             "check the focal lengths and sizes of the images, which camera is which, and T_imu_camera"
         )
 
