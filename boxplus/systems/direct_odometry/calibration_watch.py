@@ -67,20 +67,23 @@ class CalibrationWatch:
             height: of the image [pixels].
             velocities: (6,) [w, u] of the camera at the keyframe and at the frame, in itself [rad/s, m/s].
         """
-        motions = {
-            "focal length": lambda: by_focal_length(leftover, camera, self._stereo),
-            "along u": lambda: by_principal_point(leftover, camera, 0),
-            "along v": lambda: by_principal_point(leftover, camera, 1),
-            "turn of the second camera": lambda: by_turn_of_second(leftover, self._stereo) if self._stereo else leftover.seen_at,
-            "readout": lambda: by_readout(leftover, height, velocities),
-        }
         share = leftover.share_without(_ERROR_BY_MOTION) if self._depths == "motion" else None
-        moved = [motions[cause]() for cause in self._causes]
+        moved = [self._moved(cause, leftover, camera, height, velocities) for cause in self._causes]
         sizes = [_LEAST[cause] * np.sqrt(np.mean(by**2)) for cause, by in zip(self._causes, moved, strict=True)]
         which = [k for k, size in enumerate(sizes) if size > _SHOWN_PX]
         found = leftover.explained_by([moved[k] for k in which], share) if which else None
         if found is not None:
             self._found.add(*found, which)
+
+    def _moved(self, cause: Cause, leftover: Leftover, camera: Pinhole, height: int, velocities: tuple[Matrix, Matrix]) -> Matrix:
+        """(n, 2) ∂p₂ by a cause."""
+        if cause == "readout":
+            return by_readout(leftover, height, velocities)
+        if cause == "turn of the second camera" and self._stereo is not None:
+            return by_turn_of_second(leftover, self._stereo)
+        if cause in ("along u", "along v"):
+            return by_principal_point(leftover, camera, 0 if cause == "along u" else 1)
+        return by_focal_length(leftover, camera, self._stereo)
 
     @property
     def contradiction(self) -> str:

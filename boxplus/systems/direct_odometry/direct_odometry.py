@@ -34,10 +34,10 @@ from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.frame_order import FrameOrder
-from boxplus.systems.direct_odometry.image_motion import image_motion
+from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import SensorWatch
+from boxplus.systems.direct_odometry.sensor_watch import SensorWatch, velocity_between
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -55,7 +55,6 @@ _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find aga
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _SEEN_PX = 0.5  # a motion of the image that shows
 _AGAIN = Verdict("lost", ("the image is the one before, to the bit, while the camera moves: the last pose stays",), np.nan)
-_RECENT_S = 0.25  # within which a motion is that of an instant
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
 
 
@@ -203,11 +202,11 @@ class DirectOdometry:
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
-        is_keyframe, added = self._asks_for_keyframe(keyframe, alignment), None
+        is_keyframe, added = self._asks_for_keyframe(alignment, keyframe), None
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            velocity = self._velocity_at(time_ns, T)
+            velocity = velocity_between(self._T, T, self._unseen_s(time_ns))
             self._sensor.frame(keyframe, image, depth, alignment, velocity)
             self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
@@ -228,12 +227,6 @@ class DirectOdometry:
         if added is not None:
             self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
-
-    def _velocity_at(self, time_ns: int, T_world_camera: Matrix) -> Matrix | None:
-        """(6,) [w, v] of the camera, in itself, since the frame before [rad/s, m/s]; None where that is too long ago."""
-        elapsed_s = self._unseen_s(time_ns)
-        moved = se3.compose(se3.inverse(self._T), T_world_camera)
-        return se3.log(moved) / elapsed_s if 0.0 < elapsed_s < _RECENT_S else None
 
     def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
         """Where a sensor measures little, with depths by the motion."""
@@ -332,23 +325,16 @@ class DirectOdometry:
 
     def _nearest(self, T_world_camera: Matrix) -> WindowKeyframe:
         """The keyframe whose pixels move least; the one that was tracked last, unless another is clearly closer."""
-        wanted = {
-            k.number: self._distance(k, T_world_camera) * (_STAYS if k is self._reference else 1.0) for k in self.window.keyframes
-        }
+        wanted, T_camera_world = {}, se3.inverse(T_world_camera)
+        for k in self.window.keyframes:
+            away = keyframe_distance(k.tracker, se3.compose(T_camera_world, k.T_world_camera), self.config)
+            wanted[k.number] = away * (_STAYS if k is self._reference else 1.0)
         return min(self.window.keyframes, key=lambda k: wanted[k.number])
 
-    def _distance(self, keyframe: WindowKeyframe, T_world_camera: Matrix) -> float:
-        """From 1 on a keyframe is asked for."""
-        motion = image_motion(keyframe.tracker, se3.compose(se3.inverse(T_world_camera), keyframe.T_world_camera))
-        by_flow = motion.flow / self.config.keyframe_flow + motion.by_translation / self.config.keyframe_flow_translation
-        missing = (1.0 - motion.overlap) / (1.0 - self.config.keyframe_overlap)
-        return max(0.5 * by_flow, missing)
-
-    def _asks_for_keyframe(self, keyframe: WindowKeyframe, alignment: Alignment) -> bool:
-        T = se3.compose(keyframe.T_world_camera, se3.inverse(alignment.T_21))
+    def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe) -> bool:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
-        return max(self._distance(keyframe, T) + by_brightness, missing) > 1.0
+        return max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
         """None where too little has a depth and a gradient."""

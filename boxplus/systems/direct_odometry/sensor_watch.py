@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
+from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
+from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch, Depths
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.depth_watch import DepthWatch, Surfaces
 from boxplus.systems.direct_odometry.leftover import Leftover
@@ -19,6 +20,7 @@ from boxplus.systems.direct_odometry.stereo_watch import StereoWatch
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
+_RECENT_S = 0.25  # within which a motion is that of an instant
 
 
 class SensorWatch:
@@ -31,7 +33,7 @@ class SensorWatch:
 
     def __init__(self, stereo: StereoPair | None = None, *, is_alone: bool = False) -> None:
         self._is_sensed = stereo is None and not is_alone
-        depths = "motion" if is_alone else "sensed" if stereo is None else "stereo"
+        depths: Depths = "motion" if is_alone else "sensed" if stereo is None else "stereo"
         self._calibration = CalibrationWatch(depths, stereo)
         self._depths, self._registration = DepthWatch(), RegistrationWatch()
         self._pair = None if stereo is None else StereoWatch(stereo)
@@ -89,6 +91,12 @@ class SensorWatch:
         """What contradicts the calibration, in a sentence; empty where nothing does."""
         pair = "" if self._pair is None else self._pair.contradiction
         return pair or self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
+
+
+def velocity_between(T_before: Matrix, T_now: Matrix, elapsed_s: float) -> Matrix | None:
+    """(6,) [w, v] of a camera in itself, from two poses (7,) T_world_camera; None where they are too far apart in time."""
+    moved = se3.compose(se3.inverse(T_before), T_now)
+    return se3.log(moved) / elapsed_s if 0.0 < elapsed_s < _RECENT_S else None
 
 
 def _measured(depth: SensedDepth) -> NDArray[np.float32]:
