@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr, stdtrit
 
 from boxplus.manifolds import quaternion
 from boxplus.residuals.camera.photometric_sampling import sample
@@ -22,7 +23,7 @@ from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
-_FEWEST = 5  # frames for a contradiction
+_FEWEST, _MANY = 3, 5  # frames for a contradiction; from the latter on how much they disagree is known well enough
 _CUT = 4.685  # of Tukey's weights, in σ
 _CELLS = 6  # across and down
 _NOTHING = 1e-6  # information of what no frame was asked for
@@ -147,6 +148,9 @@ class Combined:
         """
         if self.frames < _FEWEST:
             return None
+        if self.frames < _MANY:  # as unlikely by chance, where the deviation itself is told by few frames (Student's t)
+            freedom = max(self._values - len(self._vector), 1)
+            least_sigmas = -float(stdtrit(freedom, ndtr(-least_sigmas)))
         q, sigma = self.estimate()
         wrong = np.abs(q) > np.maximum(least_sigmas * sigma, least)
         if not wrong.any():
