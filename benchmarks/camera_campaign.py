@@ -4,6 +4,8 @@
     python benchmarks/camera_campaign.py --seeds 1:101:2 --out odd.jsonl   # settings come from even seeds, odd ones report
     python benchmarks/camera_campaign.py --only fault=rolling_shutter --seeds 0:400
     python benchmarks/camera_campaign.py --vio --seeds 0:40            # the odometry in place of the data doctor
+    python benchmarks/camera_campaign.py --vo --seeds 0:40             # direct odometry, without IMU, on recordings of its own
+    python benchmarks/camera_campaign.py --vo --seeds 0:40 --fault wrong_focal_length
     python benchmarks/camera_campaign.py --merge odd.jsonl
 
 A seed draws world, motion, light, cameras, IMU and, in three of five, one fault (vio_campaign/draws.py). Verdicts, of the
@@ -14,7 +16,7 @@ findings that are not ok:
 - `unchecked`: nothing, and the findings say that camera and IMU could not be compared.
 - `silent`: nothing. Faults that only an estimator can tell are counted apart, as `not for inspect`.
 
-With `--vio` the verdicts are those of vio_campaign/judge.py.
+With `--vio` the verdicts are those of vio_campaign/judge.py, with `--vo` draws and verdicts those of vio_campaign/direct.py.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from vio_campaign.direct import draw_direct, draw_direct_kinds, run_direct
 from vio_campaign.draws import Draw, draw, draw_kinds
 
 from boxplus import diagnose
@@ -75,11 +78,11 @@ def run(seed: int) -> dict[str, Any]:
     }
 
 
-def run_vio(seed: int) -> dict[str, Any]:
-    """A line about a seed through the odometry."""
+def run_vio(seed: int, fault: str | None = None) -> dict[str, Any]:
+    """A line about a seed through the odometry, with a fault of another name where one is given."""
     from vio_campaign.judge import judge_run, run_odometry
 
-    drawn = draw(seed)
+    drawn = draw(seed, fault)
     began = time.perf_counter()
     outcome, facts = run_odometry(drawn)
     error = None if outcome.error_m is None else round(outcome.error_m, 4)
@@ -87,7 +90,16 @@ def run_vio(seed: int) -> dict[str, Any]:
     wrong += [["flag", "", text] for text in outcome.flags]
     verdict = judge_run(drawn, outcome)
     elapsed = round(time.perf_counter() - began, 1)
-    return {"seed": seed, **asdict(drawn.kinds), "verdict": verdict, "wrong": wrong, **facts, "time_s": elapsed}
+    about = "" if drawn.fault is None else drawn.fault.description
+    return {"seed": seed, **asdict(drawn.kinds), "about": about, "verdict": verdict, "wrong": wrong, **facts, "time_s": elapsed}
+
+
+def run_vo(seed: int, fault: str | None = None) -> dict[str, Any]:
+    """A line about a seed through direct odometry, with a fault of another name where one is given."""
+    drawn, began = draw_direct(seed, fault), time.perf_counter()
+    told = run_direct(drawn)
+    text = "" if drawn.fault is None else drawn.fault.description
+    return {"seed": seed, **asdict(drawn.kinds), "about": text, **told, "time_s": round(time.perf_counter() - began, 1)}
 
 
 def table(lines: list[dict[str, Any]]) -> str:
@@ -105,7 +117,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0:20", help="begin:end or begin:end:step")
     parser.add_argument("--only", action="append", default=[], help="KIND=VALUE, for example fault=darkness")
+    parser.add_argument("--fault", help="in every recording, in place of what a seed draws; with --vio and --vo")
     parser.add_argument("--vio", action="store_true", help="run the odometry")
+    parser.add_argument("--vo", action="store_true", help="run direct odometry")
     parser.add_argument("--out", type=Path, help="append a JSON line for each run")
     parser.add_argument("--merge", type=Path, nargs="+", help="tables of earlier runs; nothing is run")
     options = parser.parse_args(arguments)
@@ -114,11 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]
         print(table([line for line in lines if all(line[key] == value for key, value in only.items())]))
         return
+    kinds_of = draw_direct_kinds if options.vo else draw_kinds
+    odometry = run_vo if options.vo else run_vio if options.vio else None
     lines = []
     for seed in range(*map(int, options.seeds.split(":"))):
-        if not draw_kinds(seed).matches(only):
+        if not kinds_of(seed).matches(only):
             continue
-        lines.append(run_vio(seed) if options.vio else run(seed))
+        lines.append(run(seed) if odometry is None else odometry(seed, options.fault))
         line = lines[-1]
         said = "; ".join(f"{key} {value or text[:70]}" for key, value, text in line["wrong"])
         print(

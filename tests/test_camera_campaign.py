@@ -35,7 +35,9 @@ def campaign() -> Iterator[SimpleNamespace]:
 
 def test_every_kind_is_drawn_and_fits(campaign: SimpleNamespace) -> None:
     kinds = [campaign.draws.draw_kinds(seed) for seed in range(600)]
-    assert {kind.fault for kind in kinds} == {"none", *CAMERA_FAULTS}
+    assert {kind.fault for kind in kinds} == {"none", *CAMERA_FAULTS} - {"wrong_focal_length"}  # asked for by name
+    named = campaign.draws.draw(7, "wrong_second_focal_length")
+    assert named.kinds.rig == "stereo" and named.fault.name == "wrong_focal_length" and "cam1" in named.fault.description
     assert 0.3 < np.mean([kind.fault == "none" for kind in kinds]) < 0.5
     for kind in kinds:
         assert kind.world in campaign.draws.MOTIONS[kind.motion]

@@ -36,13 +36,15 @@ MOTIONS = {
 }
 RIGS, LENSES = ("stereo", "mono"), ("radtan", "equidistant", "pinhole")
 FAULTY_SHARE = 0.6
-STEREO_FAULTS = ("swapped_cameras", "wrong_baseline", "bent_rig")
+STEREO_FAULTS = ("swapped_cameras", "wrong_baseline", "bent_rig", "wrong_second_focal_length")
 ROOM_FAULTS = ("rotation_at_start", "constant_velocity_start", "bare_walls")
 """Faults that bring their own motion or world, which belongs into a room."""
 FAULT_KINDS = (
-    "covered_lens", "darkness", "drop_frames", *STEREO_FAULTS, "inverted_extrinsic", "imu_clock_offset", "other_imu",
-    "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg", "flip_gyro",
+    "covered_lens", "darkness", "drop_frames", "swapped_cameras", "wrong_baseline", "bent_rig", "inverted_extrinsic",
+    "imu_clock_offset", "other_imu", "rolling_shutter", *ROOM_FAULTS, "moving_object", "drop_imu", "imu_in_g", "gyro_in_deg",
+    "flip_gyro",
 )  # fmt: skip
+"""That seeds draw from; what came later is asked for by name, so that a seed stays what it was."""
 _SPANS = {
     "room": (ROOM_LOW, ROOM_HIGH),
     "warehouse": (np.array([-12.0, -1.0, 1.2]), np.array([12.0, 1.0, 2.2])),
@@ -106,9 +108,16 @@ def draw_kinds(seed: int) -> Kinds:
     return Kinds(world, motion, rig, lens, light, imu, fault)
 
 
-def draw(seed: int) -> Draw:
-    """Everything about a seed."""
+def draw(seed: int, fault: str | None = None) -> Draw:
+    """Everything about a seed, with a fault of another name where one is given."""
     kinds = draw_kinds(seed)
+    if fault is not None:
+        kinds = replace(kinds, fault=fault, rig="stereo" if fault in STEREO_FAULTS else kinds.rig)
+    return draw_of(seed, kinds)
+
+
+def draw_of(seed: int, kinds: Kinds) -> Draw:
+    """Everything about a seed that is of these kinds."""
     random = np.random.Generator(np.random.PCG64([seed, 22]))
     duration_s = float(random.uniform(10.0, 14.0))
     rig = _rig(kinds, random)
@@ -122,8 +131,12 @@ def draw(seed: int) -> Draw:
         light=light if kinds.light == "swinging" else Light(),
     )
     begin_s = float(random.uniform(3.0, 0.5 * duration_s))
-    fault = None if kinds.fault == "none" else _FAULTS.get(kinds.fault, _plain(kinds.fault))(begin_s, random, kinds)
-    return Draw(seed, kinds, scenario, duration_s, fault)
+    return Draw(seed, kinds, scenario, duration_s, make_fault(kinds, begin_s, random))
+
+
+def make_fault(kinds: Kinds, begin_s: float, random: np.random.Generator) -> CameraFault | None:
+    """The fault of these kinds, with parameters of its own; what begins does so at `begin_s`."""
+    return None if kinds.fault == "none" else _FAULTS.get(kinds.fault, _plain(kinds.fault))(begin_s, random, kinds)
 
 
 def _rig(kinds: Kinds, random: np.random.Generator) -> CameraRig:
@@ -160,7 +173,7 @@ def _covered(begin_s: float, random: np.random.Generator, kinds: Kinds) -> Camer
     return camera_faults.covered_lens(camera, begin_s, float(random.uniform(0.6, 4.0)))
 
 
-def _off(random: np.random.Generator, least: float, most: float) -> float:
+def off_by(random: np.random.Generator, least: float, most: float) -> float:
     """Between `least` and `most`, of either sign."""
     return float(random.choice((-1.0, 1.0)) * random.uniform(least, most))
 
@@ -169,9 +182,13 @@ _FAULTS: dict[str, Maker] = {
     "covered_lens": _covered,
     "darkness": lambda begin, random, _: camera_faults.darkness(begin, float(random.uniform(0.6, 4.0))),
     "drop_frames": lambda begin, random, _: camera_faults.drop_frames(begin, float(random.uniform(0.4, 2.0))),
-    "wrong_baseline": lambda _, random, __: camera_faults.wrong_baseline(float(np.exp(_off(random, 0.1, 0.5)))),
-    "bent_rig": lambda _, random, __: camera_faults.bent_rig(_off(random, 0.7, 3.0)),
-    "imu_clock_offset": lambda _, random, __: camera_faults.imu_clock_offset(_off(random, 0.02, 0.12)),
+    "wrong_baseline": lambda _, random, __: camera_faults.wrong_baseline(float(np.exp(off_by(random, 0.1, 0.5)))),
+    "bent_rig": lambda _, random, __: camera_faults.bent_rig(off_by(random, 0.7, 3.0)),
+    "wrong_focal_length": lambda _, random, __: camera_faults.wrong_focal_length(float(np.exp(off_by(random, 0.04, 0.25)))),
+    "wrong_second_focal_length": lambda _, random, __: camera_faults.wrong_focal_length(
+        float(np.exp(off_by(random, 0.04, 0.25))), camera=1
+    ),
+    "imu_clock_offset": lambda _, random, __: camera_faults.imu_clock_offset(off_by(random, 0.02, 0.12)),
     "other_imu": lambda _, random, __: camera_faults.other_imu(int(random.integers(1000, 2000))),
     "rolling_shutter": lambda _, random, __: camera_faults.rolling_shutter(float(random.uniform(0.012, 0.03))),
     "moving_object": lambda begin, random, _: camera_faults.moving_object(begin, float(random.uniform(2.0, 6.0))),

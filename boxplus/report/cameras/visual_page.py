@@ -88,10 +88,10 @@ def _head(data: VisualData[VioSummary]) -> str:
 def _length_tile(summary: VioSummary) -> list[tuple[str, str]]:
     if summary.lengths is None:
         return []
-    sigma = summary.lengths.sigma
-    if sigma is None:
+    longer, sigma = summary.lengths.longer, summary.lengths.sigma
+    if longer is None or sigma is None:
         return [("lengths?", "the IMU does not tell them: too little acceleration")]
-    return [(f"{summary.lengths.longer:+.1%} ± {sigma:.1%}", "lengths by the cameras, against the IMU's")]
+    return [(f"{longer:+.1%} ± {sigma:.1%}", "lengths by the cameras, against the IMU's")]
 
 
 def _map(data: VisualData[VioSummary]) -> go.Figure:

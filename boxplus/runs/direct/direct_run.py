@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
+from boxplus._extras import has
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
+from boxplus.runs.cameras.causes import MAY_BE, likely_causes
 from boxplus.runs.cameras.folder import DirectFolder, claim_camera_folder
 from boxplus.runs.direct.config import DirectRunConfig, dump_direct_config
 from boxplus.runs.direct.frame_log import FrameLogWriter
@@ -100,6 +102,8 @@ class _Run(CameraRun[Estimate, DirectSummary]):
         self._streams = [stream for stream in (self._cameras.first, self._cameras.second) if stream is not None]
         self._images = {stream.index: 0 for stream in self._streams}
         self._before_start, self._start_problem = 0, ""
+        self._troubled_ns: int | None = None
+        self._causes: list[str] = []
         self._landmarks: list[NDArray[np.float32]] = []  # of keyframes that left the window
 
     def _all_landmarks(self) -> NDArray[np.float32]:
@@ -112,7 +116,7 @@ class _Run(CameraRun[Estimate, DirectSummary]):
 
     def snapshot(self) -> tuple[dict[str, object], dict[str, object]]:
         """See `ResumableRun.snapshot`."""
-        own = {name: getattr(self, name) for name in ("_images", "_before_start", "_start_problem", "_landmarks")}
+        own = {name: getattr(self, name) for name in ("_images", "_before_start", "_start_problem", "_troubled_ns", "_landmarks")}
         return snapshot_of(self._odometry), {"own": own, "pairs": self._pairs.snapshot()}
 
     def restore(self, odometry: dict[str, Any], run: dict[str, Any]) -> None:
@@ -120,6 +124,14 @@ class _Run(CameraRun[Estimate, DirectSummary]):
         restore_odometry(self._odometry, odometry)
         self._pairs.restore(run["pairs"])
         vars(self).update(run["own"])
+
+    def at_end(self, state: State) -> None:
+        """See `RunLoop.at_end`."""
+        super().at_end(state)
+        if state == "finished" and self._cameras.kind == "stereo" and self.counts.count and self._contradiction() and has("cv2"):
+            self.stage = "looking for the cause"
+            self.show_progress()
+            self._causes = likely_causes(self._info, self.recording.read_again(), 2, self._troubled_ns, with_imu=False)
 
     def push(self, event: CameraEvent) -> list[Estimate]:
         """See `RunLoop.push`."""
@@ -150,6 +162,8 @@ class _Run(CameraRun[Estimate, DirectSummary]):
     def keep(self, estimate: Estimate) -> None:
         """Write one estimate."""
         self.status = estimate.status
+        if self._troubled_ns is None and (self._odometry.contradiction or estimate.status == "lost"):
+            self._troubled_ns = estimate.time_ns
         began = time.perf_counter()
         T, p = estimate.R_world_camera, estimate.p_world_camera
         if self.is_new(estimate.time_ns):
@@ -184,8 +198,11 @@ class _Run(CameraRun[Estimate, DirectSummary]):
         rolls = [c.name for c in (self._cameras.first, self._cameras.second) if c is not None and c.readout_s]
         if rolls:
             facts["warnings"].insert(0, WarningFacts(text=f"{' and '.join(rolls)}: {_ROLLS}", count=1))
+        elif self._odometry.remark:
+            facts["warnings"].insert(0, WarningFacts(text=self._odometry.remark, count=1))
         if self._cameras.kind == "mono":
             facts["warnings"].insert(0, WarningFacts(text=_NO_SCALE, count=1))
+        facts["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
         return DirectSummary(
             **facts,
             kind=self._cameras.kind,

@@ -17,13 +17,15 @@ Matrix = list[list[float]]
 class LengthFacts(Part):
     """What the IMU says of the cameras' lengths, which come from a baseline or, of one camera, from the IMU itself."""
 
-    longer: float = Field(description="by what share lengths of the cameras are longer than those of the IMU")
-    sigma: float | None = Field(description="standard deviation of that; null where too little acceleration tells lengths")
+    longer: float | None = Field(
+        description="by what share lengths of the cameras are longer than those of the IMU; null where no acceleration tells"
+    )
+    sigma: float | None = Field(description="standard deviation of that; null likewise")
 
     @property
     def text(self) -> str:
         """In a line."""
-        if self.sigma is None:
+        if self.longer is None or self.sigma is None:
             return "not told by the IMU: too little acceleration; a wrong baseline would not be noticed"
         least = max(LEAST_LENGTH, LEAST_SIGMAS * self.sigma)
         return (

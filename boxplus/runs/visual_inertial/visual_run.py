@@ -15,11 +15,11 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
+from boxplus.runs.cameras.causes import MAY_BE, likely_causes
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
-from boxplus.runs.visual_inertial.causes import likely_causes
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
@@ -42,7 +42,6 @@ _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
     "_troubled_ns",
 )  # fmt: skip
-_MAY_BE = "this may be the cause"
 _MUCH_LOST = 0.15  # share of the frames
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
@@ -218,7 +217,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
         if self._odometry.start_problem:
             reasons.append(self._odometry.start_problem)
-        cause = f"; {_MAY_BE}: {'; '.join(self._causes)}" if self._causes else ""
+        cause = f"; {MAY_BE}: {'; '.join(self._causes)}" if self._causes else ""
         images = ", ".join(str(count) for _, count in sorted(self._images.items())) or "no"
         return InputError(
             "frames that IMU samples cover, and a start that can be found",
@@ -236,7 +235,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if repeated:
             text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"
             shared["warnings"].append(WarningFacts(text=text, count=repeated))
-        shared["warnings"] += [WarningFacts(text=f"{_MAY_BE}: {cause}", count=1) for cause in self._causes]
+        shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
             **shared,
             cameras=self._cameras(),
@@ -291,7 +290,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
 
 
 def _length_facts(longer: float, sigma: float) -> LengthFacts:
-    return LengthFacts(longer=longer, sigma=sigma if np.isfinite(sigma) else None)
+    return LengthFacts(longer=longer, sigma=sigma) if np.isfinite(sigma) else LengthFacts(longer=None, sigma=None)
 
 
 def _start_facts(start: Start) -> StartFacts:

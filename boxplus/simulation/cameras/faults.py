@@ -160,6 +160,23 @@ def wrong_baseline(factor: float = 1.25) -> CameraFault:
     return CameraFault("wrong_baseline", text, ("baseline", "scale"), "estimator", declared=declared)
 
 
+def wrong_focal_length(factor: float = 1.1, camera: int | None = None) -> CameraFault:
+    """The focal length is declared wrong by a factor, of every camera or of one, as it is after images were scaled or cropped."""
+
+    def declared(rig: CameraRig) -> CameraRig:
+        cameras = list(rig.cameras)
+        for index in range(len(cameras)) if camera is None else (camera,):
+            lens = cameras[index].sensor.lens
+            fx, fy, cx, cy = lens.intrinsics
+            lens = lens.model_copy(update={"intrinsics": (factor * fx, factor * fy, cx, cy)})
+            cameras[index] = cameras[index].model_copy(update={"sensor": cameras[index].sensor.model_copy(update={"lens": lens})})
+        return rig.model_copy(update={"cameras": tuple(cameras)})
+
+    whose = "every camera" if camera is None else f"cam{camera}"
+    text = f"the focal length of {whose} is declared {factor:g} times as long"
+    return CameraFault("wrong_focal_length", text, ("focal length", "scaled or cropped"), "estimator", declared=declared)
+
+
 def bent_rig(pitch_deg: float = 1.0) -> CameraFault:
     """The second camera has turned since it was calibrated."""
 
@@ -351,6 +368,7 @@ CAMERA_FAULTS: dict[str, Callable[[], CameraFault]] = {
     "swapped_cameras": swapped_cameras,
     "wrong_baseline": wrong_baseline,
     "bent_rig": bent_rig,
+    "wrong_focal_length": wrong_focal_length,
     "inverted_extrinsic": inverted_extrinsic,
     "imu_clock_offset": imu_clock_offset,
     "other_imu": other_imu,

@@ -34,10 +34,10 @@ from boxplus.systems.direct_odometry.depth.depth_filter import depth_from, depth
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.frame_order import FrameOrder
-from boxplus.systems.direct_odometry.image_motion import image_motion
+from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import SensorWatch
+from boxplus.systems.direct_odometry.sensor_watch import SensorWatch, velocity_between
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -98,7 +98,7 @@ class DirectOdometry:
         self._reference: WindowKeyframe | None = None
         self._frames = FrameOrder()
         self._seen_ns: int | None = None
-        self._watch, self._sensor = Watch(self.config), SensorWatch()
+        self._watch, self._sensor = Watch(self.config), SensorWatch(stereo)
         self._start: TwoViewStart | None = None
 
     @property
@@ -110,6 +110,11 @@ class DirectOdometry:
     def contradiction(self) -> str:
         """Why no pose is to be trusted, whatever the status: grey values contradict intrinsics or depths."""
         return self._watch.contradiction
+
+    @property
+    def remark(self) -> str:
+        """What makes poses worse, though not wrong: a rolling shutter; empty where nothing does."""
+        return self._sensor.remark
 
     @property
     def start_problem(self) -> str:
@@ -144,7 +149,13 @@ class DirectOdometry:
             raise InputError("the second camera", "none", "give it as DirectOdometry(camera, stereo=StereoPair(…))")
         stereo = self.stereo
         one, two = as_image(left), as_image(right)
-        return self._push(time_ns, one, lambda *_: stereo.depth(one, two, self.camera))
+
+        def depth_of(*_: object) -> SensedDepth:
+            depth = stereo.depth(one, two, self.camera)
+            self._sensor.pair(one, two, depth, self.camera)
+            return depth
+
+        return self._push(time_ns, one, depth_of)
 
     def push_mono(self, time_ns: int, image: Image | ArrayLike) -> Estimate | None:
         """A frame of one camera alone. Lengths are in units that nothing tells: about the median depth of the first view.
@@ -163,7 +174,9 @@ class DirectOdometry:
         if self._reference is not None:
             return self._push(time_ns, grey, lambda *at: depth_from(self.window.keyframes, grey, self.camera, *at))
         self._frames.take(time_ns, grey)
-        watch, self._start = Stopwatch(), self._start or TwoViewStart(self.camera)
+        watch = Stopwatch()
+        if self._start is None:
+            self._start, self._sensor = TwoViewStart(self.camera), SensorWatch(is_alone=True)
         views = self._start.push(time_ns, grey)
         begun = None if views is None else self._begin_alone(self._start, views, watch)
         if begun is not None or self._seen_ns is None:
@@ -189,13 +202,13 @@ class DirectOdometry:
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
-        is_keyframe, added = self._asks_for_keyframe(keyframe, alignment), None
+        is_keyframe, added = self._asks_for_keyframe(alignment, keyframe), None
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            if self._is_sensed:
-                self._sensor.frame(keyframe, image, depth, alignment)
-                self._watch.contradiction = self._sensor.contradiction
+            velocity = velocity_between(self._T, T, self._unseen_s(time_ns))
+            self._sensor.frame(keyframe, image, depth, alignment, velocity)
+            self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
             if added is not None:
@@ -203,9 +216,7 @@ class DirectOdometry:
                 self.window.add(added, covariance)
                 if self.config.adjustments:
                     self.window.adjust(self.config.adjustments)
-                if self._is_sensed:
-                    moved = se3.compose(se3.inverse(self._T), T)
-                    self._sensor.keyframe(self.window.keyframes, depth, moved, self._unseen_s(time_ns))
+                self._sensor.keyframe(self.window.keyframes, depth, velocity)
                 T, covariance = added.T_world_camera, self.window.covariance(added)
                 self._reference = added
                 watch.lap("adjustment")
@@ -216,10 +227,6 @@ class DirectOdometry:
         if added is not None:
             self._log_gain, self._offset = added.log_gain, 0.0
         return self._estimate(time_ns, keyframe.number, is_keyframe, alignment, verdict, watch)
-
-    @property
-    def _is_sensed(self) -> bool:  # depths of a stereo pair or by the motion change with the intrinsics
-        return self.stereo is None and self._start is None
 
     def _filled(self, sensed: SensedDepth, image: Image, T_world_camera: Matrix, log_gain: float) -> SensedDepth:
         """Where a sensor measures little, with depths by the motion."""
@@ -318,23 +325,16 @@ class DirectOdometry:
 
     def _nearest(self, T_world_camera: Matrix) -> WindowKeyframe:
         """The keyframe whose pixels move least; the one that was tracked last, unless another is clearly closer."""
-        wanted = {
-            k.number: self._distance(k, T_world_camera) * (_STAYS if k is self._reference else 1.0) for k in self.window.keyframes
-        }
+        wanted, T_camera_world = {}, se3.inverse(T_world_camera)
+        for k in self.window.keyframes:
+            away = keyframe_distance(k.tracker, se3.compose(T_camera_world, k.T_world_camera), self.config)
+            wanted[k.number] = away * (_STAYS if k is self._reference else 1.0)
         return min(self.window.keyframes, key=lambda k: wanted[k.number])
 
-    def _distance(self, keyframe: WindowKeyframe, T_world_camera: Matrix) -> float:
-        """From 1 on a keyframe is asked for."""
-        motion = image_motion(keyframe.tracker, se3.compose(se3.inverse(T_world_camera), keyframe.T_world_camera))
-        by_flow = motion.flow / self.config.keyframe_flow + motion.by_translation / self.config.keyframe_flow_translation
-        missing = (1.0 - motion.overlap) / (1.0 - self.config.keyframe_overlap)
-        return max(0.5 * by_flow, missing)
-
-    def _asks_for_keyframe(self, keyframe: WindowKeyframe, alignment: Alignment) -> bool:
-        T = se3.compose(keyframe.T_world_camera, se3.inverse(alignment.T_21))
+    def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe) -> bool:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
-        return max(self._distance(keyframe, T) + by_brightness, missing) > 1.0
+        return max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
         """None where too little has a depth and a gradient."""

@@ -12,6 +12,7 @@ from boxplus.cameras.pinhole import project_point
 from boxplus.manifolds.quaternion import rotation_entries
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.keyframe_kernel import LEAST_Y_Z
+from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 
 _OCTAVE = 2  # of the pixels that are followed
 
@@ -72,3 +73,11 @@ def image_motion(keyframe: Keyframe, T_camera_keyframe: NDArray[np.float64]) -> 
         return ImageMotion(1.0, 1.0, 0.0)
     size = float(width + height)
     return ImageMotion(np.sqrt(whole / seen) / size, np.sqrt(shifted / seen) / size, seen / len(level.inverse_depth))
+
+
+def keyframe_distance(keyframe: Keyframe, T_camera_keyframe: NDArray[np.float64], config: DirectOdometryConfig) -> float:
+    """How far a camera at T_camera_keyframe (7,) has moved the image; from 1 on a keyframe is asked for."""
+    motion = image_motion(keyframe, T_camera_keyframe)
+    by_flow = motion.flow / config.keyframe_flow + motion.by_translation / config.keyframe_flow_translation
+    missing = (1.0 - motion.overlap) / (1.0 - config.keyframe_overlap)
+    return max(0.5 * by_flow, missing)

@@ -1,7 +1,7 @@
 """What is left of the residuals of an aligned frame after the pose took what it can, and what would explain it.
 
 At a frame that was tracked, e = I₁(p₁) − (eᵃ I₂(p₂) + b) with p₂ = π(Y), Y = R m + ρ t, is linearised by what was estimated
-(ξ, a, b) and by causes q that were not, each of which moves p₂ by ∂p₂/∂q:
+(ξ, a, b) and by causes q that were not, each of which moves p₂ by ∂p₂/∂q (`calibration_causes.py`, `depth_watch.py`):
 
     ∂e/∂q ≈ −∇I₁ ∂p₂/∂q
 
@@ -11,8 +11,11 @@ The pose takes what it can; what is left says q, with the covariance of the scat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr, stdtrit
 
 from boxplus.manifolds import quaternion
 from boxplus.residuals.camera.photometric_sampling import sample
@@ -20,9 +23,10 @@ from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
-_FEWEST = 5  # frames for a contradiction
+_FEWEST, _MANY = 3, 5  # frames for a contradiction; from the latter on how much they disagree is known well enough
 _CUT = 4.685  # of Tukey's weights, in σ
 _CELLS = 6  # across and down
+_NOTHING = 1e-6  # information of what no frame was asked for
 _CONDITION = 1e10  # of the normal equations, from which on a frame says nothing
 
 
@@ -30,32 +34,31 @@ class Leftover:
     """Residuals of a frame at the keyframe's pixels, at full resolution.
 
     Args:
-        keyframe: that the frame was aligned to, with a level of full resolution and a camera without distortion.
+        keyframe: that the frame was aligned to, with a level of full resolution.
         image: grey values (H, W) of the frame.
         alignment: of the frame to the keyframe.
 
     Attributes:
-        m: (n, 3) rays of z = 1; inverse_depth: (n,) [1/m], of the keyframe's pixels.
-        y: (n, 2) x/z and y/z in the frame.
+        pixels: (n, 2) p₁; m: (n, 3) their rays of z = 1; inverse_depth: (n,) [1/m].
+        Y: (n, 3) by inverse depth where they are in the frame's camera; seen_at: (n, 2) p₂; by_parameters: (n, 2, k) ∂p₂ by the
+            parameters of the camera.
     """
 
     @classmethod
     def of(cls, keyframe: WindowKeyframe, image: NDArray[np.float32], alignment: Alignment) -> Leftover | None:
-        """None where the keyframe has no level of full resolution, or its camera a lens with distortion."""
-        tracker = keyframe.tracker
-        is_simple = tracker.levels[-1].octave == 0 and tracker.camera.distortion is None
-        return cls(keyframe, image, alignment) if is_simple else None
+        """None where the keyframe has no level of full resolution."""
+        return cls(keyframe, image, alignment) if keyframe.tracker.levels[-1].octave == 0 else None
 
     def __init__(self, keyframe: WindowKeyframe, image: NDArray[np.float32], alignment: Alignment) -> None:
         level, camera = keyframe.tracker.levels[-1], keyframe.tracker.camera
-        self.inverse_depth = level.inverse_depth
-        self._f = np.array([camera.fx, camera.fy])
+        self.inverse_depth, self.pixels = level.inverse_depth, level.pixels
         self._R, self._t = quaternion.to_matrix(alignment.T_21[:4]), alignment.T_21[4:]
         self.m = np.column_stack([level.rays, np.ones(len(level.rays))])
-        Y = self.m @ self._R.T + level.inverse_depth[:, None] * self._t
-        Y[:, 2] = np.maximum(Y[:, 2], 1e-6)
-        self.y, self._z = Y[:, :2] / Y[:, 2:], Y[:, 2]
-        value, _, seen = sample(image, self._f * self.y + np.array([camera.cx, camera.cy]))
+        self.Y = self.m @ self._R.T + level.inverse_depth[:, None] * self._t
+        projected, by_point, by_parameters, is_ahead = camera.project_with_jacobians(self.Y)
+        self.seen_at, self.by_parameters = np.where(is_ahead[:, None], projected, -1.0), np.nan_to_num(by_parameters)
+        self._P, self._sigma = np.nan_to_num(by_point), alignment.sigma
+        value, _, seen = sample(image, self.seen_at)
         gain, offset = np.exp(alignment.brightness[0]), alignment.brightness[1]
         self._e = np.where(seen, level.grey - gain * value - offset, 0.0)
         weight = np.where(seen, np.clip(1.0 - (self._e / (_CUT * alignment.sigma)) ** 2, 0.0, 1.0) ** 2, 0.0)
@@ -72,15 +75,21 @@ class Leftover:
 
     def turned(self, d: Matrix) -> Matrix:
         """P_Y R d (n, 2) [pixels], P_Y = ∂π/∂Y, for d (n, 3)."""
-        return self._projected(d @ self._R.T)
+        return self.projected(d @ self._R.T)
 
     @property
     def by_inverse_depth(self) -> Matrix:
         """∂p₂/∂ρ = P_Y t (n, 2) [pixels · m]."""
-        return self._projected(np.broadcast_to(self._t, (len(self.m), 3)))
+        return self.projected(np.broadcast_to(self._t, (len(self.m), 3)))
 
-    def _projected(self, D: Matrix) -> Matrix:
-        return self._f * np.stack([(D[:, k] - self.y[:, k] * D[:, 2]) / self._z for k in (0, 1)], axis=1)
+    def projected(self, D: Matrix) -> Matrix:
+        """P_Y D (n, 2) [pixels] for D (n, 3) in the frame's camera."""
+        return np.asarray(np.einsum("nij,nj->ni", self._P, D))
+
+    def share_without(self, error: float) -> Matrix:
+        """(n,) by which pixels count whose inverse depths err by a share of their own: σ²/(σ² + (∇I₁ · P_Y t ρ · error)²)."""
+        by_depth = (self._slope * self.by_inverse_depth).sum(axis=1) * self.inverse_depth * error
+        return np.asarray(self._sigma**2 / (self._sigma**2 + by_depth**2))
 
     def explained_by(self, motions: list[Matrix], share: Matrix | None = None) -> tuple[Matrix, Matrix] | None:
         """q (k,) and its covariance (k, k); None where the frame does not say it.
@@ -114,20 +123,22 @@ class Combined:
 
     Args:
         count: of q.
-        own_error: standard deviation of one frame that its scatter does not show.
+        own_error: standard deviation of one frame that its scatter does not show, of all or of each.
     """
 
-    def __init__(self, count: int, own_error: float) -> None:
+    def __init__(self, count: int, own_error: ArrayLike) -> None:
         self._information, self._vector, self._square = np.zeros((count, count)), np.zeros(count), 0.0
-        self._own_error, self.frames = own_error, 0
+        self._own, self.frames, self._values = np.diag(np.full(count, own_error) ** 2), 0, 0
 
-    def add(self, q: Matrix, covariance: Matrix) -> None:
-        """What one frame says."""
-        information = np.linalg.inv(covariance + np.eye(len(q)) * self._own_error**2)
-        self._information += information
-        self._vector += information @ q
+    def add(self, q: Matrix, covariance: Matrix, which: Sequence[int] | None = None) -> None:
+        """What one frame says, of all or of `which`."""
+        asked = np.arange(len(self._vector)) if which is None else np.asarray(which)
+        block = np.ix_(asked, asked)
+        information = np.linalg.inv(covariance + self._own[block])
+        self._information[block] += information
+        self._vector[asked] += information @ q
         self._square += float(q @ information @ q)
-        self.frames += 1
+        self.frames, self._values = self.frames + 1, self._values + len(q)
 
     def strongest(self, least: ArrayLike, least_sigmas: float) -> tuple[int, float, float] | None:
         """The cause that stands out most: its number, how much of it there is, and how well that is known; None where none does.
@@ -137,6 +148,9 @@ class Combined:
         """
         if self.frames < _FEWEST:
             return None
+        if self.frames < _MANY:  # as unlikely by chance, where the deviation itself is told by few frames (Student's t)
+            freedom = max(self._values - len(self._vector), 1)
+            least_sigmas = -float(stdtrit(freedom, ndtr(-least_sigmas)))
         q, sigma = self.estimate()
         wrong = np.abs(q) > np.maximum(least_sigmas * sigma, least)
         if not wrong.any():
@@ -146,7 +160,7 @@ class Combined:
 
     def estimate(self) -> tuple[Matrix, Matrix]:
         """q (k,), and standard deviations (k,) that hold how much at least two frames disagree."""
-        covariance = np.linalg.inv(self._information)
+        covariance = np.linalg.inv(self._information + _NOTHING * np.eye(len(self._vector)))
         q = covariance @ self._vector
-        disagreement = (self._square - float(q @ self._information @ q)) / (len(q) * (self.frames - 1))
+        disagreement = (self._square - float(q @ self._information @ q)) / max(self._values - len(q), 1)
         return q, np.sqrt(np.diag(covariance) * max(disagreement, 1.0))

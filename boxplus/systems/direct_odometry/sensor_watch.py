@@ -1,4 +1,4 @@
-"""What the keyframes of an RGB-D camera say of its calibration: of intrinsics, of where depths lie, and of depths themselves."""
+"""What the keyframes say of the calibration: of intrinsics and shutter, of a stereo pair, of where depths lie, and of depths."""
 
 from __future__ import annotations
 
@@ -7,53 +7,96 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch
-from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth
+from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch, Depths
+from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.depth_watch import DepthWatch, Surfaces
 from boxplus.systems.direct_odometry.leftover import Leftover
 from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.stereo_watch import StereoWatch
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
+_RECENT_S = 0.25  # within which a motion is that of an instant
 
 
 class SensorWatch:
-    """Keyframe after keyframe; each is known by its number until it leaves the window."""
+    """Keyframe after keyframe; each is known by its number until it leaves the window.
 
-    def __init__(self) -> None:
-        self._intrinsics, self._depths, self._registration = CalibrationWatch(), DepthWatch(), RegistrationWatch()
+    Args:
+        stereo: the second camera of a stereo pair, None where there is none.
+        is_alone: one camera alone, whose depths come from its motion.
+    """
+
+    def __init__(self, stereo: StereoPair | None = None, *, is_alone: bool = False) -> None:
+        self._is_sensed = stereo is None and not is_alone
+        depths: Depths = "motion" if is_alone else "sensed" if stereo is None else "stereo"
+        self._calibration = CalibrationWatch(depths, stereo)
+        self._depths, self._registration = DepthWatch(), RegistrationWatch()
+        self._pair = None if stereo is None else StereoWatch(stereo)
         self._surfaces: dict[int, Surfaces] = {}
+        self._velocities: dict[int, Matrix] = {}
 
-    def frame(self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment) -> None:
-        """A frame that shall become a keyframe, as it was aligned to another one."""
-        self._registration.add(image, _measured(depth))
+    def pair(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole) -> None:
+        """Both images of a keyframe of a stereo pair, and the depths that were found in them."""
+        if self._pair is not None:
+            self._pair.add(left, right, depth, camera)
+
+    def frame(
+        self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment, velocity: Matrix | None
+    ) -> None:
+        """A frame that shall become a keyframe, as it was aligned to another one.
+
+        Args:
+            velocity: (6,) [w, v] of the camera, in itself [rad/s, m/s]; None where it is not known.
+        """
+        if self._is_sensed:
+            self._registration.add(image, _measured(depth))
         leftover = Leftover.of(keyframe, image.grey, alignment)
         if leftover is None:
             return
-        self._intrinsics.add(leftover, keyframe.tracker.camera)
+        before, camera = self._velocities.get(keyframe.number), keyframe.tracker.camera
+        if before is not None and velocity is not None:
+            self._calibration.add(leftover, camera, image.shape[0], (before, velocity))
         surfaces = self._surfaces.get(keyframe.number)
         if surfaces is not None:
             self._depths.add(leftover, surfaces, keyframe.tracker)
 
-    def keyframe(self, keyframes: Sequence[WindowKeyframe], depth: SensedDepth, moved: Matrix, elapsed_s: float) -> None:
+    def keyframe(self, keyframes: Sequence[WindowKeyframe], depth: SensedDepth, velocity: Matrix | None) -> None:
         """The keyframe it became.
 
         Args:
             keyframes: that frames may be aligned to, this one the last.
-            moved: (7,) from the camera's last pose to this one, T_last_now, in `elapsed_s` [s].
+            velocity: as in `frame`.
         """
         added, kept = keyframes[-1], {each.number for each in keyframes}
         self._surfaces = {number: known for number, known in self._surfaces.items() if number in kept}
-        if elapsed_s > 0.0 and added.tracker.levels[-1].octave == 0:
-            self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), se3.log(moved) / elapsed_s)
+        self._velocities = {number: known for number, known in self._velocities.items() if number in kept}
+        if velocity is None:
+            return
+        self._velocities[added.number] = velocity
+        if self._is_sensed and added.tracker.levels[-1].octave == 0 and added.tracker.camera.distortion is None:
+            self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), velocity)
+
+    @property
+    def remark(self) -> str:
+        """What makes poses worse than they have to be, in a sentence; empty where nothing does."""
+        return self._calibration.remark
 
     @property
     def contradiction(self) -> str:
         """What contradicts the calibration, in a sentence; empty where nothing does."""
-        return self._intrinsics.contradiction or self._depths.contradiction or self._registration.contradiction
+        pair = "" if self._pair is None else self._pair.contradiction
+        return pair or self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
+
+
+def velocity_between(T_before: Matrix, T_now: Matrix, elapsed_s: float) -> Matrix | None:
+    """(6,) [w, v] of a camera in itself, from two poses (7,) T_world_camera; None where they are too far apart in time."""
+    moved = se3.compose(se3.inverse(T_before), T_now)
+    return se3.log(moved) / elapsed_s if 0.0 < elapsed_s < _RECENT_S else None
 
 
 def _measured(depth: SensedDepth) -> NDArray[np.float32]:

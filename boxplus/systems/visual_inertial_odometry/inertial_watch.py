@@ -111,10 +111,10 @@ class InertialWatch:
 
     @property
     def length(self) -> tuple[float, float]:
-        """See the class; infinitely uncertain before there are enough segments."""
+        """See the class; not a number, and infinitely uncertain, before there are enough segments."""
         dd, do, oo, segments = self._sums
         if segments < _FEWEST_SHORT or dd <= 0.0:
-            return 0.0, np.inf
+            return np.nan, np.inf
         left = (oo - do**2 / dd) / (3.0 * segments - 1.0)
         return float(do / dd), float(np.sqrt(max(left, 1.0) / dd))
 

@@ -179,7 +179,7 @@ class VisualInertialOdometry:
 
     @property
     def lengths(self) -> tuple[float, float]:
-        """By what share lengths of the cameras exceed the IMU's, and its standard deviation, infinite where nothing tells."""
+        """By what share lengths of the cameras exceed the IMU's, and its standard deviation; NaN, infinite if nothing tells."""
         return self._watch.length
 
     def _advance(self, *, final: bool) -> list[VioEstimate]:

@@ -28,7 +28,7 @@ from boxplus.runs.direct.frame_pairs import FramePairs, choose_cameras
 from boxplus.runs.direct.summary import read_direct_summary
 from boxplus.runs.settings_file import load_settings
 from boxplus.sensors.camera_image import CameraImage
-from boxplus.simulation.cameras import make_rig, simulate_cameras, write_camera_recording
+from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from tests.report.unpacked import figures_of
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room, drive, errors
 
@@ -205,6 +205,16 @@ def test_one_camera_that_only_sees_its_first_frames_is_refused_with_the_reason(r
     assert code == 2
     assert "two views of one camera" in words and "of which a rotation leaves" in words
     assert json.loads((tmp_path / "out" / "run.json").read_text())["frames_before_start"] == 3
+
+
+def test_a_stereo_run_that_is_not_to_be_trusted_says_what_may_be_the_cause(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room_moving", 1, duration_s=2.5, rig=make_rig("stereo", "pinhole", 0.35, 10.0))
+    swapped = as_camera_recording(simulation, make_camera_fault("swapped_cameras"))
+    summary = run_direct_odometry(swapped, tmp_path / "swapped")
+    assert summary.contradiction is not None
+    assert any(w.text.startswith("this may be the cause") and "swapped" in w.text for w in summary.warnings)
+    sound = run_direct_odometry(as_camera_recording(simulation), tmp_path / "sound")
+    assert sound.contradiction is None and not any("may be the cause" in warning.text for warning in sound.warnings)
 
 
 def stream(index: int, name: str, kind: str = "intensity", **other: object) -> CameraStream:

@@ -105,7 +105,14 @@ def test_what_the_imu_says_of_lengths_is_kept_and_said(finished: tuple[VioFolder
     assert summary.lengths is not None and read_vio_summary(folder.summary).lengths == summary.lengths
     assert "errors of less than 5.2% are not noticed" in LengthFacts(longer=0.027, sigma=0.013).text
     assert "errors of less than 2.0% are not noticed" in LengthFacts(longer=-0.001, sigma=0.004).text
-    assert "a wrong baseline would not be noticed" in LengthFacts(longer=0.0, sigma=None).text
+    assert "a wrong baseline would not be noticed" in LengthFacts(longer=None, sigma=None).text
+
+
+def test_lengths_that_nothing_tells_are_not_said_to_agree(finished: tuple[VioFolder, VioSummary]) -> None:
+    """A run of three seconds has too few segments: no share of zero, which would read as lengths that agree."""
+    folder, summary = finished
+    assert summary.lengths is not None and summary.lengths.longer is None and summary.lengths.sigma is None
+    assert json.loads(folder.summary.read_text())["lengths"] == {"longer": None, "sigma": None}
 
 
 def test_the_report_says_what_the_run_was(finished: tuple[VioFolder, VioSummary]) -> None:

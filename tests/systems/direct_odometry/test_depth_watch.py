@@ -85,8 +85,11 @@ def test_what_depths_look_like_is_said(spoil: Spoil, looks_like: str) -> None:
     assert looks_like in watched(spoil, 1).contradiction
 
 
-def test_few_frames_contradict_nothing() -> None:
-    assert watched(distances, 1, frames=4).contradiction == ""
+def test_few_frames_contradict_only_what_is_far_off() -> None:
+    """Two say nothing; of four, what by Student's t is as unlikely as six standard deviations of many."""
+    assert watched(distances, 1, frames=2).contradiction == ""
+    assert "distances from the camera" in watched(distances, 1, frames=4).contradiction
+    assert watched(zoomed, 1, frames=4).contradiction == "" and watched(right, 1, frames=4).contradiction == ""
 
 
 def test_slopes_are_those_of_a_plane_and_nothing_at_its_end() -> None:

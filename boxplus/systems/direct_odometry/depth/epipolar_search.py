@@ -44,10 +44,16 @@ class Found(NamedTuple):
     state: NDArray[np.uint8]
 
 
+def cell_size(image: Image, count: int) -> int:
+    """Side of the cells [pixels] of which `choose_candidates` takes a pixel each."""
+    height, width = image.shape
+    return max(int(np.sqrt(height * width / count)), 1)
+
+
 def choose_candidates(image: Image, count: int) -> Pixels:
     """(n, 2) about `count` pixels of steep gradient, spread over the image."""
     height, width = image.shape
-    cell = max(int(np.sqrt(height * width / count)), 1)
+    cell = cell_size(image, count)
     inner = np.zeros((height, width), np.float32)
     inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = 1.0
     most = -(-height // cell) * -(-width // cell)
@@ -66,10 +72,20 @@ def pixels_per_inverse_depth(T_21: Matrix, rays: Matrix, rho: Matrix, f: float) 
     return np.asarray(f * np.hypot(moved[:, 0], moved[:, 1]) / z)
 
 
-def search(image: Image, camera: Pinhole, centres: Pixels, view: View, near: Matrix, far: Matrix) -> Found:
+def search(
+    image: Image,
+    camera: Pinhole,
+    centres: Pixels,
+    view: View,
+    near: Matrix,
+    far: Matrix,
+    *,
+    least_disparity: float = LEAST_DISPARITY,
+) -> Found:
     """Where the pixels `centres` (n, 2) of an image lie in another one, for inverse depths between `far` and `near` (n,).
 
-    At half the resolution along all of the line, then around what was found there.
+    At half the resolution along all of the line, then around what was found there. What moves by less than `least_disparity`
+    [px] is not known.
     """
     contrast = float(np.ptp(image.grey))
     half = View(view.image.half(), half_camera(view.camera), view.T_view_image)
@@ -82,7 +98,7 @@ def search(image: Image, camera: Pinhole, centres: Pixels, view: View, near: Mat
     fine = _lines(image, camera, centres[found], view, at + margin, np.maximum(at - margin, 0.0), contrast)
     rho, sigma, state = np.zeros(len(centres)), np.full(len(centres), np.inf), coarse.state
     rho[found], sigma[found], state[found] = fine.rho, CORRELATED * fine.sigma, fine.state
-    near_enough = rho[found] * speed > LEAST_DISPARITY
+    near_enough = rho[found] * speed > least_disparity
     state[np.flatnonzero(found)[~near_enough & (fine.state == FOUND)]] = OUTSIDE
     return Found(rho, sigma, state)
 

@@ -12,8 +12,9 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.sensors.image import Image
+from boxplus.systems.direct_odometry.depth.agreement import agreed
 from boxplus.systems.direct_odometry.depth.epipolar_kernel import FOUND
-from boxplus.systems.direct_odometry.depth.epipolar_search import View, choose_candidates, search
+from boxplus.systems.direct_odometry.depth.epipolar_search import View, cell_size, choose_candidates, search
 
 Depths = NDArray[np.float32]
 
@@ -111,9 +112,11 @@ class StereoPair:
         model = check_pinhole(self.camera, "direct odometry")
         near = np.full(len(centres), _WIDEST * width / (model.fx * self.baseline_m))
         view = View(right, model, SE3Left.check("T_right_left", self.T_right_left)[0])
-        rho, sigma_rho, state = search(left, camera, centres, view, near, np.zeros(len(centres)))
-        good = (state == FOUND) & (sigma_rho < _MOST_SHARE * rho)
-        u, v = centres[good].T
+        rho, sigma_rho, state = search(left, camera, centres, view, near, np.zeros(len(centres)), least_disparity=0.0)
+        found = state == FOUND
+        rho, sigma_rho = agreed(centres[found], rho[found], sigma_rho[found], left.shape, cell_size(left, self.candidates))
+        good = sigma_rho < _MOST_SHARE * rho
+        u, v = centres[found][good].T
         z[v, u] = 1.0 / rho[good]
         sigma[v, u] = sigma_rho[good] / rho[good] ** 2
         return SensedDepth(z, sigma, is_measured=z > 0.0)

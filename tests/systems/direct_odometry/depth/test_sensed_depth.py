@@ -37,6 +37,19 @@ def test_stereo_finds_depths_with_their_standard_deviation(camera: Pinhole, seed
     assert np.median(np.abs(found.z / z - 1.0)[known]) < 0.02
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_depths_far_for_the_baseline_are_not_too_near(seed: int) -> None:
+    """Disparities of two pixels, known to a fifth one by one: those that come out near are no more welcome than the others."""
+    T_right_left, rng = np.array([1.0, 0.0, 0.0, 0.0, -0.03, 0.0, 0.0]), np.random.default_rng(seed)
+    (left, z), (right, _) = (Room(seed).render(pose) for pose in (se3.SE3.identity(), se3.inverse(T_right_left)))
+    noisy = [Image.from_array(grey + rng.normal(0.0, 2.0, SHAPE)) for grey in (left, right)]
+    found = StereoPair(CAMERA, T_right_left).depth(*noisy, CAMERA)
+    known = found.z > 0.0
+    assert known.sum() > 8000
+    assert abs(np.median(found.z[known] / z[known]) - 1.0) < 0.04  # 0.05 to 0.06 too near by single pixels
+    assert np.median(found.sigma[known] / found.z[known]) < 0.15
+
+
 def test_one_colour_has_no_depth() -> None:
     flat = Image.from_array(np.full(SHAPE, 100.0))
     assert not StereoPair(CAMERA, (1, 0, 0, 0, -0.2, 0, 0)).depth(flat, flat, CAMERA).z.any()

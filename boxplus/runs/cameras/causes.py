@@ -16,11 +16,14 @@ from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
+MAY_BE = "this may be the cause"
 _BEFORE_S, _AFTER_S = 14.0, 2.0
 _MARGIN_NS = 500_000_000  # of IMU samples on both sides
 
 
-def likely_causes(info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None) -> list[str]:
+def likely_causes(
+    info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, *, with_imu: bool = True
+) -> list[str]:
     """Sentences about what does not go together, by readings that need no odometry; none where these find nothing.
 
     Args:
@@ -28,6 +31,7 @@ def likely_causes(info: CameraRecordingInfo, events: Iterator[CameraEvent], came
         events: of it, from the beginning; sixteen seconds are looked at.
         cameras: how many of them the run uses.
         around_ns: when the run contradicted itself [ns]; None where it never began, and its beginning is looked at.
+        with_imu: whether the run uses the IMU as well.
     """
     pictures = [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
@@ -49,7 +53,7 @@ def likely_causes(info: CameraRecordingInfo, events: Iterator[CameraEvent], came
                 compared.note(event, to_8_bits(event.grey()))
     except RecordingError:
         return []
-    found = compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu else [])
+    found = compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu and with_imu else [])
     return [_sentence(finding) for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
 
 

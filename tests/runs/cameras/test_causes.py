@@ -11,7 +11,7 @@ import pytest
 
 from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo
-from boxplus.runs.visual_inertial.causes import likely_causes
+from boxplus.runs.cameras.causes import likely_causes
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 
