@@ -226,9 +226,9 @@ class _RefineRun:
             if closed is None:
                 return found
             run, rows = self._run.trajectory, np.searchsorted(self._run.trajectory.times, found.time_ns)
-            placed = found.corrected(closed.outcome.placed)
             covariance = None if run.covariance is None else run.covariance[rows]
-            return replace(placed, covariance=covariance, loops=closed.loops(), fixes=closed.fixes(opened))
+            placed = found.corrected(closed.outcome.placed, covariance)
+            return replace(placed, loops=closed.loops(), fixes=closed.fixes(opened))
 
     def _write_trajectory(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64], accepted: bool) -> None:
         """The refined poses, or those of the run; status is the run's."""

@@ -119,7 +119,7 @@ def _start(
             f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not "
             "determined; record a longer way"
         )
-    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + _drift(graph)[0][attached.map_of] ** 2
+    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + (_SIGMAS * _drift(graph)[0][attached.map_of]) ** 2
     speed = np.linalg.norm(attached.v_map, axis=1)
     allowed += (2.0 * config.delay_sigma * speed) ** 2
     allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2
@@ -215,7 +215,7 @@ def _heights(
     """What is wrong with the heights of the fixes."""
     p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
     seconds = float(attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
-    drift = _drift(graph)[1][attached.map_of] / _SIGMAS
+    drift = _drift(graph)[1][attached.map_of]
     climb = climb_of(p_level, p_enu[:, 2], drift, seconds, config.correlation)
     return None if climb is None else climb.doubt
 
@@ -252,7 +252,7 @@ def _scatter(p_level: Floats, p_enu: Floats) -> float:
 
 
 def _drift(graph: MapGraph) -> tuple[Floats, Floats]:
-    """(n,) three standard deviations of each map's position and height against the middle one, by the odometry alone [m]."""
+    """(n,) standard deviations of each map's position and height against the middle one, by the odometry alone [m]."""
     middle = len(graph.T_odo) // 2
     sigma, of_height = np.zeros(len(graph.T_odo)), np.zeros(len(graph.T_odo))
     up = np.swapaxes(quaternion.to_matrix(graph.T_odo[:, :4]), 1, 2) @ mean_up(graph.T_odo)
@@ -267,8 +267,8 @@ def _drift(graph: MapGraph) -> tuple[Floats, Floats]:
                 own = back @ graph.covariances[k] @ back.T
             Ad = se3.adjoint(se3.inverse(Z))
             P = Ad @ P @ Ad.T + own
-            sigma[to] = _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(P[3:, 3:])[-1]), 0.0))
-            of_height[to] = _SIGMAS * math.sqrt(max(float(up[to] @ P[3:, 3:] @ up[to]), 0.0))
+            sigma[to] = math.sqrt(max(float(np.linalg.eigvalsh(P[3:, 3:])[-1]), 0.0))
+            of_height[to] = math.sqrt(max(float(up[to] @ P[3:, 3:] @ up[to]), 0.0))
     return sigma, of_height
 
 

@@ -74,15 +74,15 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     least = max(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
     left = np.where(is_near & enough & (steps >= least), steps, 0.0)
     short: Jump | None = None
-    for _ in range(_TRIED):
+    tried = {False: 0, True: 0}  # of steps that last, and of short ones: many of these must not hide one that lasts
+    while left.any():
         largest = int(np.argmax(left))
-        if left[largest] == 0.0:
-            break
         is_short, at_end = not lasting[largest], 2 * int(at[largest]) > len(attached)
         left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
         side = found.is_used[at[largest] :] if at_end else found.is_used[: at[largest]]
-        if is_short and (short is not None or float(side.mean()) < _SIDE_USED):
+        if tried[is_short] == _TRIED or (is_short and (short is not None or float(side.mean()) < _SIDE_USED)):
             continue
+        tried[is_short] += 1
         after = np.arange(len(attached)) >= at[largest]
         try:
             split = refit(after)

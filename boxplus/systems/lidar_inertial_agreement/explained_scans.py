@@ -71,22 +71,20 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         more_off = (other_misfit - own_misfit) / config.plane_threshold**2
         elsewhere = not one_motion(part.poses, other, _ASTRAY_RAD, _ASTRAY_M + _ASTRAY_SHARE * _way(part.poses))
         if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and more_off > _MORE_OFF:
-            astray = _astray(part.poses, other, float(np.sqrt(own_misfit)), float(np.sqrt(other_misfit)))
+            astray = _astray(part.poses, other, more_off)
     return Explained(by_path, astray)
 
 
-def _astray(own: Poses, other: Poses, misfit: float, misfit_other: float) -> Finding:
+def _astray(own: Poses, other: Poses, more_off: float) -> Finding:
     seconds = float(own[0][-1] - own[0][0]) * 1e-9
-    turn, turn_other = np.degrees(_turns(own, other))
-    moved, moved_other = _moves(own, other)
-    way, way_other, apart = (float(np.linalg.norm(move)) for move in (moved, moved_other, moved - moved_other))
+    apart_rad, apart = _apart(own, other)
+    way, way_other = (float(np.linalg.norm(p[-1] - p[0])) for _, _, p in (own, other))
     return Finding(
         "astray",
-        f"over {seconds:.1f} s the scans, laid upon one another without the IMU, show that the LiDAR moved by {way:.1f} m and "
-        f"turned by {turn:.0f} deg; the estimate moved by {way_other:.1f} m and turned by {turn_other:.0f} deg, ends "
-        f"{apart:.1f} m from there, and lays the scans {100 * misfit_other:.1f} cm instead of {100 * misfit:.1f} cm from one "
-        "another (rms): it has gone astray. The IMU is not that of this LiDAR, or a unit, a sign, T_imu_lidar or a clock is "
-        "wrong (see 'boxplus inspect')",
+        f"over {seconds:.1f} s the scans, laid upon one another without the IMU, show that the LiDAR moved by {way:.1f} m; the "
+        f"estimate moved by {way_other:.1f} m and ends {apart:.1f} m and {np.degrees(apart_rad):.0f} deg from there, and "
+        f"{more_off:.0%} more of the points lie off one another's surfaces under it: it has gone astray. The IMU is not that of "
+        "this LiDAR, or a unit, a sign, T_imu_lidar or a clock is wrong (see 'boxplus inspect')",
     )
 
 
@@ -121,20 +119,16 @@ def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
 
 def one_motion(own: Poses, other: Poses, angle_rad: float = 0.01, distance_m: float = 0.05) -> bool:
     """Whether two motions end alike: then neither has gone astray on its own."""
-    turned, turned_other = own[1][0].T @ own[1][-1], other[1][0].T @ other[1][-1]
-    moved, moved_other = _moves(own, other)
-    angle = float(np.linalg.norm(so3.log(turned.T @ turned_other)))
-    return angle < angle_rad and float(np.linalg.norm(moved - moved_other)) < distance_m
+    angle, distance = _apart(own, other)
+    return angle < angle_rad and distance < distance_m
 
 
-def _moves(*motions: Poses) -> list[NDArray[np.float64]]:
-    """(3,) [m] of each, from its first pose to its last, along the axes of the first."""
-    return [R[0].T @ (p[-1] - p[0]) for _, R, p in motions]
-
-
-def _turns(*motions: Poses) -> list[float]:
-    """Angle [rad] of each between its first pose and its last."""
-    return [float(np.linalg.norm(so3.log(R[0].T @ R[-1]))) for _, R, _ in motions]
+def _apart(own: Poses, other: Poses) -> tuple[float, float]:
+    """Angle [rad] and distance [m] between the last poses of two motions, seen from their first ones."""
+    (_, R, p), (_, R_other, p_other) = own, other
+    turned, turned_other = R[0].T @ R[-1], R_other[0].T @ R_other[-1]
+    moved, moved_other = R[0].T @ (p[-1] - p[0]), R_other[0].T @ (p_other[-1] - p_other[0])
+    return float(np.linalg.norm(so3.log(turned.T @ turned_other))), float(np.linalg.norm(moved - moved_other))
 
 
 def _way(motion: Poses) -> float:

@@ -53,7 +53,9 @@ class OdometryRows:
         if self.covariance is None:
             if (not_ok := int(np.count_nonzero(self.status != "ok"))) > 0:
                 raise InputError(
-                    "covariances of the poses of a run with weak or lost scans", f"none, and {not_ok} of them", again
+                    "a covariance of every pose, as some scans are weak or lost",
+                    f"none, with {not_ok} of {len(self.status)} scans weak or lost",
+                    again,
                 )
             return
         unknown = np.flatnonzero(~np.isfinite(self.covariance).all(axis=(1, 2)))

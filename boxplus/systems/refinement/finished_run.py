@@ -54,15 +54,10 @@ class FinishedRun:
     def __len__(self) -> int:
         return len(self.time_ns)
 
-    def corrected(self, correction: Correction) -> FinishedRun:
-        """The same where closed loops put it."""
+    def corrected(self, correction: Correction, covariance: Floats | None) -> FinishedRun:
+        """The same where closed loops put it, with the covariance (N, 6, 6) of the poses there."""
         T = correction.apply(self.time_ns, self.T_world_imu)
         turned = quaternion.to_matrix(T[:, :4]) @ np.swapaxes(quaternion.to_matrix(self.T_world_imu[:, :4]), 1, 2)
-        covariance = self.covariance
-        if covariance is not None:
-            to_new = np.tile(np.eye(6), (len(T), 1, 1))
-            to_new[:, 3:, 3:] = turned
-            covariance = to_new @ covariance @ np.swapaxes(to_new, 1, 2)
         velocity = np.einsum("nij,nj->ni", turned, self.velocity_bias[:, :3])
         down = (turned @ self.gravity_world).mean(axis=0)
         return replace(

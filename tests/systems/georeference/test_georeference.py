@@ -22,6 +22,7 @@ from boxplus.systems.georeference.start import find_start
 from tests.systems.georeference.drives import LAPS, ORIGIN, Drive, drive
 
 LEVER = (0.8, -0.3, 1.1)
+STEP = np.array([3.0, 0.0, 0.0])
 GOOD = GnssConfig(sigma=0.3, slow_sigma=0.1, claimed=0.3, lever=LEVER)
 
 
@@ -96,6 +97,26 @@ def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
     split = replace(between.fit, errors=np.zeros_like(between.fit.errors), datum_step=np.array([1.2, 0.9, -5.0]))
     jump = jump_of(between.attached, between.fit, lambda after: split)
     assert jump is not None and jump.metres == pytest.approx(1.5)
+
+
+def test_bursts_near_the_ends_do_not_hide_a_jump(laps: Drive) -> None:
+    good = found(laps, GOOD.model_copy(update=PRECISE))
+    assert good.fit is not None
+    seconds, half = np.arange(300.0), 150.0
+    covariance = np.tile(good.attached.covariance[:1], (300, 1, 1))
+    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(300, np.intp))
+    errors = np.where(seconds[:, None] >= half, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    for begin in (12.0, 278.0):
+        errors[(seconds >= begin) & (seconds < begin + 10.0)] += [20.0, 0.0, 0.0]
+    bent = replace(good.fit, errors=errors, is_used=np.ones(300, dtype=bool))
+
+    def refit(after: np.ndarray) -> Fit:
+        """A datum from where the jump is takes 3 m away, and one from a burst on nothing."""
+        right = abs(float(seconds[np.argmax(after)]) - half) < 1.5
+        return replace(bent, errors=errors - 3.0 * np.outer(after, [1.0, 0.0, 0.0]) if right else errors, datum_step=STEP)
+
+    jump = jump_of(fixes, bent, refit)
+    assert jump is not None and jump.lasts and jump.seconds == pytest.approx(half, abs=1.5)
 
 
 def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:

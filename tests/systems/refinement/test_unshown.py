@@ -77,7 +77,10 @@ def test_covariances_that_are_none_are_refused() -> None:
     """Weak scans without a covariance, or with one that is not finite, cannot say which steps they leave open."""
     _, P = run()
     status = np.array(["ok"] * 10 + ["weak"] * 10)
-    with pytest.raises(InputError, match=r"covariances of the poses of a run with weak or lost scans – got none, and 10 of them"):
+    with pytest.raises(
+        InputError,
+        match=r"as some scans are weak or lost – got none, with 10 of \d+ scans weak or lost",
+    ):
         OdometryRows(np.arange(20), [], status)
     P[15, 3, 3] = np.nan
     with pytest.raises(InputError, match=r"a finite covariance of every pose – got 1 with NaN.*at 15 ns"):
