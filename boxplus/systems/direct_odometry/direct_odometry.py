@@ -37,7 +37,7 @@ from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import SensorWatch, velocity_between
+from boxplus.systems.direct_odometry.sensor_watch import Motion, SensorWatch
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -206,8 +206,8 @@ class DirectOdometry:
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            velocity = velocity_between(self._T, T, self._unseen_s(time_ns))
-            self._sensor.frame(keyframe, image, depth, alignment, velocity)
+            motion = Motion.between(self._T, T, self._unseen_s(time_ns))
+            self._sensor.frame(keyframe, image, depth, alignment, motion)
             self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
@@ -216,7 +216,7 @@ class DirectOdometry:
                 self.window.add(added, covariance)
                 if self.config.adjustments:
                     self.window.adjust(self.config.adjustments)
-                self._sensor.keyframe(self.window.keyframes, depth, velocity)
+                self._sensor.keyframe(self.window.keyframes, depth, motion)
                 T, covariance = added.T_world_camera, self.window.covariance(added)
                 self._reference = added
                 watch.lap("adjustment")
