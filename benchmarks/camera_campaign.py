@@ -123,6 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="append a JSON line for each run")
     parser.add_argument("--merge", type=Path, nargs="+", help="tables of earlier runs; nothing is run")
     options = parser.parse_args(arguments)
+    if options.fault is not None and not (options.vio or options.vo):
+        parser.error("--fault needs --vio or --vo")
     only = dict(entry.split("=", 1) for entry in options.only)
     if options.merge:
         lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]

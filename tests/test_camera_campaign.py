@@ -26,7 +26,7 @@ def campaign() -> Iterator[SimpleNamespace]:
     try:
         draws = importlib.import_module("vio_campaign.draws")
         script, judge = (importlib.import_module(name) for name in ("camera_campaign", "vio_campaign.judge"))
-        yield SimpleNamespace(draws=draws, script=script, judge=judge)
+        yield SimpleNamespace(draws=draws, script=script, judge=judge, direct=importlib.import_module("vio_campaign.direct"))
     finally:
         sys.path.remove(str(FOLDER))
         for name in [name for name in sys.modules if name.partition(".")[0] in ("vio_campaign", "camera_campaign")]:
@@ -43,6 +43,26 @@ def test_every_kind_is_drawn_and_fits(campaign: SimpleNamespace) -> None:
         assert kind.world in campaign.draws.MOTIONS[kind.motion]
         assert kind.rig == "stereo" or kind.fault not in campaign.draws.STEREO_FAULTS
     assert kinds[7] == campaign.draws.draw_kinds(7) and kinds[7].matches({"world": kinds[7].world})
+
+
+@pytest.mark.parametrize("fault", ["bare_walls", "constant_velocity_start", "swapped_cameras", "darkness"])
+def test_a_fault_by_name_brings_what_it_needs(campaign: SimpleNamespace, fault: str) -> None:
+    for kinds_of, made_of in (
+        (campaign.draws.draw_kinds, campaign.draws.draw),
+        (campaign.direct.draw_direct_kinds, campaign.direct.draw_direct),
+    ):
+        seed = next(k for k in range(500) if kinds_of(k).world == "stairs" and kinds_of(k).rig == "mono")
+        kinds, made = kinds_of(seed), made_of(seed, fault).kinds
+        assert made.fault == fault and made.light == kinds.light
+        assert made.rig == ("stereo" if fault in campaign.draws.STEREO_FAULTS else kinds.rig)
+        in_room = fault in campaign.draws.ROOM_FAULTS
+        assert (made.world, made.motion) == (("room", "handheld") if in_room else (kinds.world, kinds.motion))
+
+
+def test_a_fault_by_name_is_not_ignored(campaign: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        campaign.script.main(["--seeds", "0:0", "--fault", "darkness"])
+    assert "--fault needs --vio or --vo" in capsys.readouterr().err
 
 
 def test_a_seed_repeats_and_its_motion_is_free_of_obstacles(campaign: SimpleNamespace) -> None:

@@ -23,7 +23,7 @@ from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.runs.cameras.causes import MAY_BE
 from boxplus.runs.direct.direct_run import run_direct_odometry
 from boxplus.simulation.cameras import as_camera_recording
-from vio_campaign.draws import FAULTY_SHARE, MOTIONS, ROOM_FAULTS, STEREO_FAULTS, Draw, Kinds, draw_of, make_fault
+from vio_campaign.draws import FAULTY_SHARE, MOTIONS, Draw, Kinds, draw_of, make_fault, with_fault
 
 FLOOR_M, SHARE_OF_WAY, MANY_NOT_OK = 0.02, 0.02, 0.3
 FAULT_KINDS = (
@@ -40,18 +40,15 @@ def draw_direct_kinds(seed: int) -> Kinds:
     rig, lens = str(random.choice(("stereo", "mono", "rgbd"), p=(0.6, 0.2, 0.2))), str(random.choice(("radtan", "pinhole")))
     light = str(random.choice(("steady", "swinging", "jumping"), p=(0.6, 0.25, 0.15)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
-    if fault in STEREO_FAULTS:
-        rig = "stereo"
-    if fault in ROOM_FAULTS:
-        world, motion = "room", "handheld"
-    return Kinds(world, motion, rig, "pinhole" if rig == "rgbd" else lens, light, "none", fault)
+    kinds = with_fault(Kinds(world, motion, rig, lens, light, "none", "none"), fault)
+    return replace(kinds, lens="pinhole") if kinds.rig == "rgbd" else kinds
 
 
 def draw_direct(seed: int, fault: str | None = None) -> Draw:
     """Everything about a seed, with a fault of another name where one is given; the IMU is drawn and not recorded."""
     kinds = draw_direct_kinds(seed)
     if fault is not None:
-        kinds = replace(kinds, fault=fault, rig="stereo" if fault in STEREO_FAULTS else kinds.rig)
+        kinds = with_fault(kinds, fault)
     made = draw_of(seed, replace(kinds, imu="industrial", fault="none"))
     random = np.random.Generator(np.random.PCG64([seed, 32]))
     begin_s = float(random.uniform(3.0, 0.5 * made.duration_s))

@@ -101,19 +101,22 @@ def draw_kinds(seed: int) -> Kinds:
     light = str(random.choice(("steady", "swinging", "jumping"), p=(0.6, 0.25, 0.15)))
     imu = str(random.choice(list(IMU_GRADES)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
+    return with_fault(Kinds(world, motion, rig, lens, light, imu, "none"), fault)
+
+
+def with_fault(kinds: Kinds, fault: str) -> Kinds:
+    """The same with this fault, and with the cameras, world and motion that it needs."""
     if fault in STEREO_FAULTS:
-        rig = "stereo"
+        kinds = replace(kinds, rig="stereo")
     if fault in ROOM_FAULTS:
-        world, motion = "room", "handheld"
-    return Kinds(world, motion, rig, lens, light, imu, fault)
+        kinds = replace(kinds, world="room", motion="handheld")
+    return replace(kinds, fault=fault)
 
 
 def draw(seed: int, fault: str | None = None) -> Draw:
     """Everything about a seed, with a fault of another name where one is given."""
     kinds = draw_kinds(seed)
-    if fault is not None:
-        kinds = replace(kinds, fault=fault, rig="stereo" if fault in STEREO_FAULTS else kinds.rig)
-    return draw_of(seed, kinds)
+    return draw_of(seed, kinds if fault is None else with_fault(kinds, fault))
 
 
 def draw_of(seed: int, kinds: Kinds) -> Draw:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
 from boxplus.systems.direct_odometry.calibration_causes import by_focal_length, by_principal_point, by_readout, by_turn_of_second
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 from boxplus.systems.direct_odometry.leftover import Combined, Leftover
@@ -54,33 +55,44 @@ class CalibrationWatch:
     Args:
         depths: where those of the keyframes come from.
         stereo: the second camera, where they come from it.
+
+    Raises:
+        InputError: depths of a stereo pair without its second camera, or other depths with one.
     """
 
     def __init__(self, depths: Depths = "sensed", stereo: StereoPair | None = None) -> None:
+        if (depths == "stereo") != (stereo is not None):
+            got = f"depths {depths!r} {'without one' if stereo is None else 'with one'}"
+            raise InputError("a second camera if, and only if, depths are 'stereo'", got, "give both or none")
         self._depths, self._stereo, self._causes = depths, stereo, _CAUSES[depths]
         self._found = Combined(len(self._causes), [_OWN_ERROR[cause] for cause in self._causes])
 
-    def add(self, leftover: Leftover, camera: Pinhole, height: int, velocities: tuple[Matrix, Matrix]) -> None:
+    def add(self, leftover: Leftover, camera: Pinhole, height: int, velocities: tuple[Matrix, Matrix] | None) -> None:
         """A frame that was aligned to a keyframe.
 
         Args:
             height: of the image [pixels].
-            velocities: (6,) [w, u] of the camera at the keyframe and at the frame, in itself [rad/s, m/s].
+            velocities: (6,) [w, u] of the camera at the keyframe and at the frame, in itself [rad/s, m/s]; None where they are
+                not known: then nothing is asked of the shutter.
         """
         share = leftover.share_without(_ERROR_BY_MOTION) if self._depths == "motion" else None
-        moved = [self._moved(cause, leftover, camera, height, velocities) for cause in self._causes]
-        sizes = [_LEAST[cause] * np.sqrt(np.mean(by**2)) for cause, by in zip(self._causes, moved, strict=True)]
-        which = [k for k, size in enumerate(sizes) if size > _SHOWN_PX]
-        found = leftover.explained_by([moved[k] for k in which], share) if which else None
+        asked: dict[int, Matrix] = {}
+        for k, cause in enumerate(self._causes):
+            moved = self._moved(cause, leftover, camera, height, velocities)
+            if moved is not None and _LEAST[cause] * np.sqrt(np.mean(moved**2)) > _SHOWN_PX:
+                asked[k] = moved
+        found = leftover.explained_by(list(asked.values()), share) if asked else None
         if found is not None:
-            self._found.add(*found, which)
+            self._found.add(*found, list(asked))
 
-    def _moved(self, cause: Cause, leftover: Leftover, camera: Pinhole, height: int, velocities: tuple[Matrix, Matrix]) -> Matrix:
-        """(n, 2) ∂p₂ by a cause."""
+    def _moved(
+        self, cause: Cause, leftover: Leftover, camera: Pinhole, height: int, velocities: tuple[Matrix, Matrix] | None
+    ) -> Matrix | None:
+        """(n, 2) ∂p₂ by a cause; None where it is not known."""
         if cause == "readout":
-            return by_readout(leftover, height, velocities)
-        if cause == "turn of the second camera" and self._stereo is not None:
-            return by_turn_of_second(leftover, self._stereo)
+            return None if velocities is None else by_readout(leftover, height, velocities)
+        if cause == "turn of the second camera":
+            return None if self._stereo is None else by_turn_of_second(leftover, self._stereo)
         if cause in ("along u", "along v"):
             return by_principal_point(leftover, camera, 0 if cause == "along u" else 1)
         return by_focal_length(leftover, camera, self._stereo)

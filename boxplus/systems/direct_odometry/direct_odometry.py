@@ -37,7 +37,7 @@ from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import SensorWatch, velocity_between
+from boxplus.systems.direct_odometry.sensor_watch import Motion, SensorWatch
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -55,6 +55,7 @@ _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find aga
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
 _SEEN_PX = 0.5  # a motion of the image that shows
 _AGAIN = Verdict("lost", ("the image is the one before, to the bit, while the camera moves: the last pose stays",), np.nan)
+_UNSEEN = Verdict("lost", ("fewer than 100 pixels have a depth and a gradient above noise: there is nothing to track",), np.nan)
 _LOST_SPEED, _LOST_TURN = 1.0, 1.0  # [m/s], [rad/s] standard deviations of a motion that is not seen
 
 
@@ -206,8 +207,8 @@ class DirectOdometry:
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
-            velocity = velocity_between(self._T, T, self._unseen_s(time_ns))
-            self._sensor.frame(keyframe, image, depth, alignment, velocity)
+            motion = Motion.between(self._T, T, self._unseen_s(time_ns))
+            self._sensor.frame(keyframe, image, depth, alignment, motion)
             self._watch.contradiction = self._sensor.contradiction
             added = self._keyframe(time_ns, image, depth, T, log_gain)
             is_keyframe = added is not None
@@ -216,7 +217,7 @@ class DirectOdometry:
                 self.window.add(added, covariance)
                 if self.config.adjustments:
                     self.window.adjust(self.config.adjustments)
-                self._sensor.keyframe(self.window.keyframes, depth, velocity)
+                self._sensor.keyframe(self.window.keyframes, depth, motion)
                 T, covariance = added.T_world_camera, self.window.covariance(added)
                 self._reference = added
                 watch.lap("adjustment")
@@ -266,20 +267,17 @@ class DirectOdometry:
             self._T, self._covariance = second.T_world_camera, self.window.covariance(second)
             self._reference, self._log_gain, self._offset = second, second.log_gain, 0.0
         watch.lap("start")
-        reasons = (*self._watch.past_reasons, *verdict.reasons)
+        reasons = (*self._watch.reasons, *verdict.reasons)
         verdict = Verdict("weak" if reasons else "ok", reasons, np.nan)
         return self._estimate(time_ns, first.number, second is not None, alignment, verdict, watch)
 
     def _begin(self, time_ns: int, image: Image, depth_of: DepthOf, watch: Stopwatch) -> Estimate:
         """The first frame, or the first after the view was lost for good."""
-        keyframe = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0)
-        if keyframe is None:
-            verdict = Verdict(
-                "lost", ("fewer than 100 pixels have a depth and a gradient above noise: there is nothing to track",), np.nan
-            )
-        else:
+        keyframe, verdict = self._keyframe(time_ns, image, depth_of(self._T, 0.0), self._T, 0.0), _UNSEEN
+        self._watch.contradiction = self._sensor.contradiction
+        if keyframe is not None:
             self._resume(time_ns)
-            verdict = Verdict("weak" if self._watch.past_reasons else "ok", tuple(self._watch.past_reasons), np.nan)
+            verdict = Verdict("weak" if self._watch.reasons else "ok", self._watch.reasons, np.nan)
             self.window.begin(keyframe, self._covariance)
             self._reference, self._seen_ns = keyframe, time_ns
             self._velocity_s = self._log_gain = self._offset = 0.0

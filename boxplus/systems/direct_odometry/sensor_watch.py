@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,28 @@ from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
 _RECENT_S = 0.25  # within which a motion is that of an instant
+
+
+class Motion(NamedTuple):
+    """How a camera moved since its last pose.
+
+    Attributes:
+        velocity: (6,) [w, v] of it in itself [rad/s, m/s], in the mean.
+        elapsed_s: since then [s].
+    """
+
+    velocity: Matrix
+    elapsed_s: float
+
+    @classmethod
+    def between(cls, T_before: Matrix, T_now: Matrix, elapsed_s: float) -> Motion:
+        """From two poses (7,) T_world_camera, one later than the other by `elapsed_s` > 0."""
+        return cls(se3.log(se3.compose(se3.inverse(T_before), T_now)) / elapsed_s, elapsed_s)
+
+    @property
+    def at_once(self) -> Matrix | None:
+        """The velocity (6,) while an image is read out; None where the last pose is too long ago to tell it."""
+        return self.velocity if self.elapsed_s < _RECENT_S else None
 
 
 class SensorWatch:
@@ -45,41 +68,34 @@ class SensorWatch:
         if self._pair is not None:
             self._pair.add(left, right, depth, camera)
 
-    def frame(
-        self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment, velocity: Matrix | None
-    ) -> None:
-        """A frame that shall become a keyframe, as it was aligned to another one.
-
-        Args:
-            velocity: (6,) [w, v] of the camera, in itself [rad/s, m/s]; None where it is not known.
-        """
+    def frame(self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment, motion: Motion) -> None:
+        """A frame that shall become a keyframe, as it was aligned to another one."""
         if self._is_sensed:
             self._registration.add(image, _measured(depth))
         leftover = Leftover.of(keyframe, image.grey, alignment)
         if leftover is None:
             return
-        before, camera = self._velocities.get(keyframe.number), keyframe.tracker.camera
-        if before is not None and velocity is not None:
-            self._calibration.add(leftover, camera, image.shape[0], (before, velocity))
+        before, now = self._velocities.get(keyframe.number), motion.at_once
+        velocities = None if before is None or now is None else (before, now)
+        self._calibration.add(leftover, keyframe.tracker.camera, image.shape[0], velocities)
         surfaces = self._surfaces.get(keyframe.number)
         if surfaces is not None:
             self._depths.add(leftover, surfaces, keyframe.tracker)
 
-    def keyframe(self, keyframes: Sequence[WindowKeyframe], depth: SensedDepth, velocity: Matrix | None) -> None:
+    def keyframe(self, keyframes: Sequence[WindowKeyframe], depth: SensedDepth, motion: Motion) -> None:
         """The keyframe it became.
 
         Args:
             keyframes: that frames may be aligned to, this one the last.
-            velocity: as in `frame`.
+            motion: as in `frame`.
         """
         added, kept = keyframes[-1], {each.number for each in keyframes}
         self._surfaces = {number: known for number, known in self._surfaces.items() if number in kept}
         self._velocities = {number: known for number, known in self._velocities.items() if number in kept}
-        if velocity is None:
-            return
-        self._velocities[added.number] = velocity
+        if motion.at_once is not None:
+            self._velocities[added.number] = motion.at_once
         if self._is_sensed and added.tracker.levels[-1].octave == 0 and added.tracker.camera.distortion is None:
-            self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), velocity)
+            self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), motion.velocity)
 
     @property
     def remark(self) -> str:
@@ -91,12 +107,6 @@ class SensorWatch:
         """What contradicts the calibration, in a sentence; empty where nothing does."""
         pair = "" if self._pair is None else self._pair.contradiction
         return pair or self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
-
-
-def velocity_between(T_before: Matrix, T_now: Matrix, elapsed_s: float) -> Matrix | None:
-    """(6,) [w, v] of a camera in itself, from two poses (7,) T_world_camera; None where they are too far apart in time."""
-    moved = se3.compose(se3.inverse(T_before), T_now)
-    return se3.log(moved) / elapsed_s if 0.0 < elapsed_s < _RECENT_S else None
 
 
 def _measured(depth: SensedDepth) -> NDArray[np.float32]:

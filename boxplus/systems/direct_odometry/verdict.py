@@ -49,6 +49,11 @@ class Watch:
         self.past_reasons: list[str] = []
         self.contradiction = ""
 
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What stands against every pose from here on."""
+        return (*self.past_reasons, *([self.contradiction] if self.contradiction else []))
+
     def judge(self, alignment: Alignment, median_depth: float) -> Verdict:
         """Status and reasons of a frame with this alignment, to a keyframe of this depth [m]."""
         ratio = np.nan
@@ -56,7 +61,7 @@ class Watch:
             ratio = alignment.sigma / float(np.median(self._sigmas))
         if alignment.status in ("little overlap", "large residual") or not np.isfinite(alignment.covariance).all():
             return Verdict("lost", (alignment.reason,), ratio)
-        reasons = [*self.past_reasons, *([self.contradiction] if self.contradiction else [])]
+        reasons = [*self.reasons]
         if alignment.status == "iteration limit":
             reasons.append(alignment.reason)
         reasons += self._doubts_of_covariance(alignment, median_depth)

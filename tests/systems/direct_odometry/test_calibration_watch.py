@@ -9,6 +9,7 @@ import pytest
 
 from boxplus.cameras.distortion import RadialTangential
 from boxplus.cameras.pinhole import Pinhole
+from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import track
@@ -21,7 +22,6 @@ from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Matrix, Room
 
 LENS = replace(CAMERA, distortion=RadialTangential(-0.28, 0.07, 1e-4, 2e-5))
 LEFT_RIGHT = np.array([1.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0])  # T_right_left
-STILL = np.zeros(6)
 FRAMES = 8
 
 
@@ -39,10 +39,17 @@ def rolled(room: Room, T: Matrix, velocity: Matrix, readout_s: float) -> Matrix:
 
 
 def watched(
-    stated: Pinhole, seed: int, *, true: Pinhole = CAMERA, depths: Depths = "sensed", turn: float = 0.0, readout_s: float = 0.0
+    stated: Pinhole,
+    seed: int,
+    *,
+    true: Pinhole = CAMERA,
+    depths: Depths = "sensed",
+    turn: float = 0.0,
+    readout_s: float = 0.0,
+    knows_velocities: bool = True,
 ) -> CalibrationWatch:
     """Eight frames turned by up to ten degrees, each tracked against a first one with this camera, drawn with the true one."""
-    rng, room = np.random.default_rng(seed), Room(seed)
+    rng, of_motion, room = np.random.default_rng(seed), np.random.default_rng([seed, 1]), Room(seed)
     T_stated = se3.compose(se3.exp([0.0, turn, 0.0, 0.0, 0.0, 0.0]), LEFT_RIGHT)
     stereo = StereoPair(stated, T_stated) if depths == "stereo" else None
     watch, odometry, start = CalibrationWatch(depths, stereo), DirectOdometry(stated), se3.SE3.identity()
@@ -52,7 +59,7 @@ def watched(
 
     for _ in range(FRAMES):
         w, v = rng.normal(size=(2, 3))
-        velocities = tuple(rng.normal(size=6) * ([0.6] * 3 + [0.3] * 3) if readout_s else STILL for _ in range(2))
+        velocities = tuple(of_motion.normal(size=6) * ([0.6] * 3 + [0.3] * 3) for _ in range(2))
         T = se3.exp(np.concatenate([np.radians(7.0) * w / np.linalg.norm(w), 0.1 * v / np.linalg.norm(v)]))
         (one, z), (two, _) = room.render(start, true), room.render(T, true)
         if readout_s:
@@ -68,7 +75,7 @@ def watched(
         assert keyframe is not None
         alignment = track(keyframe.tracker, second, T_21=se3.inverse(T))
         assert alignment.status == "converged"
-        watch.add(Leftover(keyframe, second.grey, alignment), stated, SHAPE[0], velocities)
+        watch.add(Leftover(keyframe, second.grey, alignment), stated, SHAPE[0], velocities if knows_velocities else None)
     return watch
 
 
@@ -94,11 +101,29 @@ def test_wrong_focal_lengths_are_whatever_tells_the_depths(seed: int, camera: Pi
     assert "contradict the focal length: they ask for -" in said
 
 
-def test_a_second_camera_that_turned_in_the_plane_of_the_baseline_is_named() -> None:
-    watch = CalibrationWatch("stereo")
-    for _ in range(10):
-        watch._found.add(np.array([0.0, 0.01, 0.0]), np.diag([0.01, 0.002, 0.002]) ** 2)
-    assert "turned by 0.57 degrees in the plane of the baseline" in watch.contradiction
+@pytest.mark.parametrize("seed", range(2))
+def test_intrinsics_are_asked_for_where_velocities_are_not_known(seed: int) -> None:
+    assert watched(CAMERA, seed, knows_velocities=False).contradiction == ""
+    watch = watched(longer(CAMERA, 1.12), seed, knows_velocities=False)
+    assert "contradict the focal length: they ask for -" in watch.contradiction and watch.remark == ""
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_second_camera_that_turned_in_the_plane_of_the_baseline_is_named(seed: int) -> None:
+    """The sense is right; how far it turned is told too small, as the pose's lengths follow the depths in part."""
+    turn = np.radians(-1.2)
+    watch = watched(CAMERA, seed, depths="stereo", turn=turn)
+    assert "they ask for a second camera that is turned by" in watch.contradiction
+    assert "in the plane of the baseline" in watch.contradiction and watch.remark == ""
+    q, _ = watch._found.estimate()
+    assert turn < q[1] < 0.5 * turn
+
+
+def test_a_second_camera_without_its_depths_is_refused() -> None:
+    with pytest.raises(InputError, match=r"second camera .* got depths 'stereo' without one"):
+        CalibrationWatch("stereo")
+    with pytest.raises(InputError, match="got depths 'motion' with one"):
+        CalibrationWatch("motion", StereoPair(CAMERA, LEFT_RIGHT))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -110,7 +135,8 @@ def test_a_rolling_shutter_is_a_remark(seed: int) -> None:
 
 
 def test_one_frame_contradicts_nothing() -> None:
-    assert CalibrationWatch().contradiction == "" and CalibrationWatch("stereo").remark == ""
+    stereo = CalibrationWatch("stereo", StereoPair(CAMERA, LEFT_RIGHT))
+    assert CalibrationWatch().contradiction == "" and stereo.remark == ""
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])

@@ -8,7 +8,10 @@ are smooth: a pixel i takes
 
 in the cells around it, itself included: on a surface that is seen aslant, inverse depths change by some hundredth a pixel of
 distance d. One that too few of its neighbours agree with was found where the texture repeats, and is dropped. The variance
-is that of the mean, times how much the neighbours scatter beyond their own, times a factor, as patches overlap and err together.
+is that of the mean, times how much the neighbours scatter beyond their own variances (it never shrinks by scattering less), times
+their number up to 3, as patches overlap and err together:
+
+    σ̂² = max(Σ_j (ρ_j − ρ̂)²/s_j² / (n − 1), 1) min(n, 3) / Σ_j 1/s_j²,   n the number of these j
 
 Source: Engel, Sturm and Cremers, Semi-Dense Visual Odometry for a Monocular Camera, ICCV 2013, 2.4.
 """

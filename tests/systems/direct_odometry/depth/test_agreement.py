@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from boxplus.systems.direct_odometry.depth.agreement import agreed
 
@@ -14,6 +15,34 @@ def cells(seed: int) -> np.ndarray:
     v, u = np.mgrid[: SHAPE[0] // CELL, : SHAPE[1] // CELL]
     corners = CELL * np.stack([u.ravel(), v.ravel()], axis=1)
     return corners + np.random.default_rng(seed).integers(0, CELL, size=corners.shape)
+
+
+def reference(pixels: np.ndarray, rho: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The formulas of the module, pixel by pixel."""
+    mean, deviation, cell = np.zeros(len(rho)), np.full(len(rho), np.inf), pixels // CELL
+    for i in range(len(rho)):
+        around = np.flatnonzero(np.abs(cell - cell[i]).max(axis=1) <= 2)
+        s2 = sigma[around] ** 2 + (0.01 * rho[i]) ** 2 * ((pixels[around] - pixels[i]) ** 2).sum(axis=1)
+        alike = (rho[around] - rho[i]) ** 2 < 4.0 * (sigma[i] ** 2 + s2)
+        j, w, n = around[alike], 1.0 / s2[alike], np.count_nonzero(alike)
+        if n - 1 >= max(3.0, 0.4 * (len(around) - 1)):
+            mean[i] = (w * rho[j]).sum() / w.sum()
+            scatter = (w * (rho[j] - mean[i]) ** 2).sum() / (n - 1)
+            deviation[i] = np.sqrt(max(scatter, 1.0) * min(n, 3) / w.sum())
+    return mean, deviation
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_kernel_is_its_formulas(seed: int) -> None:
+    """With cells that are empty, depths that stand alone, and neighbours that scatter more and less than they say."""
+    rng = np.random.default_rng([seed, 7])
+    pixels = cells(seed)[rng.uniform(size=(SHAPE[0] // CELL) * (SHAPE[1] // CELL)) < 0.7]
+    rho = 0.2 + 0.001 * pixels[:, 0] + rng.normal(0.0, 0.02, len(pixels)) + 0.3 * (rng.uniform(size=len(pixels)) < 0.1)
+    sigma = np.where(pixels[:, 1] < SHAPE[0] // 2, 0.013, 0.04) * rng.uniform(0.8, 1.2, len(pixels))
+    expected, found = reference(pixels, rho, sigma), agreed(pixels, rho, sigma, SHAPE, CELL)
+    assert 0.5 < np.isfinite(expected[1]).mean() < 1.0
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-12)
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-12)
 
 
 def test_noise_falls_and_is_said() -> None:
