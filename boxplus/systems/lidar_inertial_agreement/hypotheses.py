@@ -123,7 +123,7 @@ def _lags(agreement: Agreement) -> bool:
 def judges(cause: Cause, agreement: Agreement) -> bool:
     """Whether a comparison could have shown this mistake, so that saying nothing of it clears it."""
     rotation = agreement.rotation
-    if rotation is None or cause == "astray":  # nothing clears it
+    if rotation is None:
         return False
     if cause in ("time_offset", "clock_drift"):
         return _path_counts(agreement) and judges_clocks(rotation)
