@@ -40,8 +40,7 @@ class Leftover:
 
     Attributes:
         pixels: (n, 2) p₁; m: (n, 3) their rays of z = 1; inverse_depth: (n,) [1/m].
-        Y: (n, 3) by inverse depth where they are in the frame's camera; seen_at: (n, 2) p₂; by_parameters: (n, 2, k) ∂p₂ by the
-            parameters of the camera.
+        Y: (n, 3) by inverse depth where they are in the frame's camera; seen_at: (n, 2) p₂.
     """
 
     @classmethod
@@ -55,8 +54,8 @@ class Leftover:
         self._R, self._t = quaternion.to_matrix(alignment.T_21[:4]), alignment.T_21[4:]
         self.m = np.column_stack([level.rays, np.ones(len(level.rays))])
         self.Y = self.m @ self._R.T + level.inverse_depth[:, None] * self._t
-        projected, by_point, by_parameters, is_ahead = camera.project_with_jacobians(self.Y)
-        self.seen_at, self.by_parameters = np.where(is_ahead[:, None], projected, -1.0), np.nan_to_num(by_parameters)
+        projected, by_point, _, is_ahead = camera.project_with_jacobians(self.Y)
+        self.seen_at = np.where(is_ahead[:, None], projected, -1.0)
         self._P, self._sigma = np.nan_to_num(by_point), alignment.sigma
         value, _, seen = sample(image, self.seen_at)
         gain, offset = np.exp(alignment.brightness[0]), alignment.brightness[1]
