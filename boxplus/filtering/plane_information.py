@@ -53,38 +53,41 @@ def pose_row(
 
 
 @kernel(inline=True)
-def _add_criterion(
+def _take_noise_off(
     x: NDArray[np.float64],
+    lidar: tuple[float, float, float],
     imu: tuple[float, float, float],
     plane: NDArray[np.float64],
+    beside: tuple[float, float],
     weight: float,
-    h: NDArray[np.float64],
+    with_extrinsic: bool,
+    with_criterion: bool,
     row: NDArray[np.float64],
-    signal: NDArray[np.float64],
+    b: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> None:
-    """signal += w h hᵀ, noise += w M Cov(u) Mᵀ of one plane, M u = [s × Rᵀu, u] (`filtering.degeneracy`).
+    """b −= w M Cov(u) (y − q) of one plane, noise += w M Cov(u) Mᵀ, with h = M u (`pose_row`).
 
     Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
     really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
+
+    Args:
+        beside: gᵢᵀ (y − q), where the point lies beside the middle of the plane's own points.
     """
-    sx, sy, sz = imu
-    for first in (5, 9):
+    size = MEASURED_DOF if with_extrinsic else 6
+    for k in range(2):
+        first = 5 + 4 * k
         gx, gy, gz = plane[first], plane[first + 1], plane[first + 2]
         factor = weight * plane[13] / (1.0 + plane[13] * (gx * gx + gy * gy + gz * gz))
-        cx = x[R] * gx + x[R + 3] * gy + x[R + 6] * gz
-        cy = x[R + 1] * gx + x[R + 4] * gy + x[R + 7] * gz
-        cz = x[R + 2] * gx + x[R + 5] * gy + x[R + 8] * gz
-        row[0], row[1], row[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
-        row[3], row[4], row[5] = gx, gy, gz
-        for i in range(6):
-            wh = factor * row[i]
-            for j in range(i, 6):
-                noise[i, j] += wh * row[j]
-    for i in range(6):
-        wh = weight * h[i]
-        for j in range(i, 6):
-            signal[i, j] += wh * h[j]
+        pose_row(x, lidar, imu, (gx, gy, gz), with_extrinsic, row)
+        pulled = factor * beside[k]
+        for i in range(size):
+            b[i] -= pulled * row[i]
+        if with_criterion:
+            for i in range(6):
+                wh = factor * row[i]
+                for j in range(i, 6):
+                    noise[i, j] += wh * row[j]
 
 
 @kernel
@@ -105,20 +108,23 @@ def accumulate_planes(
 ) -> None:
     """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L], and to what tells weak directions of the pose.
 
+    A normal that is off by ε sees a point that lies beside the middle of its plane off it by ε (y − q), and the row has the same
+    ε: their product does not even out. What of it is to be expected is taken off b (a corrected score: Nakamura, Biometrika 1990).
+
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
         planes: (n, PLANE) records of `maps.plane_matching`, columns named there; the weights are written to the last one.
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
-        A, b: (12, 12), (12,), added to.
+        A, b: (12, 12), (12,), added to; b without the pull of noisy normals.
         with_criterion: whether `signal` and `noise` are wanted.
         signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
             alone would give.
         sums: (2,) += [used points, Σ z²].
     """
     h = np.empty(MEASURED_DOF)
-    row = np.empty(6)
+    row = np.empty(MEASURED_DOF)
     size = MEASURED_DOF if with_extrinsic else 6
     for n in range(p_lidar.shape[0]):
         if fate[n] != USED and fate[n] != GATED:
@@ -153,8 +159,12 @@ def accumulate_planes(
             b[i] += wh * z
             for j in range(i, size):
                 A[i, j] += wh * h[j]
+        _take_noise_off(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, with_criterion, row, b, noise)
         if with_criterion:
-            _add_criterion(x, (sx, sy, sz), plane, weight, h, row, signal, noise)
+            for i in range(6):
+                wh = weight * h[i]
+                for j in range(i, 6):
+                    signal[i, j] += wh * h[j]
         sums[0] += 1.0
         sums[1] += z * z
     _mirror(A)

@@ -188,3 +188,28 @@ def test_the_noise_of_the_normals_is_what_tilted_normals_add(seed: int) -> None:
         expected += weight * np.outer(row, row) / len(signs)
     found = N
     assert np.allclose(found, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_noisy_normals_do_not_pull_a_point_beside_their_plane_towards_its_middle(seed: int) -> None:
+    """b where the sensor is right, over many normals that noise has tilted: nothing, where w h z alone is not."""
+    random = np.random.default_rng(seed)
+    x, point = random_state(random), (8.0 * random.normal(size=(1, 3))).astype(np.float32)
+    frame = np.linalg.svd(random.normal(size=(1, 3)))[2]
+    count, sigma = 40_000, 0.01
+    g = frame[1:] * random.uniform(2.0, 4.0, (2, 1))
+    middle = _world(x, point)[0] - np.array([0.1, -0.07]) @ frame[1:]
+    planes = np.zeros((count, PLANE))
+    tilts = sigma * random.normal(size=(count // 2, 2)) @ g
+    tilted = frame[0] + np.concatenate([tilts, -tilts])  # what is odd in them evens out
+    planes[:, :3] = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+    planes[:, 3] = planes[:, :3] @ middle
+    planes[:, 5:8], planes[:, 8], planes[:, 9:12], planes[:, 12] = g[0], g[0] @ middle, g[1], g[1] @ middle
+    points, fate = np.repeat(point, count, axis=0), np.zeros(count, np.uint8)
+    with_noise = _accumulate(x, points, planes, fate)[1]
+    planes[:, 13] = sigma**2
+    left = _accumulate(x, points, planes, fate)[1]
+    assert np.linalg.norm(with_noise[3:6]) > 0
+    assert np.linalg.norm(left[:6]) < 0.05 * np.linalg.norm(with_noise[:6])
+    assert np.linalg.norm(left[6:]) < 0.05 * np.linalg.norm(with_noise[6:])

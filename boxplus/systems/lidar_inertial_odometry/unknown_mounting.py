@@ -153,7 +153,6 @@ def moved_sensitivity(
         information.directions,
         cov_prior=np.ascontiguousarray(cov_prior[_POSE, _POSE]),
         used=information.used,
-        since_match=np.zeros(6),
     )
     if left is None:
         return B
