@@ -147,9 +147,9 @@ class MapDatum:
         if correction is not None:
             self._new_share = 0.0
 
-    def insert(self, points: int) -> None:
-        """The map has taken in so many points of the scan."""
-        self._local_points += points
+    def insert(self, points: int, replaced: int = 0) -> None:
+        """The map has taken in so many points of the scan, so many of them in the place of others."""
+        self._local_points += points - replaced
         self._new_share = points / self._local_points if points else 0.0
         step = np.eye(12)
         step[_MAP, _MAP] *= 1.0 - self._new_share

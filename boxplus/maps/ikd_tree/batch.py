@@ -169,7 +169,7 @@ def update_batch(
     """Apply the operations `begin` to `end` below a slot, in order: to the tree, or to a new subtree from the log.
 
     Returns the number of the next operation: less than `end` if room ran out or the tree became too deep. `changed` of the
-    job is increased by the number of points deleted, revived and (of those given) stored.
+    job is increased by the number of points deleted, revived and (of those given) stored; of the latter the kind becomes INSERT.
     """
     job = work.job[0]
     cell, box = work.scratch[:6], work.scratch[6:12]
@@ -201,6 +201,7 @@ def update_batch(
             log_operation(work, DROP, box)
         if kind != DROP:
             inside = insert_point(pool, work, node, side, x, y, z)
+            operations[row]["kind"] = np.uint32(INSERT)  # what is stored can be told from what its cell did not take
             job["live"] += 1
             job["changed"] += 1
             if inside:

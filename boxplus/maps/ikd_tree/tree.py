@@ -40,6 +40,7 @@ class InsertReport(NamedTuple):
     superseded: int  #: points not stored because their cell has one
     not_finite: int  #: rejected: a coordinate is NaN or infinite
     too_far: int  #: rejected: farther than 100 km from the origin on an axis
+    stored: NDArray[np.bool_]  #: (N,) which of the points given were stored
 
 
 class Neighbors(NamedTuple):
@@ -134,7 +135,7 @@ class IkdTree:
         self._pool = build_pool(np.pad(relative, ((0, 0), (0, 1))))
         self._job["live"], self._job["queued"], self._job["depth"] = len(relative), 0, 0
         self._revivable = 0
-        return InsertReport(len(relative), 0, not_finite, too_far)
+        return InsertReport(len(relative), 0, not_finite, too_far, self._near(world))
 
     @changes
     def insert(self, points: ArrayLike, *, downsample: bool = False) -> InsertReport:
@@ -148,11 +149,14 @@ class IkdTree:
         """
         if downsample and self.cell_size is None:
             raise InputError("a cell_size for a downsampled insert", "none", "give IkdTree a cell_size, or insert all points")
-        relative, not_finite, too_far = self._to_relative(as_points(points, "points"))
+        world = as_points(points, "points")
+        relative, not_finite, too_far = self._to_relative(world)
         operations = np.empty(len(relative), OPERATION)
         fill_operations(relative, INSERT_DOWNSAMPLED if downsample else INSERT, operations)
         inserted = self._update(operations)
-        return InsertReport(inserted, len(relative) - inserted, not_finite, too_far)
+        stored = np.ones(len(world), bool) if len(relative) == len(world) else self._near(world)
+        stored[stored] = operations["kind"] == INSERT
+        return InsertReport(inserted, len(relative) - inserted, not_finite, too_far, stored)
 
     @changes
     def delete_points(self, points: ArrayLike) -> int:
@@ -381,6 +385,11 @@ class IkdTree:
         relative = np.empty(world.shape, np.float32)
         kept, not_finite = keep_near(np.ascontiguousarray(world), self.origin, MAX_EXTENT, relative)
         return relative[:kept], not_finite, len(world) - kept - not_finite
+
+    def _near(self, world: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) which of the points `_to_relative` keeps."""
+        near: NDArray[np.bool_] = (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1)
+        return near
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""

@@ -14,6 +14,7 @@ from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import SHARED_ERRORS, Correction, MapDatum
 from boxplus.filtering.nav_state import RL, TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
+from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.sliding_box import SlidingBox
@@ -74,6 +75,7 @@ class LidarInertialOdometry(Snapshots):
     def __init__(self, config: LioConfig | None = None, *, live: bool = False) -> None:
         self.config, self._live = as_settings(LioConfig, config), live
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
+        self._arrivals = FirstArrivals(self.config.map_cell)
         self.start: Start | None = None
         self.start_problem: str | None = None
         self._sequencer = Sequencer()
@@ -181,6 +183,7 @@ class LidarInertialOdometry(Snapshots):
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self.start, self._standstill = None, None
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
+        self._arrivals = FirstArrivals(self.config.map_cell)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         return after_gap(frame)
@@ -353,7 +356,7 @@ class LidarInertialOdometry(Snapshots):
         return self._consistency.lost or (self._is_blind(frame) and on_map < self.config.min_matched_share)
 
     def _insert(self, p_world: NDArray[np.float64]) -> None:
-        self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
+        self._datum.insert(*self._arrivals.insert_into(self.map, p_world, self._time_ns))
         self._datum.creep(self._cov, self._x)
         if self._mounting_drift is not None:
             self._mounting_drift.insert(self._datum.new_share)
