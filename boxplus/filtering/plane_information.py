@@ -108,8 +108,8 @@ def accumulate_planes(
 ) -> None:
     """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L], and to what tells weak directions of the pose.
 
-    A normal that is off by ε sees a point that lies beside the middle of its plane off it by ε (y − q), and the row has the same
-    ε: their product does not even out. What of it is to be expected is taken off b (a corrected score: Nakamura, Biometrika 1990).
+    A normal that is off by ε sees a point that lies beside the middle of its plane off it by εᵀ (y − q), and the row has the
+    same ε: their product does not even out. What is to be expected of it is taken off b (corrected score: Nakamura, 1990).
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.

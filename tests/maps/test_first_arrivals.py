@@ -30,7 +30,7 @@ def test_the_second_scan_within_a_second_replaces_the_first_and_no_other_does(se
         now_ns += int(random.choice([100_000_000, 700_000_000]))
         side = float(random.choice([CELL, CELL, 0.5 * CELL]))
         tree.cell_size = side
-        points = random.uniform(-1.0, 1.0, (60, 3)) + [5.0, -3.0, 0.0]
+        points = random.uniform(-1.0, 1.0, (60, 3)) + np.array([5.0, -3.0, 0.0])
         counts = arrivals.insert_into(tree, points, now_ns)
         before = len(kept)
         first = {cell: (t, p) for cell, (t, p) in first.items() if now_ns - t <= SOON_NS}
@@ -65,7 +65,7 @@ def test_a_surface_that_comes_into_view_is_not_where_noise_first_reached_it() ->
         azimuth, away = random.uniform(-0.5, 0.5, 4000), nearest + random.uniform(0.0, 1.0, 4000)
         foot = np.column_stack([away * np.cos(azimuth), away * np.sin(azimuth), np.full(4000, height)])
         seen = foot * (1.0 + 0.03 * random.normal(size=(4000, 1)) / np.linalg.norm(foot, axis=1, keepdims=True))
-        p_world = seen + [0.0, 0.0, 0.06 - height]  # the ceiling lies in the middle of a cell
+        p_world = seen + np.array([0.0, 0.0, 0.06 - height])  # the ceiling lies in the middle of a cell
         plain.insert(p_world, downsample=True)
         arrivals.insert_into(tree, p_world, k * 100_000_000)
 

@@ -388,8 +388,7 @@ class IkdTree:
 
     def _near(self, world: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(N,) which of the points `_to_relative` keeps."""
-        near: NDArray[np.bool_] = (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1)
-        return near
+        return np.asarray((np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1))
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""
