@@ -27,7 +27,8 @@ class Information:
     """What a measurement says about the components [θ, p, θ_L, p_L] at one state.
 
     Attributes:
-        A, b: (12, 12), (12,), Hᵀ R⁻¹ H and Hᵀ R⁻¹ z, the latter without what noise of H alone is expected to make of it.
+        A, b: (12, 12), (12,), Hᵀ R⁻¹ H and Hᵀ R⁻¹ z.
+        pull: (12,) what noise of H alone is expected to make of b.
         directions: which directions of the pose it determines.
         used: how many of its parts (points, pixels) took part.
         residual_rms: root mean square of their residuals [m].
@@ -35,6 +36,7 @@ class Information:
 
     A: NDArray[np.float64]
     b: NDArray[np.float64]
+    pull: NDArray[np.float64]
     directions: PoseDirections
     used: int
     residual_rms: float
@@ -103,7 +105,7 @@ def iterated_update(
         information = measurement.at(x, rematch=rematch)
         left = without_noise(
             information.A,
-            information.b,
+            information.b - information.pull,
             information.directions,
             cov_prior=pose_prior,
             used=information.used,

@@ -53,7 +53,7 @@ def pose_row(
 
 
 @kernel(inline=True)
-def _take_noise_off(
+def _add_noise(
     x: NDArray[np.float64],
     lidar: tuple[float, float, float],
     imu: tuple[float, float, float],
@@ -63,10 +63,10 @@ def _take_noise_off(
     with_extrinsic: bool,
     with_criterion: bool,
     row: NDArray[np.float64],
-    b: NDArray[np.float64],
+    pull: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> None:
-    """b −= w M Cov(u) (y − q) of one plane, noise += w M Cov(u) Mᵀ, with h = M u (`pose_row`).
+    """pull += w M Cov(u) (y − q) of one plane, noise += w M Cov(u) Mᵀ, with h = M u (`pose_row`).
 
     Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
     really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
@@ -82,7 +82,7 @@ def _take_noise_off(
         pose_row(x, lidar, imu, (gx, gy, gz), with_extrinsic, row)
         pulled = factor * beside[k]
         for i in range(size):
-            b[i] -= pulled * row[i]
+            pull[i] += pulled * row[i]
         if with_criterion:
             for i in range(6):
                 wh = factor * row[i]
@@ -102,6 +102,7 @@ def accumulate_planes(
     with_criterion: bool,
     A: NDArray[np.float64],
     b: NDArray[np.float64],
+    pull: NDArray[np.float64],
     signal: NDArray[np.float64],
     noise: NDArray[np.float64],
     sums: NDArray[np.float64],
@@ -109,7 +110,7 @@ def accumulate_planes(
     """Add a scan to A = Hᵀ R⁻¹ H and b = Hᵀ R⁻¹ z over [θ, p, θ_L, p_L], and to what tells weak directions of the pose.
 
     A normal that is off by ε sees a point that lies beside the middle of its plane off it by εᵀ (y − q), and the row has the
-    same ε: their product does not even out. What is to be expected of it is taken off b (corrected score: Nakamura, 1990).
+    same ε: their product does not even out. What is to be expected of it in b is `pull` (corrected score: Nakamura, 1990).
 
     Args:
         x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
@@ -117,7 +118,8 @@ def accumulate_planes(
         fate: (n,), USED where a plane was found; the gate |z| < √‖ℓ‖ / 9 turns USED into GATED and back.
         range_variance, map_variance: of a point and of a map point, along the normal [m²].
         with_extrinsic: whether the six columns of the extrinsic are measured.
-        A, b: (12, 12), (12,), added to; b without the pull of noisy normals.
+        A, b: (12, 12), (12,), added to.
+        pull: (12,), added to: what noise of the normals is expected to make of b.
         with_criterion: whether `signal` and `noise` are wanted.
         signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
             alone would give.
@@ -159,7 +161,7 @@ def accumulate_planes(
             b[i] += wh * z
             for j in range(i, size):
                 A[i, j] += wh * h[j]
-        _take_noise_off(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, with_criterion, row, b, noise)
+        _add_noise(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, with_criterion, row, pull, noise)
         if with_criterion:
             for i in range(6):
                 wh = weight * h[i]

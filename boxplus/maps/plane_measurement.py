@@ -97,13 +97,13 @@ class PlaneMeasurement:
         total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
         if matches and self._confirm and self._look_closer(x, total):
             total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=True)
-        A, b, signal, noise, sums = total
+        A, b, pull, signal, noise, sums = total
         if matches:  # in between the planes stay, and what they can tell
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
             self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
-        return Information(A * self._weight, b * self._weight, self._directions, used, rms)
+        return Information(A * self._weight, b * self._weight, pull * self._weight, self._directions, used, rms)
 
     def in_parts(
         self, x: NDArray[np.float64], bounds: Sequence[int], *, rematch: bool
@@ -159,12 +159,14 @@ class PlaneMeasurement:
         *,
         criterion: bool,
     ) -> tuple[NDArray[np.float64], ...]:
-        """What `accumulate_planes` adds up over planes: A, b, signal, noise and sums."""
-        A, b = np.zeros((MEASURED_DOF, MEASURED_DOF)), np.zeros(MEASURED_DOF)
+        """What `accumulate_planes` adds up over planes: A, b, pull, signal, noise and sums."""
+        A, (b, pull) = np.zeros((MEASURED_DOF, MEASURED_DOF)), np.zeros((2, MEASURED_DOF))
         signal, noise, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(2)
         point, stored = self._config.range_sigma**2, self._config.map_sigma**2
-        accumulate_planes(x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, signal, noise, sums)
-        return A, b, signal, noise, sums
+        accumulate_planes(
+            x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, pull, signal, noise, sums
+        )
+        return A, b, pull, signal, noise, sums
 
     def _look_closer(self, x: NDArray[np.float64], total: tuple[NDArray[np.float64], ...]) -> bool:
         """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
@@ -176,7 +178,7 @@ class PlaneMeasurement:
         Returns:
             Whether any was refused or bent.
         """
-        config, A, used = self._config, total[0][:6, :6], max(int(total[4][0]), 1)
+        config, A, used = self._config, total[0][:6, :6], max(int(total[5][0]), 1)
         try:
             covariance = np.linalg.inv(A)
         except np.linalg.LinAlgError:  # nothing at all measures some direction

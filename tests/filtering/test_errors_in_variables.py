@@ -186,23 +186,26 @@ def test_an_axis_can_be_called_weak_whatever_its_ratio(seed: int) -> None:
 
 @dataclass
 class HeldPlanes:
-    """Planes of noisy normals, the pull of noise taken off: all of S counts, b is (S − N) times the way to the truth."""
+    """Planes found where the state was then: (S − N) times the way to the truth, and the noise stays with the sensor."""
 
     true: np.ndarray
     noise: np.ndarray
     p_world_imu: np.ndarray
+    found_at: np.ndarray = field(default_factory=lambda: np.zeros(3))
     steps: list[np.ndarray] = field(default_factory=list)
 
     def at(self, x: np.ndarray, *, rematch: bool) -> Information:
         p = x[P : P + 3]
         self.steps.append(p.copy())
-        del rematch
-        A, b, N = np.zeros((12, 12)), np.zeros(12), 1e5 * np.eye(6)
+        if rematch:
+            self.found_at = p.copy()
+        A, b, pull, N = np.zeros((12, 12)), np.zeros(12), np.zeros(12), 1e5 * np.eye(6)
         A[:3, :3] = 1e8 * np.eye(3)
         N[3:, 3:] = self.noise
         A[3:6, 3:6] = self.true + self.noise
-        b[3:6] = self.true @ (p - self.p_world_imu)
-        return Information(A, b, pose_directions(A[:6, :6], N, 1.0, 1.3), MANY, 0.0)
+        b[3:6] = self.true @ (self.found_at - self.p_world_imu) + A[3:6, 3:6] @ (p - self.found_at)
+        pull[3:6] = self.noise @ (p - self.found_at)
+        return Information(A, b, pull, pose_directions(A[:6, :6], N, 1.0, 1.3), MANY, 0.0)
 
     def has_moved(self, x: np.ndarray) -> bool:
         del x

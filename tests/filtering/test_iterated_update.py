@@ -44,7 +44,7 @@ class LinearMeasurement:
         A, b = np.zeros((12, 12)), np.zeros(12)
         A[np.ix_(POSITIONS, POSITIONS)] = self.H.T @ (self.H / self.r[:, None])
         b[POSITIONS] = self.H.T @ (z / self.r)
-        return Information(A, b, self.directions, len(self.y), float(np.sqrt(np.mean(z**2))))
+        return Information(A, b, np.zeros(12), self.directions, len(self.y), float(np.sqrt(np.mean(z**2))))
 
     def has_moved(self, x: np.ndarray) -> bool:
         del x

@@ -149,7 +149,7 @@ def moved_sensitivity(
     """
     left = without_noise(
         information.A,
-        information.b,
+        information.b - information.pull,
         information.directions,
         cov_prior=np.ascontiguousarray(cov_prior[_POSE, _POSE]),
         used=information.used,

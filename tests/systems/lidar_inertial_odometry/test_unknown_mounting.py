@@ -144,7 +144,7 @@ class _Linear:
             x[PL : PL + 3] - self._x[PL : PL + 3],
         ])  # fmt: skip
         directions = PoseDirections(np.full(6, np.inf), np.eye(6), 1.0, np.zeros(6, dtype=bool), np.eye(6))
-        return Information(self._H.T @ self._H, self._H.T @ (self._z + self._H @ moved), directions, 100, 0.0)
+        return Information(self._H.T @ self._H, self._H.T @ (self._z + self._H @ moved), np.zeros(12), directions, 100, 0.0)
 
     def has_moved(self, x: np.ndarray) -> bool:
         del x

@@ -93,7 +93,9 @@ def test_the_axis_is_refined_by_what_the_scans_leave_open() -> None:
         A = np.zeros((12, 12))
         A[3:6, 3:6] = normals.T @ normals
         directions = pose_directions(np.eye(6), np.eye(6), 1.0, 0.0)
-        posterior = Posterior(np.zeros(36), np.eye(24), True, A, Information(A, np.zeros(12), directions, 500, 0.0), 1, True)
+        posterior = Posterior(
+            np.zeros(36), np.eye(24), True, A, Information(A, np.zeros(12), np.zeros(12), directions, 500, 0.0), 1, True
+        )
         marked = unshown.mark(posterior)
         assert marked.last.directions.weak.sum() == 1 and not directions.weak.any()
     assert np.arccos(unshown.axes[0] @ AXIS) < 0.005
