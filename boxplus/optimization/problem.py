@@ -348,14 +348,15 @@ class Problem:
         cost_initial = model.cost.cost
         strategy = strategy_of(options)
         try:
-            status, reason, history = minimize(model, strategy, options, callback, begin)
+            ending, history = minimize(model, strategy, options, callback, begin)
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(model, error)) from error
         faded = faded_shares(self.groups, None if model.is_linearized and callback is None else model.values)
         silenced = faded_notes(self.groups, faded, model.values, options.threads)
         return Solution(
-            status=status,
-            reason=reason,
+            status=ending.status,
+            reason=ending.reason,
+            limit=ending.limit,
             values=tuple(model.values),
             cost_initial=cost_initial,
             cost=model.cost.cost,

@@ -72,7 +72,7 @@ def lens_finding(
         told_by = "correct the second line of the file"
     if not isinstance(adjusted, ColmapModel) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
         return None
-    is_out = solved.reason.startswith("iteration limit")
+    is_out = solved.limit == "steps"
     if not (solved.status == "converged" or is_out):
         return None
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
