@@ -33,5 +33,5 @@ def test_a_value_out_of_range_is_named_by_its_option() -> None:
 
 
 def test_what_is_wrong_with_no_option_alone_is_refused_as_well() -> None:
-    with pytest.raises(InputError, match="for these options together – got .*nothing is left between start and end"):
+    with pytest.raises(InputError, match=r"for these options together – got .*nothing is left between start and end"):
         _command(start_s=2.0, end_s=1.0)
