@@ -42,7 +42,7 @@ class ClockRate:
 
     def __str__(self) -> str:
         loses = "loses" if self.rate > 0.0 else "gains"
-        first, last = self.ends_s
+        first, last = (round(end, 3) + 0.0 for end in self.ends_s)  # no minus before a zero
         return (
             f"the estimate's clock {loses} {1e3 * abs(self.rate):.3g} ± {1e3 * self.deviation:.2g} ms every second: its stamps "
             f"lack {first:+.3f} s at the beginning and {last:+.3f} s at the end"

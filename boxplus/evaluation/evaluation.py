@@ -370,7 +370,7 @@ def _rate_doubt(found: ClockRate, rmse: float, with_offset: float | None, with_r
         return None
     beside = "" if with_offset is None else f", and {with_offset:.4g} m with a constant offset"
     return (
-        f"the clocks do not run at the same rate: {found}; with stamps t + {found.offset_s:.4f} s + {found.rate:.4g} "
+        f"the clocks do not run at the same rate: {found}; with stamps t {found.offset_s:+.4f} s {found.rate:+.4g} "
         f"(t − {found.middle_ns * 1e-9:.3f} s) the ATE is {with_rate:.4g} m instead of {rmse:.4g} m{beside}"
     )
 

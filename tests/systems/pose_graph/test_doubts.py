@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus import InputError, PoseGraphConfig, optimize_pose_graph
+from boxplus.manifolds import se2, se3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph.readings import misreading
 
@@ -107,6 +108,10 @@ def test_a_file_that_means_something_else_than_it_was_read_as_is_told():
         (replace(space, poses=swapped[0], measurements=swapped[1]), "taken for qw qx qy qz"),
         (replace(plane, edges=plane.edges[:, ::-1]), "from their second pose to their first"),
         (replace(space, edges=space.edges[:, ::-1]), "from their second pose to their first"),
+        (replace(plane, poses=se2.inverse(plane.poses)), "taken for those of the world in the body"),
+        (replace(space, poses=se3.inverse(space.poses)), "taken for those of the world in the body"),
+        (replace(plane, poses=plane.poses * [1.0, 1e3, 1e3]), "positions are taken for 1000 times too large"),
+        (replace(space, poses=space.poses * np.repeat([1.0, 0.3048], [4, 3])), "positions are taken for 3.281 times too small"),
     )
     for graph, cause in cases:
         assert cause in optimize_pose_graph(graph).doubt
