@@ -341,8 +341,7 @@ class Problem:
         begin = time.perf_counter()
         options = as_settings(SolverOptions, options, settings)
         model, notes, analysis = self._analyse(options)
-        for stage in model.timing_s:
-            model.timing_s[stage] = 0.0
+        model.timing_s = dict.fromkeys(model.timing_s, 0.0)
         began = self.values_at(start)
         model.start(began)
         cost_initial = model.cost.cost
