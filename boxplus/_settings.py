@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from boxplus._arguments import shown
-from boxplus.errors import BoxplusError, InputError
+from boxplus.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass as _Refusing
@@ -60,28 +60,27 @@ Place = tuple[str | int, ...]
 """The names that lead to a setting, and numbers where one of several is meant."""
 
 
-def refusal(kind: type[BaseModel], error: ValidationError, named: Callable[[Place], str] | None = None) -> BoxplusError:
+def refusal(kind: type[BaseModel], error: ValidationError, named: Callable[[Place], str] | None = None) -> InputError:
     """What is wrong with settings, all of it, and what was meant.
 
     Args:
-        named: what whoever gave them calls a setting, such as the option of a command.
+        named: what whoever gave them calls a setting, such as the option of a command; of no name at all, the whole.
     """
-    found: dict[Place, BoxplusError] = {}
+    found: dict[Place, InputError] = {}
     for one in error.errors():
         place = _place(kind, one["loc"])
         if place not in found:  # of a value that may be one thing or another, there is one for each of them
             found[place] = _refusal_of_one(kind, one, place, named or (lambda place: f"{_dotted(place)} of {kind.__name__}"))
-    inputs = [one for one in found.values() if isinstance(one, InputError)]
-    first = next(iter(found.values()))
-    if len(inputs) < 2:
-        return first
-    expected, got = ("; ".join(parts) for parts in zip(*((one.expected, one.got) for one in inputs), strict=True))
-    return InputError(expected, got, "; ".join(dict.fromkeys(one.advice for one in inputs)))
+    refusals = list(found.values())
+    if len(refusals) == 1:
+        return refusals[0]
+    expected, got = ("; ".join(parts) for parts in zip(*((one.expected, one.got) for one in refusals), strict=True))
+    return InputError(expected, got, "; ".join(dict.fromkeys(one.advice for one in refusals)))
 
 
-def _refusal_of_one(kind: type[BaseModel], one: Any, place: Place, named: Callable[[Place], str]) -> BoxplusError:
+def _refusal_of_one(kind: type[BaseModel], one: Any, place: Place, named: Callable[[Place], str]) -> InputError:
     cause = one.get("ctx", {}).get("error")
-    if isinstance(cause, BoxplusError):
+    if isinstance(cause, InputError):  # of what a check raises pydantic gathers ValueErrors only: no other of boxplus' errors
         return cause
     owner, name = _owner(kind, place), str(place[-1]) if place else "the whole"
     if one["type"] == "extra_forbidden":

@@ -76,6 +76,13 @@ def test_all_that_is_wrong_is_said_at_once():
         load_settings(_Sections, settings=["solver.max_iterations=-1", "solver.time_limit_s=0"])
 
 
+def test_of_errors_of_several_kinds_none_is_lost():
+    with pytest.raises(bp.InputError) as caught:
+        bp.RecordingOptions(other_lidars=["{topic: ["], min_range=-1.0)
+    assert caught.value.expected.startswith("another LiDAR as a topic or as {topic: …") and "min_range" in caught.value.expected
+    assert caught.value.got.startswith("'{topic: ['; -1.0") and "see docs/several_lidars.md" in caught.value.advice
+
+
 class _Sections(Settings):
     solver: bp.SolverOptions = bp.SolverOptions()
 

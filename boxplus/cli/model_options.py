@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ValidationError
 
-from boxplus._settings import refusal
+from boxplus._settings import Place, refusal
 from boxplus.recordings.options import OtherLidar, RecordingOptions
 
 _TEXTS: dict[Any, Any] = {tuple[str, ...] | None: list[str] | None, tuple[OtherLidar, ...] | None: list[str] | None}
@@ -45,7 +45,7 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
             try:
                 options = model.model_validate(given)
             except ValidationError as error:
-                raise refusal(model, error, lambda place: _flag(str(place[0]))) from None
+                raise refusal(model, error, _option) from None
             command(**words, options=options)
 
         added = [
@@ -65,6 +65,10 @@ def takes_options(model: type[BaseModel]) -> Callable[[Callable[..., None]], Cal
         return with_options
 
     return decorate
+
+
+def _option(place: Place) -> str:
+    return _flag(str(place[0])) if place else "these options together"
 
 
 def _flag(name: str) -> str:

@@ -98,6 +98,8 @@ class Association:
                 f"clock offset: {silent}the motions fit best with {found} added to the estimate's stamps, correlation "
                 f"{found.correlation:.3f}{applied}{found.repetition}"
             )
+            if found.rate is not None and found.rate.shows:
+                lines.append(f"clock rate: {found.rate}")
         return lines
 
 
@@ -110,6 +112,7 @@ def associate(
     offset_s: float = 0.0,
     max_gap_s: float = 0.25,
     min_matches: int = 10,
+    tell_offset: bool = True,
 ) -> Association:
     """Find the pose of the ground truth that belongs to each pose of the estimate.
 
@@ -126,6 +129,7 @@ def associate(
         offset_s: added to the stamps of the estimate [s].
         max_gap_s: ground truth that is farther apart than this is not interpolated [s].
         min_matches: fewer matches than this are refused.
+        tell_offset: look for the clock offset that the motions suggest, which takes longest.
 
     Raises:
         InputError: no overlap in time, too few matches, stamps that look like another unit, one trajectory with stamps and
@@ -157,7 +161,7 @@ def associate(
         time_ns = t_est[index_est]
         matched_gt = _interpolated(ground_truth, index_gt, time_ns)
     outside = int(((t_est < t_gt[0]) | (t_est > t_gt[-1])).sum())
-    offset = estimate_time_offset(t_est, estimate, t_gt, ground_truth)
+    offset = estimate_time_offset(t_est, estimate, t_gt, ground_truth) if tell_offset else None
     if len(index_est) < min_matches:
         hint = ""
         if offset is not None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
@@ -23,6 +24,7 @@ Signal = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 _STRETCHES, _LEAST_SAMPLES = 10, 12  # at most, and samples in each
 LEAST_STRETCHES = 3
+_LEAST_OF_RATE = 5  # stretches, as it takes two numbers
 _MOST_SAMPLES = 2000
 _SLOPE_S = 0.1  # shortest time over which a velocity is taken
 _TURN_S = 0.5  # over which rotations are compared
@@ -65,6 +67,7 @@ class MotionPair:
         steps = [float(np.median(np.diff(t))) for t in (own, true)]
         self._slope_s = max(_SLOPE_S, *(2.0 * step for step in steps))
         inside = own[(own >= 0.0) & (own <= (end - begin) * 1e-9)]
+        self._begin_ns = int(begin)
         self._t = inside[:: max(1, math.ceil(len(inside) / _MOST_SAMPLES))]
         turn_s = max(_TURN_S, self._slope_s)
         # What a signal needs on both sides of an instant, itself and for its slope.
@@ -85,8 +88,8 @@ class MotionPair:
         if len(t) < _LEAST_SAMPLES:
             return False
         x, y = own(t), true(t + offset_s)
-        whole = _Stretch.of(x, y, np.zeros_like(x), np.zeros_like(x))
-        return whole.left < (1.0 - least**2) * whole.size
+        left, size = float((_aligned_error(x, y) ** 2).sum()), float(((y - y.mean(axis=0)) ** 2).sum())
+        return left < (1.0 - least**2) * size
 
     def misfits(self, offsets_s: list[float]) -> list[NDArray[np.float64]]:
         """What every offset leaves, (offsets, k) squares over k stretches of the path, the same samples for all.
@@ -113,6 +116,8 @@ class MotionPair:
             told = sum(one.told for one in stretches)
             if len(stretches) < LEAST_STRETCHES or not told > _ROUNDING * sum(one.moved for one in stretches):
                 return None
+            if not _white_deviation(stretches) < largest_s:
+                return None
             step = sum(one.pull for one in stretches) / told
             at += float(step)
             if not abs(at - offset_s) < largest_s:
@@ -120,62 +125,166 @@ class MotionPair:
             if abs(step) < _SETTLED_S:
                 break
         deviation = jackknife(np.array([one.pull for one in stretches]), np.array([one.told for one in stretches]))
+        # Slopes of noise alone, as of a circle at constant speed, where a turn is an offset, scatter less than they know.
+        deviation = max(deviation, _white_deviation(stretches))
         if not math.isfinite(deviation) or abs(step) > 0.1 * deviation:
             return None
         left, size = sum(one.left for one in stretches), sum(one.size for one in stretches)
         return ClockFit(at, deviation, math.sqrt(max(1.0 - left / max(size, 1e-300), 0.0)), name)
 
+    def fit_rate(self, name: str, offset_s: float, largest_s: float) -> ClockRate | None:
+        """Offset and rate together, at most `largest_s` from an offset anywhere; None where the motions do not tell them."""
+        middle_s = 0.5 * float(self._t[0] + self._t[-1])
+        at, half_s = np.array([offset_s, 0.0]), max(middle_s - float(self._t[0]), 1e-9)
+        parts: list[_RateStretch] = []
+        for _ in range(_STEPS):
+            shift_s = at[0] + at[1] * (self._t - middle_s)
+            parts = [_RateStretch.of(part, middle_s) for part in self._cut(name, shift_s, shift_s, 0.0)]
+            told = np.sum([part.told for part in parts], axis=0)
+            if len(parts) < _LEAST_OF_RATE or not np.linalg.eigvalsh(told)[0] > 0.0:
+                return None
+            step = np.linalg.solve(told, np.sum([part.pull for part in parts], axis=0))
+            at += step
+            if not abs(at[0] - offset_s) + abs(at[1]) * half_s < largest_s:
+                return None
+            if abs(step[0]) + abs(step[1]) * half_s < _SETTLED_S:
+                break
+        else:
+            return None
+        without = [
+            np.linalg.solve(told - part.told, np.sum([other.pull for other in parts if other is not part], axis=0))
+            for part in parts
+        ]
+        spread = np.sqrt((len(parts) - 1) / len(parts) * ((without - np.mean(without, axis=0)) ** 2).sum(axis=0))
+        rate, offset = (float(value) for value in at[::-1])
+        return ClockRate(rate, float(spread[1]), offset, float(spread[0]), self._begin_ns + round(1e9 * middle_s), half_s)
+
     def _stretches(self, name: str, offset_s: float, widest_s: float = 0.0) -> list[_Stretch]:
         """Every stretch compared at an offset; of all offsets up to `widest_s` the same samples."""
+        shift_s = np.full(len(self._t), offset_s)
+        return [_Stretch.of(part) for part in self._cut(name, shift_s, 0.0 if widest_s else shift_s, widest_s)]
+
+    def _cut(
+        self, name: str, shift_s: NDArray[np.float64], covered_s: NDArray[np.float64] | float, widest_s: float
+    ) -> list[_Part]:
+        """The motions of both, the ground truth's later by `shift_s` (n,), in stretches; none where there are too few.
+
+        Args:
+            covered_s, widest_s: where the ground truth has to be there, around which shift and how far.
+        """
         own, true, around = self.signals[name]
-        t = self._t
-        reach = around + widest_s
-        t = t[self._covered[0](t, around) & self._covered[1](t + (0.0 if widest_s else offset_s), reach)]
+        inside = self._covered[0](self._t, around) & self._covered[1](self._t + covered_s, around + widest_s)
+        t, shift_s = self._t[inside], shift_s[inside]
         count = min(_STRETCHES, len(t) // _LEAST_SAMPLES)
         if count < LEAST_STRETCHES:
             return []
-        x, y = own(t), true(t + offset_s)
+        x, y = own(t), true(t + shift_s)
         half = 0.5 * self._slope_s
         u = (own(t + half) - own(t - half)) / self._slope_s
-        v = (true(t + offset_s + half) - true(t + offset_s - half)) / self._slope_s
+        v = (true(t + shift_s + half) - true(t + shift_s - half)) / self._slope_s
         edges = np.searchsorted(t, np.linspace(t[0], t[-1], count + 1)[1:-1])
-        parts = zip(*(np.split(array, edges) for array in (x, y, u, v)), strict=True)
-        return [_Stretch.of(*part) for part in parts if len(part[0]) >= _LEAST_SAMPLES]
+        parts = zip(*(np.split(array, edges) for array in (t, x, y, u, v)), strict=True)
+        return [_Part.of(*part) for part in parts if len(part[0]) >= _LEAST_SAMPLES]
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Vectors x (n, 3) of one motion over a stretch about their mean, and their slopes u (n, 3)."""
+
+    x: NDArray[np.float64]
+    u: NDArray[np.float64]
+
+    def beyond(self, factor: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
+        """(3 n,) of the slopes, each times a factor, what place, turn and scale of the stretch do not explain as well.
+
+        By the motion's own turn and scale: of a circle at constant speed nothing is left but its own noise, which that of
+        another motion has nothing to do with.
+        """
+        free = np.zeros((len(self.x), 3, 4))
+        for axis, (one, other) in enumerate(((1, 2), (2, 0), (0, 1))):
+            free[:, one, axis], free[:, other, axis] = -self.x[:, other], self.x[:, one]
+        free[:, :, 3] = self.x
+        basis, lengths, _ = np.linalg.svd(free.reshape(-1, 4), full_matrices=False)
+        basis = basis[:, lengths > 1e-9 * max(lengths[0], 1e-300)]
+        slope = factor * self.u
+        flat = (slope - slope.mean(axis=0)).reshape(-1)
+        return np.asarray(flat - basis @ (basis.T @ flat))
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One stretch at times t (n,) [s]: the estimate, laid onto the ground truth by a similarity of its own, and that."""
+
+    t: NDArray[np.float64]
+    own: _Motion
+    true: _Motion
+
+    @classmethod
+    def of(
+        cls,
+        t: NDArray[np.float64],
+        x: NDArray[np.float64],
+        y: NDArray[np.float64],
+        u: NDArray[np.float64],
+        v: NDArray[np.float64],
+    ) -> _Part:
+        """From vectors x of the estimate and y of the ground truth and their slopes u and v, all (n, 3)."""
+        scale, R = _similarity(x, y)
+        own = _Motion(scale * (x - x.mean(axis=0)) @ R.T, scale * u @ R.T)
+        return cls(t, own, _Motion(y - y.mean(axis=0), v))
+
+    @property
+    def error(self) -> NDArray[np.float64]:
+        """(3 n,) estimate less ground truth."""
+        return (self.own.x - self.true.x).reshape(-1)
 
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Of one stretch, squared: the regression's two sums, the slopes, what the alignment leaves, and the size of the motion."""
+    """Of one stretch: the regression's two sums, squares of the slopes, of what is left and of the motion, and their number.
+
+    `moved` are the slopes, `wide` what of them tells, with its noise.
+    """
 
     pull: float
     told: float
     moved: float
+    wide: float
     left: float
     size: float
+    count: int
 
     @classmethod
-    def of(cls, x: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> _Stretch:
-        """From vectors x of the estimate and y of the ground truth and their slopes u and v, all (n, 3)."""
-        y = y - y.mean(axis=0)
-        scale, R = _similarity(x, y)
-        x, u = scale * (x - x.mean(axis=0)) @ R.T, scale * u @ R.T
-        e = x - y
-        # What place, turn and scale of the stretch explain as well as an offset does is no evidence of it.
-        free = np.stack([*(np.cross(axis, x) for axis in np.eye(3)), x]).reshape(4, -1).T
-        basis = np.linalg.svd(free, full_matrices=False)
-        Q = basis[0][:, basis[1] > 1e-9 * max(basis[1][0], 1e-300)]
-        slopes = []
-        for slope in (u, v):
-            flat = (slope - slope.mean(axis=0)).reshape(-1)
-            slopes.append(flat - Q @ (Q.T @ flat))
+    def of(cls, part: _Part) -> _Stretch:
+        """The sums of a stretch."""
+        u, v, e = part.own.beyond(), part.true.beyond(), part.error
+        mean = 0.5 * (u + v)
         # The noise of one slope is not that of the other: their product is free of it, where a square would count it as motion.
-        return cls(
-            float(0.5 * (slopes[0] + slopes[1]) @ e.reshape(-1)),
-            float(slopes[0] @ slopes[1]),
-            float((u * u).sum() + (v * v).sum()),
-            float((e * e).sum()),
-            float((y * y).sum()),
-        )
+        moved, size = sum(float((one.u * one.u).sum()) for one in (part.own, part.true)), float((part.true.x**2).sum())
+        return cls(float(mean @ e), float(u @ v), moved, float(mean @ mean), float(e @ e), size, len(e))
+
+
+@dataclass(frozen=True, slots=True)
+class _RateStretch:
+    """The two sums of the regression on offset and rate, (2,) and (2, 2)."""
+
+    pull: NDArray[np.float64]
+    told: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, part: _Part, middle_s: float) -> _RateStretch:
+        """The sums of a stretch, with the offset in the middle of the way."""
+        since = (part.t - middle_s)[:, None]
+        u, v = (np.stack([motion.beyond(), motion.beyond(since)]) for motion in (part.own, part.true))
+        cross = u @ v.T
+        return cls(0.5 * (u + v) @ part.error, 0.5 * (cross + cross.T))
+
+
+def _white_deviation(stretches: list[_Stretch]) -> float:
+    """Standard deviation of the offset, were what is left white noise: the least that it can be [s]."""
+    told, wide = sum(one.told for one in stretches), sum(one.wide for one in stretches)
+    variance = sum(one.left for one in stretches) / max(sum(one.count for one in stretches), 1)
+    return math.sqrt(variance * wide) / max(told, 1e-300)
 
 
 def _similarity(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -61,7 +61,10 @@ def alignment_doubts(
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
-    if _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
+    w_first = _w_first(association.estimate, association.ground_truth, alignment.R_world_estimate, scatter)
+    if w_first is not None:
+        doubts.append(w_first)
+    elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
             f"the orientations differ by a constant {constant:.1f}° (scatter {scatter:.1f}°): the body frames are not the same, "
@@ -138,6 +141,20 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
             "inverted and its positions are not: conjugate its quaternions; rotation error and relative errors mean nothing"
         )
         return
+    # Where positions differ, too, what makes them differ turns them.
+    if _w_first(estimate, truth, R, scatter) is None and rmse < _FITS * alignment.spread_m[0]:
+        yield (
+            f"the orientations scatter by {scatter:.0f}° against the ground truth's: another convention, or none; "
+            "look at the positions alone"
+        )
+
+
+def _w_first(estimate: Trajectory, truth: Trajectory, R: NDArray[np.float64], scatter: float) -> str | None:
+    """A sentence where orientations agree clearly better with other columns; of a body that turns little, they hardly scatter.
+
+    Args:
+        R: (3, 3) R_world_estimate of the alignment. scatter: of the orientations as they were read [deg].
+    """
     swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
     ways = {
         "the estimate": _scatter_deg(R @ swapped[0], truth.R),
@@ -145,16 +162,12 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
         "both files": _scatter_deg(R @ swapped[0], swapped[1]),
     }
     way = min(ways, key=lambda name: ways[name])
-    if ways[way] < _CLEARLY * scatter:
-        yield (
-            f"the orientations scatter by {scatter:.0f}° as they were read, and by {ways[way]:.1f}° if the quaternions of {way} "
-            "are taken for qw qx qy qz: reorder the columns, the rotation error and the relative errors mean nothing"
-        )
-    elif rmse < _FITS * alignment.spread_m[0]:  # else what makes the positions differ turns them, too
-        yield (
-            f"the orientations scatter by {scatter:.0f}° against the ground truth's: another convention, or none; "
-            "look at the positions alone"
-        )
+    if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
+        return None
+    return (
+        f"the orientations scatter by {scatter:.1f}° as they were read, and by {ways[way]:.1f}° if the quaternions of {way} are "
+        "taken for qw qx qy qz: reorder the columns, the rotation error and the relative errors mean nothing"
+    )
 
 
 def _inversion_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:

@@ -18,6 +18,7 @@ from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_origin, principal_spread
 from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
+from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.incidents import incident_doubts
@@ -218,12 +219,27 @@ def evaluate(
     if not (isinstance(deltas, Sequence) and all(isinstance(delta, Delta) for delta in deltas)):
         raise InputError("deltas as a list of Delta", shown(deltas), 'write e.g. [Delta(10.0, "m")]')
 
-    def matches(offset_s: float) -> Association:
+    def matches(estimate: Trajectory, offset_s: float, *, tell_offset: bool = False) -> Association:
         return associate(
-            estimate, ground_truth, method, max_difference_s, offset_s=offset_s, max_gap_s=max_gap_s, min_matches=min_matches
+            estimate,
+            ground_truth,
+            method,
+            max_difference_s,
+            offset_s=offset_s,
+            max_gap_s=max_gap_s,
+            min_matches=min_matches,
+            tell_offset=tell_offset,
         )
 
-    association = matches(offset_s)
+    def error_with(estimate: Trajectory, offset_s: float) -> float | None:
+        """The ATE with other stamps; None where they cannot be compared."""
+        with suppress(InputError):
+            other = matches(estimate, offset_s)
+            moved = _find_alignment(other, alignment, align_by_first).apply(other.estimate)
+            return rms(translation_errors(projected(moved, plane), projected(other.ground_truth, plane)))
+        return None
+
+    association = matches(estimate, offset_s, tell_offset=True)
     matched = association.estimate
     if alignment != "sim3":
         _refuse_other_unit(matched, association.ground_truth)
@@ -234,12 +250,16 @@ def evaluate(
     warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
     noticed = association.time_offset
-    if noticed is not None and (abs(noticed.offset_s) > _NOTICED_OFFSET_S or noticed.shows):
-        rmse_with = None
-        with suppress(InputError):
-            other = matches(association.offset_s + noticed.offset_s)
-            moved = _find_alignment(other, alignment, align_by_first).apply(other.estimate)
-            rmse_with = rms(translation_errors(projected(moved, plane), projected(other.ground_truth, plane)))
+    by_rate = None
+    if noticed is not None and noticed.rate is not None and noticed.rate.shows:
+        on_time = replace(estimate, time_ns=noticed.rate.corrected(estimate.times + round(offset_s * 1e9)), lines=None)
+        by_rate = _rate_doubt(
+            noticed.rate, rms(translation), error_with(estimate, offset_s + noticed.offset_s), error_with(on_time, 0.0)
+        )
+    if by_rate is not None:
+        warnings.append(by_rate)
+    elif noticed is not None and (abs(noticed.offset_s) > _NOTICED_OFFSET_S or noticed.shows):
+        rmse_with = error_with(estimate, association.offset_s + noticed.offset_s)
         gain = 1.0 if rmse_with is None else rms(translation) / max(rmse_with, 1e-300)
         if gain > 1.0 / _FAR_BETTER or (gain > _FAR_BETTER and _is_told(noticed, estimate, ground_truth)):
             warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, rms(translation), rmse_with))
@@ -340,6 +360,19 @@ def _is_told(found: TimeOffset, estimate: Trajectory, ground_truth: Trajectory) 
     """Whether an offset is worth a word even if the errors hardly change with it."""
     interval_s = max(float(np.median(np.diff(poses.times))) * 1e-9 for poses in (estimate, ground_truth))
     return found.shows and abs(found.offset_s) > max(_NOTICED_OFFSET_S, _OF_INTERVAL * interval_s)
+
+
+def _rate_doubt(found: ClockRate, rmse: float, with_offset: float | None, with_rate: float | None) -> str | None:
+    """A sentence on a rate with which the errors do get smaller, than they are and than an offset alone makes them."""
+    least = rmse if with_offset is None else min(rmse, with_offset)
+    far_apart = abs(found.rate) * found.half_s > _NOTICED_OFFSET_S
+    if with_rate is None or not with_rate < (_BETTER if far_apart else _FAR_BETTER) * least:
+        return None
+    beside = "" if with_offset is None else f", and {with_offset:.4g} m with a constant offset"
+    return (
+        f"the clocks do not run at the same rate: {found}; with stamps t {found.offset_s:+.4f} s {found.rate:+.4g} "
+        f"(t − {found.middle_ns * 1e-9:.3f} s) the ATE is {with_rate:.4g} m instead of {rmse:.4g} m{beside}"
+    )
 
 
 def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.evaluation.clock_fit import LEAST_STRETCHES, ClockFit, MotionPair, as_good, jackknife
+from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
@@ -42,6 +43,7 @@ class TimeOffset:
         signal: `rotation` or `translation`: which motion tells it.
         deviation_s: standard deviation of the offset, as it scatters over the stretches of the path [s].
         others_s: offsets that fit as well, as the motion repeats itself, in order of their size [s].
+        rate: of the clocks against each other, found together with an offset; None where the motions do not tell it.
     """
 
     offset_s: float
@@ -49,6 +51,7 @@ class TimeOffset:
     signal: str
     deviation_s: float
     others_s: tuple[float, ...] = ()
+    rate: ClockRate | None = None
 
     @property
     def least_s(self) -> float:
@@ -112,7 +115,9 @@ def estimate_time_offset(
     if not told:
         return None
     nearest, *others = _distinct(sorted(told, key=lambda one: abs(one.offset_s)))
-    return replace(nearest, others_s=tuple(one.offset_s for one in others))
+    rates = [rate for signal in pair.signals if (rate := pair.fit_rate(signal, nearest.offset_s, _NEAR[0])) is not None]
+    rate = min(rates, key=lambda one: one.deviation, default=None)
+    return replace(nearest, others_s=tuple(one.offset_s for one in others), rate=rate)
 
 
 def _refined(pair: MotionPair, start_s: float) -> ClockFit | None:
@@ -231,11 +236,15 @@ def _nearest_row(t: NDArray[np.int64], at: NDArray[np.float64]) -> NDArray[np.in
     return after - (at - t[after - 1] < t[after] - at)
 
 
+def _correlate(b: Floats, core: Floats) -> Floats:
+    """(n − m + 1,) Σ_j b[k + j] core[j] of b (n,) and core (m,); NumPy's, as SciPy's takes a second to be there."""
+    n = len(b)
+    return np.asarray(np.fft.irfft(np.fft.rfft(b) * np.conj(np.fft.rfft(core, n)), n)[: n - len(core) + 1])
+
+
 def _lags(a: Floats, b: Floats, lags: int, least: float) -> list[tuple[float, float]]:
     """The lags (in samples, refined by a parabola) by which `a` has to be moved later to fit `b`, where the correlation has a
     maximum of at least `least`, and the correlations there; none at the end of the range."""
-    from scipy.signal import correlate
-
     n = len(a)
     core = a[lags : n - lags] - a[lags : n - lags].mean()
     m = len(core)
@@ -248,7 +257,7 @@ def _lags(a: Floats, b: Floats, lags: int, least: float) -> list[tuple[float, fl
     if scale < 1e-12 or spread.max() < 1e-12:
         return []
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = correlate(b, core, mode="valid") / (m * scale * spread)
+        values = _correlate(b, core) / (m * scale * spread)
     values = np.where(np.isfinite(values), values, 0.0)
     middle = values[1:-1]
     peaks = 1 + np.flatnonzero((middle >= least) & (middle >= values[:-2]) & (middle > values[2:]))

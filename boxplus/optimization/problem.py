@@ -341,21 +341,21 @@ class Problem:
         begin = time.perf_counter()
         options = as_settings(SolverOptions, options, settings)
         model, notes, analysis = self._analyse(options)
-        for stage in model.timing_s:
-            model.timing_s[stage] = 0.0
+        model.timing_s = dict.fromkeys(model.timing_s, 0.0)
         began = self.values_at(start)
         model.start(began)
         cost_initial = model.cost.cost
         strategy = strategy_of(options)
         try:
-            status, reason, history = minimize(model, strategy, options, callback, begin)
+            ending, history = minimize(model, strategy, options, callback, begin)
         except NotPositiveDefinite as error:
             raise SingularProblemError(explain_singularity(model, error)) from error
         faded = faded_shares(self.groups, None if model.is_linearized and callback is None else model.values)
         silenced = faded_notes(self.groups, faded, model.values, options.threads)
         return Solution(
-            status=status,
-            reason=reason,
+            status=ending.status,
+            reason=ending.reason,
+            limit=ending.limit,
             values=tuple(model.values),
             cost_initial=cost_initial,
             cost=model.cost.cost,

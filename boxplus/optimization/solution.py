@@ -13,6 +13,7 @@ from boxplus._arguments import require
 from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
+from boxplus.optimization.minimizers.remainder import remaining_cost, unconverged_sentence
 from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.observability.singularity import describe_null_space
 from boxplus.optimization.terms.misfit import misfit_notes
@@ -53,6 +54,7 @@ class Solution:
     Attributes:
         status: `converged`; `stopped` by a limit or the callback; `stalled` where no step lowers the cost any more.
         reason: why it stopped, in a sentence with numbers.
+        limit: that stopped it, `steps` or `time`; None where it ended by itself, or the callback stopped it.
         values: (n, size) of every block; also `solution[block]` and `solution[block[rows]]`.
         cost_initial, cost: ½ Σ ρ(‖r‖²) at the start and at the end, whitened.
         history: every step tried.
@@ -77,6 +79,7 @@ class Solution:
 
     status: Literal["converged", "stopped", "stalled"]
     reason: str
+    limit: Literal["steps", "time"] | None
     values: tuple[NDArray[np.float64], ...]
     cost_initial: float
     cost: float
@@ -209,6 +212,35 @@ class Solution:
         self._problem.start(self.values)
         return describe_null_space(self._problem, find_null_space(self._problem))
 
+    def unconverged(self, advice: str = "allow more steps, or start elsewhere") -> str | None:
+        """A sentence where it ended farther from the minimum than noise puts the minimum itself; None else.
+
+        So it may be where a limit stopped it, or no step led down any more; who stops it by the callback knows. Costs a
+        linearisation and a linear solve there, and nothing where it converged.
+
+        Args:
+            advice: what to do about it.
+
+        Raises:
+            InputError: variables or residuals were removed since.
+
+        Example:
+            >>> problem = bp.Problem()
+            >>> x = problem.add_variables(bp.Euclidean(1), [0.0])
+            >>> group = problem.add_residuals(bp.residuals.Prior(bp.Euclidean(1), [2.0], sigma=0.5), x)
+            >>> problem.solve(max_iterations=0).unconverged()[:60]
+            'no minimum was reached (iteration limit of 0 reached): the c'
+            >>> problem.solve().unconverged() is None
+            True
+        """
+        if self.limit is None and self.status != "stalled":
+            return None
+        self._problem.start(self.values)
+        remaining = remaining_cost(self._problem, [step.cost for step in self.history])
+        rows = sum(group.residual.dim * int(np.count_nonzero(group.counted)) for group in self._problem.groups)
+        told = unconverged_sentence(self.reason, self.cost, remaining, rows - self._problem.layout.dof)
+        return None if told is None else f"{told}: {advice}"
+
     def doubts(self) -> tuple[str, ...]:
         """Sentences on what speaks against the values, converged or not.
 
@@ -239,6 +271,7 @@ class Solution:
             f"{self.status}: {self.reason}",
         ]
         lines += [f"{count} residuals of group {name!r} could not be evaluated" for name, count in self.invalid.items() if count]
+        lines += [text for text in (self.unconverged(),) if text]
         return "\n".join([*lines, *self.notes, *self.doubts()])
 
 

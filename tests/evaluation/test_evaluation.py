@@ -74,6 +74,12 @@ def test_files_that_mean_something_else_are_told() -> None:
     assert "quaternions of the estimate are taken for qw" in told(swapped(estimate), truth)
     assert "quaternions of the ground truth are taken for qw" in told(estimate, swapped(truth))
     assert "quaternions of both files are taken for qw" in told(swapped(estimate), swapped(truth))
+    turned = Rotation.from_rotvec([0.0, 0.0, 0.05] * np.sin(np.arange(len(truth)))[:, None]) * Rotation.from_rotvec(
+        [0.3, 1.0, 0.2]
+    )
+    little = Trajectory(truth.time_ns, truth.p, turned.as_quat()[:, [3, 0, 1, 2]])
+    assert "quaternions of the estimate are taken for qw" in told(swapped(little), little)
+    assert "body frames are not the same" not in told(swapped(little), little)
     still = Trajectory(estimate.time_ns, estimate.p, np.tile(estimate.q_wxyz[0], (len(estimate), 1)))
     assert "never change" in told(still, truth)
     R = Rotation.from_quat(estimate.q_wxyz[:, [1, 2, 3, 0]]).inv()

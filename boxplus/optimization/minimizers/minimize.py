@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,15 @@ Status = Literal["converged", "stopped", "stalled"]
 Callback = Callable[[Iteration], bool | None]
 
 
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """Why a minimisation ended; see `Solution` for `status`, `reason` and `limit`."""
+
+    status: Status
+    reason: str
+    limit: Literal["steps", "time"] | None = None
+
+
 def strategy_of(options: SolverOptions) -> Strategy:
     """The strategy that the options name."""
     if options.method == "gauss_newton":
@@ -31,7 +41,7 @@ def strategy_of(options: SolverOptions) -> Strategy:
 
 def minimize(
     problem: LeastSquares, strategy: Strategy, options: SolverOptions, callback: Callback | None, begin: float
-) -> tuple[Status, str, list[Iteration]]:
+) -> tuple[Ending, list[Iteration]]:
     """Lower the cost of `problem` from its accepted point until a tolerance or a limit is met.
 
     Args:
@@ -39,7 +49,7 @@ def minimize(
         begin: `time.perf_counter()` when the user called.
 
     Returns:
-        (status, reason, history); the accepted point is in `problem`.
+        (ending, history); the accepted point is in `problem`.
     """
     history: list[Iteration] = []
 
@@ -55,21 +65,21 @@ def minimize(
     for number in range(1, options.max_iterations + 1):
         last = history[-1]
         if stop:
-            return "stopped", f"the callback asked to stop after iteration {last.number}", history
+            return Ending("stopped", f"the callback asked to stop after iteration {last.number}"), history
         if (slope := problem.slope()) <= options.gradient_tolerance:
-            return "converged", _flat(slope, options), history
+            return Ending("converged", _flat(slope, options)), history
         if options.time_limit_s is not None and last.time_s >= options.time_limit_s:
-            return "stopped", f"time limit of {options.time_limit_s:g} s reached", history
+            return Ending("stopped", f"time limit of {options.time_limit_s:g} s reached", "time"), history
         before = strategy.parameter
         step = strategy.propose(problem)
         if step is None:
-            return "stalled", _stall(strategy, rejected, lost, broken), history
+            return Ending("stalled", _stall(strategy, rejected, lost, broken)), history
         parameter, cost = strategy.parameter, problem.cost.cost
         # After rejections, and where damping had to grow for H to be factorised, little is expected because the step was made
         # small, not because the minimum is near.
         made_small = rejected or parameter > before > 0.0
         if not made_small and 0.0 <= step.predicted < options.expected_tolerance * cost:
-            return "converged", f"the next step is expected to lower the cost by {step.predicted:.2g} at most", history
+            return Ending("converged", f"the next step is expected to lower the cost by {step.predicted:.2g} at most"), history
         size = float(np.abs(step.delta).max(initial=0.0))
         values = problem.moved(step.delta)
         tried = problem.linearize(values)
@@ -87,17 +97,18 @@ def minimize(
         if settled or small:
             # After rejections a step is small because it was made so, not because the minimum is near.
             if rejected:
-                return "stalled", _stall(strategy, rejected, lost, broken), history
+                return Ending("stalled", _stall(strategy, rejected, lost, broken)), history
             if settled:
-                return "converged", f"the cost changed by {decrease:.2g}, {options.cost_tolerance:.2g} of it or less", history
-            return "converged", f"the step moved nothing by more than {size:.2g}", history
+                told = f"the cost changed by {decrease:.2g}, {options.cost_tolerance:.2g} of it or less"
+                return Ending("converged", told), history
+            return Ending("converged", f"the step moved nothing by more than {size:.2g}"), history
         broken = 0 if accepted else broken + (not np.isfinite(tried.cost))
         rejected, lost = (0, 0) if accepted else (rejected + 1, max(lost, tried.lost))
     if stop:
-        return "stopped", f"the callback asked to stop after iteration {history[-1].number}", history
+        return Ending("stopped", f"the callback asked to stop after iteration {history[-1].number}"), history
     if (slope := problem.slope()) <= options.gradient_tolerance:
-        return "converged", _flat(slope, options), history
-    return "stopped", f"iteration limit of {options.max_iterations} reached", history
+        return Ending("converged", _flat(slope, options)), history
+    return Ending("stopped", f"iteration limit of {options.max_iterations} reached", "steps"), history
 
 
 def _flat(slope: float, options: SolverOptions) -> str:

@@ -21,6 +21,7 @@ _IS_DEPENDENT = 1e-12  # motions that move nothing, such as a turn of one point 
 _READINGS = 256  # combinations of kinds tried
 _GROUPS, _DIRECTIONS = 4, 2  # named before the rest is counted
 _FLAT = 1e-4
+_HARDLY = 1e-3  # radians for every metre, or the other way round, that are none
 
 
 def touching_groups(problem: LeastSquares, number: NDArray[np.int64]) -> str:
@@ -67,8 +68,10 @@ def describe_shared(problem: LeastSquares, shared: SharedDirections, own: Sequen
     U, length, _ = np.linalg.svd(rest, full_matrices=False)
     others = U[:, length > 0.5]
     for direction in others.T[:_DIRECTIONS]:
-        how = _tangents_text(problem, shared, direction / shared.scale)
-        sentences.append(f"{names} can move freely along ({how}); {seen}")
+        tangents = direction / shared.scale
+        together = _poses_text(problem, shared, tangents)
+        how = together or f"along ({_tangents_text(problem, shared, tangents)})"
+        sentences.append(f"{names} can move freely {how}; {seen}")
     if others.shape[1] > _DIRECTIONS:
         more = others.shape[1] - _DIRECTIONS
         sentences.append(f"{'' if shared.is_complete else 'at least '}{more} more directions of the same variables are free")
@@ -261,6 +264,27 @@ def _about(world: _World, motion: NDArray[np.float64], is_anywhere: bool) -> str
 
 def _listed(phrases: list[str]) -> str:
     return phrases[0] if len(phrases) == 1 else ", ".join(phrases[:-1]) + " and " + phrases[-1]
+
+
+def _poses_text(problem: LeastSquares, shared: SharedDirections, direction: NDArray[np.float64]) -> str:
+    """How far poses turn where others shift, of a motion that is none of the whole; nothing where it does not do both."""
+    most: dict[str, tuple[float, str]] = {}
+    for part in _parts(problem, shared):
+        tangents = direction[part.places].reshape(len(part.rows), -1)
+        names = problem.layout.tangents[part.block.number].tangent_names
+        for unit in ("[rad]", "[m]"):
+            moved = np.linalg.norm(tangents[:, [name.endswith(unit) for name in names]], axis=1)
+            row = int(np.argmax(moved))
+            if moved[row] > most.get(unit, (0.0, ""))[0]:
+                number = problem.layout.number[part.block.number][part.rows[row]]
+                most[unit] = float(moved[row]), variable_names(problem.layout, np.array([number]))
+    if len(most) < 2 or most["[rad]"][0] < _HARDLY * most["[m]"][0] or most["[m]"][0] < _HARDLY * most["[rad]"][0]:
+        return ""
+    (turn, who_turns), (shift, who_shifts) = most["[rad]"], most["[m]"]
+    return (
+        f"by turning and shifting together, each by its own: where {who_shifts}, which shifts most, shifts by 1 m, {who_turns}, "
+        f"which turns most, turns by {np.degrees(turn / shift):.3g} deg"
+    )
 
 
 def _tangents_text(problem: LeastSquares, shared: SharedDirections, direction: NDArray[np.float64]) -> str:

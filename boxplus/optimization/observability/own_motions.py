@@ -18,6 +18,7 @@ from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.variables import Variables
 
 _ALONG = 1e-5  # largest sine of the angle between a direction and the viewing ray it is
+_WHOLE = 1e-6  # share of a tangent's squared length, up to which it is taken for none and for all
 _SAME = 1e-6  # largest difference of directions that are told in one sentence
 
 
@@ -79,7 +80,8 @@ def _plain(problem: LeastSquares, block: Variables, alone: OwnDirections) -> lis
     unit = alone.directions[:, :, 0] / np.linalg.norm(alone.directions[:, :, 0], axis=1, keepdims=True)
     freedom = alone.directions.shape[2]
     if freedom > 1 or np.linalg.norm(unit - unit[0] * np.sign(unit @ unit[0])[:, None], axis=1).max() > _SAME:
-        what = f"{freedom} of {block.manifold.dof} degrees of freedom of {names}"
+        which = _which(alone, problem.layout.tangents[block.number].tangent_names)
+        what = f"{freedom} of {block.manifold.dof} degrees of freedom{which} of {names}"
         return [f"{what} are unconstrained; residuals touching {_them(alone)}: {seen}"]
     first = unit[0] * np.sign(unit[0, np.argmax(np.abs(unit[0]))])
     if block.manifold in (Euclidean(2), Euclidean(3)):
@@ -89,6 +91,16 @@ def _plain(problem: LeastSquares, block: Variables, alone: OwnDirections) -> lis
         named = [(abs(w), f"{w:+.2f} {name}") for w, name in parts if abs(w) > 0.05]
         how = f"along ({', '.join(text for _, text in sorted(named, reverse=True)[:4])})"
     return [f"{names} can move freely {how}; residuals touching {_them(alone)}: {seen}"]
+
+
+def _which(alone: OwnDirections, tangent_names: Sequence[str]) -> str:
+    """` (translation x [m], translation y [m])`: the tangents that are free one by one, with all variables; else nothing."""
+    Q = np.linalg.qr(alone.directions)[0]
+    share = (Q * Q).sum(axis=2)  # of every tangent, that lies in what is free
+    is_free = share.min(axis=0) > 1.0 - _WHOLE
+    if not (is_free | (share.max(axis=0) < _WHOLE)).all():
+        return ""
+    return f" ({', '.join(name for name, free in zip(tangent_names, is_free, strict=True) if free)})"
 
 
 def _them(alone: OwnDirections) -> str:

@@ -58,6 +58,7 @@ class Extrinsic:
         contradiction: what the sensors contradict over the first seconds of rotation, whatever the mounting; sentences.
         unknown: what makes a result of it not to be trusted unless the motion bears the mounting out later: a sentence; empty
             where it is given, recorded, or was estimated about all axes.
+        how: an estimate was found; empty where it is none.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -68,6 +69,7 @@ class Extrinsic:
     sigma: tuple[float, float] | None = None
     contradiction: str = ""
     unknown: str = ""
+    how: str = ""
 
     def applied_to(self, config: LioConfig) -> LioConfig:
         """The configuration with this extrinsic; a guess is refined online unless the configuration decides."""
@@ -173,8 +175,12 @@ def _guessed(
         text += "; the motion turns about too few axes to determine the rest"
     sigma = (float(np.clip(std_deg[-1], _LEAST_DEG, _WIDE_DEG)), float(std_m.max()))
     unknown = _UNKNOWN.format(assumed="it was estimated about some axes only") if open_axes else ""
-    warning = f"{_NOBODY_SAYS}: it was {text}, and is refined while running; {_REMEDY}"
-    return Extrinsic(T, "estimated", text, True, warning, sigma, unknown=unknown)
+    return Extrinsic(T, "estimated", text, True, _warning(text), sigma, unknown=unknown, how=how)
+
+
+def _warning(text: str) -> str:
+    """What to do about an estimate, of which `text` tells."""
+    return f"{_NOBODY_SAYS}: it was {text}, and is refined while running; {_REMEDY}"
 
 
 def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic, should_stop: Callable[[], bool]) -> Extrinsic:
@@ -192,8 +198,8 @@ def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic, should
             rehearsal = "the motion showed nothing more of it"
     if isinstance(rehearsal, str):
         kept = f"{found.text}; a first run over the beginning made no more of it: {rehearsal}"
-        return replace(found, text=kept, warning=found.warning.replace(found.text, kept))
-    how = f"{found.text.partition(':')[0]} and in a first run over {rehearsal.seconds:.0f} s"
+        return replace(found, text=kept, warning=_warning(kept))
+    how = f"{found.how} and in a first run over {rehearsal.seconds:.0f} s"
     return _guessed(rehearsal.T_imu_lidar, how, rehearsal.std_deg, rehearsal.std_m, open_axes=False)
 
 

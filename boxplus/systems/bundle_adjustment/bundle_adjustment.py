@@ -155,7 +155,7 @@ def adjust_bundle(
         errors = pixel_errors(problem, list(solution.values))
         adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
         depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss, watch)
-        is_out = solution.reason.startswith("iteration limit")
+        is_out = solution.limit == "steps"
         left = 0 if is_out else config.solver.max_iterations - solution.iterations
         if len(strayed) == _ROUNDS or (solution.status == "stopped" and not is_out):  # by somebody, who does not wait for more
             break
@@ -211,7 +211,7 @@ def adjust_bundle(
         cheirality=cheirality,
         depth=depth,
         notes=(*notes, *watch.notes, *structure_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth, solution, left, [text for text in said if text]),
+        doubt=_doubt(cheirality, depth, solution, left, said),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -267,13 +267,15 @@ def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]
     return 2 * len(point_of) + 7 - others - 3 * len(np.unique(point_of))
 
 
-def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, said: list[str]) -> str | None:
+def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, said: list[str | None]) -> str | None:
     """Why the result is not to be trusted, beside what was `said` of it."""
-    reasons = list(said)
+    reasons = [text for text in said if text]
     if left <= 0:
         reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
-    if not depth.cameras_move_apart:
+    if not depth.cameras_move_apart:  # no minimum, either, and more steps lead to none
         reasons.append(NOT_APART)
+    elif unconverged := solution.unconverged():
+        reasons.append(unconverged)
     if cheirality.bad_share > _BAD_SHARE:
         count = cheirality.behind + cheirality.left_out
         reasons.append(

@@ -65,7 +65,7 @@ def examination_options(
     limit_s = config.solver.time_limit_s
     if limit_s is not None:
         limit_s -= solved.history[-1].time_s
-    is_at_end = solved.status != "stopped" or solved.reason.startswith("iteration limit")
+    is_at_end = solved.status != "stopped" or solved.limit == "steps"
     if watch.is_stopped or not is_at_end or (limit_s is not None and limit_s <= 0.0):
         return None
     work = sum(group.residual.count for group in problem.groups) + cameras**3 // _CUBE

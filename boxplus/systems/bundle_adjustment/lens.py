@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
-from boxplus._chi_square import chi_square_exceeded
 from boxplus.errors import BoxplusError
+from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.between_formats import colmap_of
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.gbp import GbpProblem
@@ -26,13 +27,14 @@ from boxplus.systems.bundle_adjustment.examination import Watch, examination_opt
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
-_CHANCE = 1e-6  # of noise to lower the cost by as much
+_CHANCE = 1e-4  # of noise to lower the cost by as much
 _HINT = 0.3  # of the fall of the cost that counts, which the first step that is taken has to show
 _CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
 _BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
 _ROUGH_PX, _OF_START, _STEPS = 2.0, 0.5, 10  # [px] median error of a start; share of it that another lens leaves; steps
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_NOT_RADIAL = (0, 1, 2, 3, 6, 7)  # of them, all but radial distortion
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,26 +68,72 @@ def lens_finding(
         left: measurements less unknowns.
     """
     cost = solved.cost
-    told_by = "--refine-intrinsics"
-    if isinstance(adjusted, GbpProblem):
-        used, adjusted = used[np.argsort(adjusted.camera_of, kind="stable")], _with_any_lens(adjusted)
-        told_by = "correct the second line of the file"
-    if not isinstance(adjusted, ColmapModel) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
+    if isinstance(adjusted, BalProblem) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
         return None
-    is_out = solved.reason.startswith("iteration limit")
-    if not (solved.status == "converged" or is_out):
+    told_by = "correct the second line of the file"
+    if isinstance(adjusted, ColmapModel):
+        told_by = "--refine-intrinsics, of a camera model that has them: OPENCV has all"
+    used, adjusted = _with_any_lens(adjusted, used)
+    if not (solved.status == "converged" or solved.limit == "steps"):
         return None
+    found = None
+    # Distortion alone first: few images tell it well, and focal lengths and principal point, beside which it gets lost, hardly.
+    for held in (_NOT_RADIAL, ()):
+        other = _freed(adjusted, used, dropped, config, loss, solved, left, watch, held)
+        if watch.is_stopped:
+            return None
+        found = other if found is None or (other is not None and other.cost < found.cost) else found
+    if found is None:
+        return None
+    changes, most = _changes(adjusted, found.lenses)
+    if not changes:
+        return None
+    told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
+    return LensFinding(
+        f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
+        f"{found.cost:.6g} and below, and the scene is bent by what they are wrong ({told_by})",
+        most > _BENT and found.cost < _FALLS * cost,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Freed:
+    """Lenses that explain the images better than chance, and the cost with them."""
+
+    lenses: ColmapModel
+    cost: float
+
+
+def _freed(
+    adjusted: ColmapModel,
+    used: NDArray[np.bool_],
+    dropped: NDArray[np.int64],
+    config: BundleAdjustmentConfig,
+    loss: Loss | None,
+    solved: Solution,
+    left: int,
+    watch: Watch,
+    held: tuple[int, ...],
+) -> _Freed | None:
+    """What comes of it where all may move but the parameters `held` of every lens; None where that is no better than chance."""
+    cost = solved.cost
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, free, loss)
     problem.fix(points[dropped])
+    lenses = [block for block in problem.blocks if block is not cameras and block is not points]
+    if held:
+        for block in lenses:
+            problem.fix(block, components=held)
     options = examination_options(problem, len(cameras), solved, config, watch)
     if options is None:
         return None
-    numbers = sum(block.values.size for block in problem.blocks if block is not cameras and block is not points)
-    # As in an F-test; the noise as the errors have it, not as sigma says.
-    share = 0.5 * chi_square_exceeded(_CHANCE, max(numbers, 1)) / left
-    if is_out:  # more steps would lower the cost without another lens, too
+    numbers = sum(block.values.size - len(block) * len(held) for block in lenses)
+    if left <= numbers:
+        return None
+    # An F-test: the noise as the errors have it, not as sigma says. Of few measurements these know it badly, which counts.
+    share = numbers / (left - numbers) * float(fdtri(numbers, left - numbers, 1.0 - _CHANCE))
+    if solved.limit == "steps":  # more steps would lower the cost without another lens, too
         share = max(share, _MORE_STEPS)
 
     shown = watch.of("another lens?")
@@ -103,15 +151,7 @@ def lens_finding(
         return None
     none = np.zeros(0)
     other = adjusted_reconstruction(adjusted, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-    changes, most = _changes(adjusted, other) if isinstance(other, ColmapModel) else ([], 0.0)
-    if not changes:
-        return None
-    told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
-    return LensFinding(
-        f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
-        f"{solution.cost:.6g} and below, and the scene is bent by what they are wrong ({told_by})",
-        most > _BENT and solution.cost < _FALLS * cost,
-    )
+    return _Freed(other, solution.cost) if isinstance(other, ColmapModel) else None
 
 
 def lens_of_start(
@@ -125,10 +165,9 @@ def lens_of_start(
         used: (k,) observations that are adjusted.
         solved: where bundle adjustment ended: who stopped it does not wait for this.
     """
-    if isinstance(start, GbpProblem):
-        used, start = used[np.argsort(start.camera_of, kind="stable")], _with_any_lens(start)
-    if not isinstance(start, ColmapModel) or config.intrinsics != "held":
+    if isinstance(start, BalProblem) or config.intrinsics != "held":
         return None
+    used, start = _with_any_lens(start, used)
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     seen, rows = Sightings.of(start), np.flatnonzero(used)
     off = _median_error(seen, rows)
@@ -168,10 +207,13 @@ def _median_error(seen: Sightings, rows: NDArray[np.intp]) -> float:
     return float(np.median(errors)) if len(errors) else np.nan
 
 
-def _with_any_lens(gbp: GbpProblem) -> ColmapModel:
-    """The same with a camera that may have distortion, of which the format has none."""
-    model = colmap_of(gbp)
-    return replace(model, camera_models=("OPENCV",), camera_params=(np.append(gbp.intrinsics, np.zeros(4)),))
+def _with_any_lens(held: GbpProblem | ColmapModel, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ColmapModel]:
+    """The same with cameras that may have any distortion, whatever their models have, and `used` (k,) in its order."""
+    if isinstance(held, GbpProblem):
+        used, held = used[np.argsort(held.camera_of, kind="stable")], colmap_of(held)
+    params = [colmap_layout(held, number) @ held.camera_params[number] for number in range(len(held.camera_ids))]
+    wide = tuple(np.pad(known, (0, len(_NAMES) - len(known))) for known in params)
+    return used, replace(held, camera_models=("OPENCV",) * len(params), camera_params=wide)
 
 
 def _changes(before: ColmapModel, after: ColmapModel) -> tuple[list[str], float]:

@@ -128,10 +128,12 @@ def adjust_lines(
         empty if points is None else _point_errors(data, v[cameras.number], v[points.number]) for v in (start, values)
     )
     said = [_doubt(adjusted, errors, point_errors, seen, config, loss)]
-    is_stopped = solution.status == "stopped" and not solution.reason.startswith("iteration limit")  # who does that does not wait
+    is_stopped = solution.status == "stopped" and solution.limit != "steps"  # who does that does not wait
     watch = Watch(callback)
     if not is_stopped and not line_parallax_ratio(adjusted, seen, config, loss, solution.cost, watch) > TURNING:
-        said.append(NOT_APART)
+        said.append(NOT_APART)  # no minimum, either, and more steps lead to none
+    else:
+        said.append(solution.unconverged())
     # From a start that is off, segments of a line may disagree; what the adjustment makes of given lines decides about these.
     notes = found.notes() if config.triangulate else found.notes(("one view", "along the line", "too short"))
     if data.reflected:

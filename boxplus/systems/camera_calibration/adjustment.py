@@ -90,6 +90,7 @@ class Adjustment:
         covariance: (D, D) of the intrinsics of every camera, one after the other, and of the tangents [θ, p] of the mountings of
             all cameras but the first.
         other_minimum: by how much χ² of a second minimum far away is larger; infinite where none is known.
+        unconverged: a sentence where the search ended before its minimum.
     """
 
     rig: Rig
@@ -100,6 +101,7 @@ class Adjustment:
     sigma_px: float
     covariance: Floats
     other_minimum: float = math.inf
+    unconverged: str | None = None
 
     def intrinsics(self, camera: int) -> slice:
         """Where a camera's intrinsics are in `covariance`."""
@@ -171,7 +173,9 @@ def adjust(corners: TargetCorners, places: Floats, start: Rig, max_iterations: i
     squares = float(np.sum(errors[kept] ** 2))
     free = 2 * int(kept.sum()) - _dof(rig, blocks)
     sigma = max(math.sqrt(squares / max(free, 1)), _SMALLEST_SIGMA_PX)
-    return Adjustment(rig, corners, errors, kept, lost, sigma, _covariance(rig, blocks, solution, sigma))
+    unconverged = solution.unconverged("use more views, of a target that fills the image")
+    covariance = _covariance(rig, blocks, solution, sigma)
+    return Adjustment(rig, corners, errors, kept, lost, sigma, covariance, unconverged=unconverged)
 
 
 def _dof(rig: Rig, blocks: _Blocks) -> int:

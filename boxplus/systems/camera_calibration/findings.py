@@ -77,11 +77,16 @@ def judge(found: CameraCalibration) -> list[Finding]:
     """All there is to say, the worst first."""
     findings: list[Finding] = []
     for camera in range(len(found.singles)):
-        findings += _lens_determined(found, camera) + _side(found, camera)
+        findings += _converged(found, camera) + _lens_determined(found, camera) + _side(found, camera)
         findings += _views(found, camera) + _pattern(found, camera)
     findings += _target(found) + _left_out(found) + _together(found) + _inertial(found)
     order = {"refused": 0, "doubt": 1, "remark": 2}
     return sorted(findings, key=lambda finding: order[finding.severity])
+
+
+def _converged(found: CameraCalibration, camera: int) -> list[Finding]:
+    told = found.of_camera(camera)[0].unconverged
+    return [] if told is None else [Finding("unconverged", "doubt", f"cam{camera}: {told}")]
 
 
 def _lens_determined(found: CameraCalibration, camera: int) -> list[Finding]:
@@ -322,6 +327,8 @@ def _inertial(found: CameraCalibration) -> list[Finding]:
         )
         if wide
     ]
+    if imu.unconverged is not None:
+        result.append(Finding("imu_unconverged", "doubt", f"cameras and IMU: {imu.unconverged}"))
     if open_parts:
         text = (
             f"the motion does not determine how cam0 is mounted on the IMU: {', '.join(open_parts)}; turn and shake "

@@ -77,6 +77,7 @@ class CameraImuCalibration:
         session_s: until the last image that could be used [s]; `used_s` ends before where more than 400 frames would be needed.
         imu_chi2: mean square of the whitened IMU residuals: about 1 or less where its noise is as stated.
         corner_chi2: that of the corners, by the standard deviation that the cameras alone have.
+        unconverged: a sentence where the search ended before its minimum.
     """
 
     T_imu_camera: Floats
@@ -92,6 +93,7 @@ class CameraImuCalibration:
     session_s: float
     imu_chi2: float
     corner_chi2: float
+    unconverged: str | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +137,7 @@ def calibrate_imu(
     offset_s, R_imu_camera = _rotation_start(session, imu)
     state = _state_at_start(session, imu, offset_s, R_imu_camera)
     solved, solution, problem = _solve(session, state, model, sigma_px, imu, noise, 1.0)
+    unconverged = solution.unconverged("turn and shake faster, about all axes")
     mounting, offset = problem.blocks[2], problem.blocks[4]
     covariance = solution.joint_covariance(mounting, offset, is_determined=True)
     scale, scale_sigma = _scale(session, solved, solution.cost, (model, sigma_px, imu, noise))
@@ -154,6 +157,7 @@ def calibrate_imu(
         session_s=1e-9 * (session.span_ns[1] - session.span_ns[0]),
         imu_chi2=2.0 * costs[1] / (15 * links),
         corner_chi2=2.0 * costs[0] / (2 * len(session.pixels)),
+        unconverged=unconverged,
     )
 
 

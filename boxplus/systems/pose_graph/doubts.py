@@ -227,8 +227,12 @@ def undetermined_notes(graph: PoseGraph, solution: Solution) -> list[str]:
     _mark_singular(graph.information, weak)
     if not weak.any():
         return []
+    counted = ""
+    if not np.array_equal(graph.ids, np.arange(len(graph.ids))):
+        counted = f" (poses are counted from 0 in the order of the file: poses[0] has the id {graph.ids[0]})"
     return [
-        f"the edges do not determine all poses; where they do not, the start decides: {told}" for told in solution.undetermined()
+        f"the edges do not determine all poses; where they do not, the start decides: {told}{counted}"
+        for told in solution.undetermined()
     ]
 
 

@@ -217,7 +217,7 @@ def optimize_pose_graph(
         notes.append(slack_sentence(fit))
     notes += local_notes(fit, minima)
     drifted = drifted_doubt(graph, poses_end) if free else None
-    reasons = [text for text in (misreading(graph), drifted) if text]
+    reasons = [text for text in (solution.unconverged(), misreading(graph), drifted) if text]
     if verdict is not None:
         if fit.is_poor and not fit.is_contradiction:
             notes.append(f"{misfit(fit)}: information that is too optimistic, or false loop closures among those that were kept")
@@ -238,7 +238,7 @@ def optimize_pose_graph(
         (reasons if bent else notes).append(told)
     examined = time.perf_counter()
     reliability, found = None, []
-    if config.examine and (solution.status != "stopped" or solution.iterations >= options.max_iterations):
+    if config.examine and (solution.status != "stopped" or solution.limit == "steps"):
         if loss is not None or config.objective == "chordal":
             found = held_against_each_other(
                 graph, poses_end, options, loss, None if starts.verdict is None else starts.verdict.is_kept

@@ -17,7 +17,8 @@ _LIMIT = 20_000  # steps looked at
 def misreading(graph: PoseGraph) -> str | None:
     """A sentence where the poses of the file contradict its odometry as they were read, and agree with it read in another way.
 
-    The ways are angles in degrees (2D), quaternions with w first (3D), and edges that go from the second pose to the first.
+    The ways are angles in degrees (2D), quaternions with w first (3D), edges that go from the second pose to the first, poses of
+    the world in the body, and positions in another unit than the edges.
     """
     if graph.poses is None:
         return None
@@ -31,24 +32,30 @@ def misreading(graph: PoseGraph) -> str | None:
         return None
     turn = graph.poses[:, :split]
 
-    def off(R: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int64]) -> float:
+    def off(R: NDArray[np.float64], p: NDArray[np.float64], a: NDArray[np.int64], b: NDArray[np.int64]) -> float:
         """Median distance between what poses and edges say of a step, as a share of its length."""
         seen = np.einsum("nba,nb->na", R[a], p[b] - p[a])
         return float(np.median(np.linalg.norm(seen - t, axis=1))) / length
 
     R = _rotations(turn)
-    if not off(R, i, j) > _FAR:
+    as_read = off(R, p, i, j)
+    if not as_read > _FAR:
         return None
     other = _rotations(np.radians(turn) if graph.dimension == 2 else turn[:, [1, 2, 3, 0]])
+    back, ratio = R.transpose(0, 2, 1), float(np.median(np.linalg.norm(p[j] - p[i], axis=1))) / length
     ways = {
-        "angles are taken for degrees" if graph.dimension == 2 else "quaternions are taken for qw qx qy qz": off(other, i, j),
-        "edges are taken to lead from their second pose to their first": off(R, j, i),
+        "angles are taken for degrees" if graph.dimension == 2 else "quaternions are taken for qw qx qy qz": off(other, p, i, j),
+        "edges are taken to lead from their second pose to their first": off(R, p, j, i),
+        "poses are taken for those of the world in the body, and inverted": off(back, -np.einsum("nab,nb->na", back, p), i, j),
     }
+    if ratio > 0.0:
+        told = f"{ratio:.4g} times too large" if ratio > 1.0 else f"{1.0 / ratio:.4g} times too small"
+        ways[f"positions are taken for {told}, another unit than that of the edges"] = off(R, p / ratio, i, j)
     way = min(ways, key=lambda name: ways[name])
     if not ways[way] < _NEAR:
         return None
     return (
-        f"the poses of the file contradict its odometry by {off(R, i, j):.0%} of a step as they were read, and by "
+        f"the poses of the file contradict its odometry by {as_read:.0%} of a step as they were read, and by "
         f"{ways[way]:.1%} if {way}: correct the file"
     )
 

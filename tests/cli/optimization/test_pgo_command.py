@@ -218,7 +218,9 @@ def test_a_script_gets_json_or_silence(tmp_path: Path) -> None:
     silent = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report", "--quiet", "--overwrite")
     assert (silent.exit_code, silent.stdout, silent.stderr) == (0, "", "")
     stopped = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report", "-q", "--overwrite", "--max-iterations", "0")
-    assert stopped.stdout == "" and len(stopped.stderr.splitlines()) == 1  # why it stopped
+    why, doubt = stopped.stderr.splitlines()
+    assert (stopped.exit_code, stopped.stdout, why) == (3, "", "stopped: iteration limit of 0 reached")
+    assert doubt.startswith("not to be trusted: no minimum was reached (iteration limit of 0 reached): the cost of")
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,9 @@ def test_points_too_far_for_their_cameras_are_counted_and_named():
     points[far] = sightings.centers[:2].mean(axis=0) + 1e6 * sightings.R_camera_world[:2, 2].sum(axis=0)
     start = replace(start, image_of=start.image_of[keep], point_of=start.point_of[keep], pixels=pixels[keep], points=points)
     result = adjust_bundle(start)
-    assert result.depth.cameras_move_apart and result.doubt is None
+    assert result.depth.cameras_move_apart
+    # Such points creep on, and leave it short of the minimum after a hundred steps: 270.4, where 248.7 is reached after 237.
+    assert result.solution.limit == "steps" and result.doubt.startswith("no minimum was reached")
     assert set(result.depth.undetermined) <= set(far) and len(result.depth.undetermined) >= 5
     note = next(note for note in result.notes if note.startswith("the depth along the viewing ray is not determined"))
     assert f"for {len(result.depth.undetermined)} of 150 points" in note and "100" in note.split(":")[1]

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
+from boxplus.manifolds import quaternion, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.lens import lens_of_start
 from boxplus.systems.bundle_adjustment.sightings import Sightings
-from tests.systems.bundle_adjustment.scenes import note_of, turning
+from tests.small_problems import in_camera
+from tests.systems.bundle_adjustment.scenes import FOCAL, note_of, perturbed, turning
 
 
 @pytest.mark.parametrize("format", ["gbp", "colmap"])
@@ -78,3 +80,29 @@ def test_a_start_all_behind_its_cameras_tells_no_lens_and_warns_of_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert lens_of_start(behind, used, BundleAdjustmentConfig(), solved, Watch(None)) is None
+
+
+def _distorted(seed: int, k1: float, cameras: int = 2, points: int = 100) -> Reconstruction:
+    """Seen through a lens with radial distortion, and adjusted without: PINHOLE has none."""
+    rng = np.random.default_rng([seed, 7])
+    z = rng.uniform(4.0, 12.0, points)
+    p = np.column_stack([rng.uniform(-0.5, 0.5, (points, 2)) * z[:, None], z])
+    center = rng.normal(size=(cameras, 3)) * [1.0, 1.0, 0.3]
+    center /= np.linalg.norm(center, axis=1, keepdims=True)
+    R = so3.exp(rng.uniform(-0.15, 0.15, (cameras, 3)))
+    T = np.hstack([quaternion.from_matrix(R), -np.einsum("nij,nj->ni", R, center)])
+    camera_of, point_of = (grid.ravel() for grid in np.mgrid[:cameras, :points])
+    start = perturbed(rng, T, p, camera_of, point_of, "colmap", 0.005, 0.05)
+    seen = in_camera(T[camera_of], p[point_of])
+    x = seen[:, :2] / seen[:, 2:]
+    return replace(start, pixels=start.pixels + FOCAL * k1 * (x * x).sum(axis=1)[:, None] * x)
+
+
+@pytest.mark.parametrize("seed", range(1, 13, 2))
+def test_two_views_tell_distortion_that_their_camera_model_does_not_have(seed):
+    """They told it by focal length and principal point, which they hardly determine, or not at all."""
+    said = adjust_bundle(_distorted(seed, -0.2))
+    told = next(text for text in (said.doubt, *said.notes) if text and "other intrinsics than those held" in text)
+    assert "k1 = -0." in told and "OPENCV has all" in told
+    sound = adjust_bundle(_distorted(seed, 0.0))
+    assert sound.doubt is None and not any("other intrinsics" in note for note in sound.notes)

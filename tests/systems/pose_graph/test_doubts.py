@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from boxplus import InputError, PoseGraphConfig, optimize_pose_graph
+from boxplus.manifolds import se2, se3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.systems.pose_graph.readings import misreading
 
@@ -107,6 +109,10 @@ def test_a_file_that_means_something_else_than_it_was_read_as_is_told():
         (replace(space, poses=swapped[0], measurements=swapped[1]), "taken for qw qx qy qz"),
         (replace(plane, edges=plane.edges[:, ::-1]), "from their second pose to their first"),
         (replace(space, edges=space.edges[:, ::-1]), "from their second pose to their first"),
+        (replace(plane, poses=se2.inverse(plane.poses)), "taken for those of the world in the body"),
+        (replace(space, poses=se3.inverse(space.poses)), "taken for those of the world in the body"),
+        (replace(plane, poses=plane.poses * [1.0, 1e3, 1e3]), "positions are taken for 1000 times too large"),
+        (replace(space, poses=space.poses * np.repeat([1.0, 0.3048], [4, 3])), "positions are taken for 3.281 times too small"),
     )
     for graph, cause in cases:
         assert cause in optimize_pose_graph(graph).doubt
@@ -152,9 +158,23 @@ def test_what_the_information_leaves_open_is_told_in_every_start_mode(dimension,
     notes = [note for note in result.notes if "do not determine all poses" in note]
     assert notes and "the start decides" in notes[0]
     if kept == "rotation":
-        assert f"{dimension} of {graph.information.shape[1]} degrees of freedom of poses[1…59] are unconstrained" in notes[0]
+        which = ", ".join(f"translation {axis} [m]" for axis in "xyz"[:dimension])
+        assert f"{dimension} of {len(information[0])} degrees of freedom ({which}) of poses[1…59] are unconstrained" in notes[0]
     else:  # a step tells the heading of the pose it starts from: that of the last stays open in any case
-        assert any("of freedom of poses[59]" in note or "poses[59] can move" in note for note in notes)
+        assert any(re.search(r"of freedom( \(.*\))? of poses\[59\]|poses\[59\] can move", note) for note in notes)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_motion_that_mixes_turns_and_shifts_is_told_in_words_with_the_poses_it_moves(dimension):
+    graph = simulate_pose_graph(dimension=dimension, poses=200, seed=1).graph
+    information, split = graph.information.copy(), 3 if dimension == 3 else 1
+    information[:, :split] = information[:, :, :split] = 0.0
+    result = optimize_pose_graph(replace(graph, information=information, ids=graph.ids + 1000))
+    (told,) = [note for note in result.notes if "by turning and shifting together" in note][:1]
+    assert re.search(
+        r"where poses\[\d+\], which shifts most, shifts by 1 m, poses\[\d+\], which turns most, turns by \S+ deg", told
+    )
+    assert "(poses are counted from 0 in the order of the file: poses[0] has the id 1000)" in told
 
 
 def test_one_weak_edge_in_a_determined_graph_is_no_news():
