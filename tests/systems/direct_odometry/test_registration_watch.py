@@ -42,6 +42,17 @@ def test_registered_depths_are_not_contradicted(seed: int) -> None:
     assert contradiction(seed, 1, -1) == ""  # no closer than a sensor may put its edges
 
 
+@pytest.mark.parametrize("seed", [0, 1, 5, 28])
+def test_texture_that_happens_to_lie_along_edges_says_nothing(seed: int) -> None:
+    """Surfaces end where grey values do not change, and every keyframe sees the same: chance is not told by its scatter."""
+    rng, watch = np.random.default_rng(seed), RegistrationWatch()
+    (grey, _), (_, depth) = boxes(rng), boxes(rng)
+    for _ in range(8):
+        noise = rng.normal(0.0, 2.0, (2, *SHAPE))
+        watch.add(Image((grey + noise[0]).astype(np.float32)), (depth * (1.0 + 0.001 * noise[1])).astype(np.float32))
+    assert watch.contradiction == ""
+
+
 @pytest.mark.parametrize(("u", "v"), [(16, 0), (-8, 0), (0, 12), (-10, 6)])
 def test_a_shift_is_named(u: int, v: int) -> None:
     assert f"moved by {-u:+d} pixels along u and {-v:+d} along v" in contradiction(7, u, v)
