@@ -5,9 +5,9 @@ For every frame:
 1. **Track** it against the keyframe that sees most of the same, coarse to fine, from the motion so far going on and from
    standstill; where that fails, from half and double of it, small turns, and against the other keyframes.
 2. **Judge** the alignment: a pose that the images do not support is not a pose.
-3. Where the image moved far enough, or its brightness changed, it becomes a **keyframe**: with its depths it enters the window,
-   whose poses, brightness and inverse depths are adjusted together (`window.py`). Depths that no sensor measures come from
-   the motion (`depth_filter.py`); one camera alone waits for two views that tell them (`two_view_start.py`).
+3. Where it moved far, its brightness changed, or it fits much worse than others did, it becomes a **keyframe**: with its depths
+   it enters the window, whose poses, brightness and inverse depths are adjusted together (`window.py`). Depths that no sensor
+   measures come from the motion (`depth_filter.py`); one camera alone waits for two views that tell them.
 
 Source: Engel, Koltun and Cremers, Direct Sparse Odometry, TPAMI 2018; Kerl, Sturm and Cremers, Dense Visual SLAM for RGB-D
 Cameras, IROS 2013; docs/direct_odometry.md.
@@ -332,6 +332,9 @@ class DirectOdometry:
     def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe) -> bool:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
+        keyframe.least_sigma = min(keyframe.least_sigma, alignment.sigma)
+        if alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma:
+            return True
         return max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:

@@ -9,8 +9,8 @@ a tenth of the image:
 Registered depths have the peak of c at 0, others where they should be moved to. It is believed when edges of surfaces are
 clearly edges of the image there, much more so than at 0, keyframe after keyframe, and farther away than a sensor may put the
 edges of its depths. Keyframes that see the same agree about where texture happens to lie along edges as well; but then c has many
-such peaks, and the largest of them does not stand out from all other shifts. Surroundings without edges (a wall, sheets of metal all alike) say nothing. The normalisation by d + d₀ and
-|∇I| + m₀ keeps a few strong edges from deciding alone.
+such peaks, and the largest of them does not stand out from all other shifts. Surroundings without edges (a wall, sheets of metal
+all alike) say nothing. The normalisation by d + d₀ and |∇I| + m₀ keeps a few strong edges from deciding alone.
 """
 
 from __future__ import annotations
