@@ -37,7 +37,7 @@ from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import Motion, SensorWatch
+from boxplus.systems.direct_odometry.sensor_watches.sensor_watch import Motion, SensorWatch
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -333,9 +333,8 @@ class DirectOdometry:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
         keyframe.least_sigma = min(keyframe.least_sigma, alignment.sigma)
-        if alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma:
-            return True
-        return max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
+        fits_worse = alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
+        return fits_worse or max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
         """None where too little has a depth and a gradient."""

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.sensors.image import Image
-from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.sensor_watches.registration_watch import RegistrationWatch
 
 SHAPE = (240, 320)
 

@@ -13,11 +13,11 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import track
-from boxplus.systems.direct_odometry.calibration_causes import by_focal_length, by_readout, by_turn_of_second
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch, Depths
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
-from boxplus.systems.direct_odometry.leftover import Leftover
+from boxplus.systems.direct_odometry.sensor_watches.calibration_causes import by_focal_length, by_readout, by_turn_of_second
+from boxplus.systems.direct_odometry.sensor_watches.calibration_watch import CalibrationWatch, Depths
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Matrix, Room
 
 LENS = replace(CAMERA, distortion=RadialTangential(-0.28, 0.07, 1e-4, 2e-5))

@@ -16,9 +16,14 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.systems.direct_odometry.calibration_causes import by_focal_length, by_principal_point, by_readout, by_turn_of_second
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
-from boxplus.systems.direct_odometry.leftover import Combined, Leftover
+from boxplus.systems.direct_odometry.sensor_watches.calibration_causes import (
+    by_focal_length,
+    by_principal_point,
+    by_readout,
+    by_turn_of_second,
+)
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Combined, Leftover
 
 Matrix = NDArray[np.float64]
 Depths = Literal["sensed", "stereo", "motion"]
