@@ -32,6 +32,9 @@ class DirectOdometryConfig(Settings):
     keyframe_overlap: float = Field(
         default=0.7, gt=0.2, lt=1.0, description="share of a keyframe's pixels seen below which another is asked for"
     )
+    keyframe_residual: float = Field(
+        default=2.0, gt=1.0, description="residual that asks for a keyframe, by the least of the frames aligned to the one before"
+    )
     depth_noise: tuple[float, float, float] = Field(
         default=(0.0012, 0.0019, 0.4),
         description="σ_z = a + b (z − c)² of measured depths [m], above c; by default that of structured light",

@@ -5,9 +5,9 @@ For every frame:
 1. **Track** it against the keyframe that sees most of the same, coarse to fine, from the motion so far going on and from
    standstill; where that fails, from half and double of it, small turns, and against the other keyframes.
 2. **Judge** the alignment: a pose that the images do not support is not a pose.
-3. Where the image moved far enough, or its brightness changed, it becomes a **keyframe**: with its depths it enters the window,
-   whose poses, brightness and inverse depths are adjusted together (`window.py`). Depths that no sensor measures come from
-   the motion (`depth_filter.py`); one camera alone waits for two views that tell them (`two_view_start.py`).
+3. Where it moved far, its brightness changed, or it fits much worse than others did, it becomes a **keyframe**: with its depths
+   it enters the window, whose poses, brightness and inverse depths are adjusted together (`window.py`). Depths that no sensor
+   measures come from the motion (`depth_filter.py`); one camera alone waits for two views that tell them.
 
 Source: Engel, Koltun and Cremers, Direct Sparse Odometry, TPAMI 2018; Kerl, Sturm and Cremers, Dense Visual SLAM for RGB-D
 Cameras, IROS 2013; docs/direct_odometry.md.
@@ -37,7 +37,7 @@ from boxplus.systems.direct_odometry.frame_order import FrameOrder
 from boxplus.systems.direct_odometry.image_motion import image_motion, keyframe_distance
 from boxplus.systems.direct_odometry.patches import choose_patches
 from boxplus.systems.direct_odometry.search_starts import starts_around
-from boxplus.systems.direct_odometry.sensor_watch import Motion, SensorWatch
+from boxplus.systems.direct_odometry.sensor_watches.sensor_watch import Motion, SensorWatch
 from boxplus.systems.direct_odometry.two_view_start import TwoViews, TwoViewStart
 from boxplus.systems.direct_odometry.verdict import Tracked, Verdict, Watch
 from boxplus.systems.direct_odometry.window import Window
@@ -332,7 +332,9 @@ class DirectOdometry:
     def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe) -> bool:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
-        return max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
+        keyframe.least_sigma = min(keyframe.least_sigma, alignment.sigma)
+        fits_worse = alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
+        return fits_worse or max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
         """None where too little has a depth and a gradient."""

@@ -31,6 +31,7 @@ class WindowKeyframe:
         T_world_camera: (7,); log_gain: a, of its brightness.
         tracker: what images are tracked against; patches: what the window adjusts.
         first: first estimates of pose and a, from when on a prior knows it.
+        least_sigma: of the frames that were aligned to it so far [grey values].
     """
 
     number: int
@@ -41,6 +42,7 @@ class WindowKeyframe:
     tracker: Keyframe
     patches: Patches
     first: tuple[Matrix, float] | None = None
+    least_sigma: float = np.inf
 
     @property
     def first_pose(self) -> Matrix:

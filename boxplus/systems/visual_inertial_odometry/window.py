@@ -222,8 +222,9 @@ class Window:
         last = next(frame for frame in reversed(self.frames) if frame.is_keyframe)
         if tracks.time_ns - last.time_ns > self._config.keyframe_interval * 1e9:
             return True
-        known = np.isin(tracks.ids, self._track)
-        if known.sum() < self._config.keyframe_tracked * self._founded:
+        # One camera that has not moved yet knows no landmark: then corners that are lost have to be replaced as well.
+        known, founded = (self._track, self._founded) if self._founded else (last.tracks.ids, len(last.tracks))
+        if np.isin(tracks.ids, known).sum() < self._config.keyframe_tracked * founded:
             return True
         poses = self.bodies.values[self._row(last.number)], pose
         return mean_parallax(last.tracks, tracks, *poses, self._rig.cameras[0]) > self._config.keyframe_parallax

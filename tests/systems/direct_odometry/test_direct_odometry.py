@@ -221,6 +221,23 @@ def test_stereo_poses_are_metric() -> None:
     assert metres < 0.03
 
 
+def test_a_frame_that_fits_much_worse_than_others_becomes_a_keyframe() -> None:
+    """Depths of a short base are coarse: the farther the camera goes, the worse the keyframe fits, until it is lost."""
+    room, T_right_left = Room(0), np.array([1.0, 0.0, 0.0, 0.0, -0.03, 0.0, 0.0])
+    rng, odometry = np.random.default_rng(0), DirectOdometry(CAMERA, stereo=StereoPair(CAMERA, T_right_left))
+    best: dict[int, float] = {}
+    for k in range(12):
+        T = se3.exp([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+        T[4:] = [0.05 * k - 0.6, 0.0, -0.8]
+        left, right = (
+            room.render(pose)[0] + rng.normal(0.0, 1.0, SHAPE) for pose in (T, se3.compose(T, se3.inverse(T_right_left)))
+        )
+        estimate = odometry.push_stereo(33_000_000 * k, left, right)
+        if k:
+            best[estimate.keyframe] = min(best.get(estimate.keyframe, np.inf), estimate.sigma)
+            assert estimate.is_keyframe or estimate.sigma <= 2.0 * best[estimate.keyframe]
+
+
 def test_wrong_input_is_refused() -> None:
     seen = drive(50, 2)
     odometry = DirectOdometry(CAMERA)

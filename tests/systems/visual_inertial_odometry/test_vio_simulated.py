@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -110,6 +112,18 @@ def test_one_camera_is_enough_once_the_scale_was_found(flown) -> None:
     known = [e for e in estimates if e.status != "starting"]
     error, covariance = position_and_yaw_error(flight, known[0], known[-1])
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all() and np.linalg.norm(error[1:]) < 0.2
+
+
+def test_one_camera_that_knows_no_depth_yet_replaces_corners_that_are_lost() -> None:
+    """While it rests it has no landmark whose loss could ask for a keyframe; before that, a change of light left it blind."""
+    vio, estimates = run(Flight(3, 1.5), rig(1), CONFIG)
+    newest = vio.window.frames[-1]
+    assert estimates[-1].status != "starting" and not len(vio.window.points)
+    pose, count = vio.window.bodies.values[-1], len(newest.tracks)
+    few = replace(
+        newest.tracks, **{name: getattr(newest.tracks, name)[: count // 2] for name in ("ids", "pixels", "rays", "is_new")}
+    )
+    assert vio.window.wants_keyframe(few, pose) and not vio.window.wants_keyframe(newest.tracks, pose)
 
 
 def test_a_dark_while_is_weak_then_lost_and_the_map_frame_is_kept() -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.systems.direct_alignment.keyframe import Keyframe
-from boxplus.systems.direct_odometry.leftover import Combined, Leftover
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Combined, Leftover
 
 Matrix = NDArray[np.float64]
 _LEAST_SIGMAS = 6.0  # for a contradiction

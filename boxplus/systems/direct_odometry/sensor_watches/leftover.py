@@ -7,10 +7,18 @@ At a frame that was tracked, e = I₁(p₁) − (eᵃ I₂(p₂) + b) with p₂ 
 
 The pose takes what it can; what is left says q, with the covariance of the scatter between cells of the image (see
 `tracking.py`). Frames are combined by their information, and the standard deviation grows by how much they disagree.
+
+Where inverse depths err pixel by pixel, x = −(JᵀWJ)⁻¹ JᵀWe is biased however many pixels there are: errors of ρ are in e and in J
+alike, so that lengths come out too short by the share of the errors in how much ρ varies, and a cause that moves all pixels alike
+takes the rest. Instruments Z, the columns of J by a smooth surface through the ρ of all pixels, vary with them and know no single
+one: x = −(ZᵀWJ)⁻¹ ZᵀWe.
+
+Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, chapter 6.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,6 +36,7 @@ _CUT = 4.685  # of Tukey's weights, in σ
 _CELLS = 6  # across and down
 _NOTHING = 1e-6  # information of what no frame was asked for
 _CONDITION = 1e10  # of the normal equations, from which on a frame says nothing
+_DEGREE, _LEAST_SMOOTH = 3, 0.05  # of the polynomial that smooths inverse depths; by their median, which it stays above
 
 
 class Leftover:
@@ -50,13 +59,10 @@ class Leftover:
 
     def __init__(self, keyframe: WindowKeyframe, image: NDArray[np.float32], alignment: Alignment) -> None:
         level, camera = keyframe.tracker.levels[-1], keyframe.tracker.camera
-        self.inverse_depth, self.pixels = level.inverse_depth, level.pixels
+        self.pixels, self._camera, self._sigma = level.pixels, camera, alignment.sigma
         self._R, self._t = quaternion.to_matrix(alignment.T_21[:4]), alignment.T_21[4:]
         self.m = np.column_stack([level.rays, np.ones(len(level.rays))])
-        self.Y = self.m @ self._R.T + level.inverse_depth[:, None] * self._t
-        projected, by_point, _, is_ahead = camera.project_with_jacobians(self.Y)
-        self.seen_at = np.where(is_ahead[:, None], projected, -1.0)
-        self._P, self._sigma = np.nan_to_num(by_point), alignment.sigma
+        self._place(level.inverse_depth)
         value, _, seen = sample(image, self.seen_at)
         gain, offset = np.exp(alignment.brightness[0]), alignment.brightness[1]
         self._e = np.where(seen, level.grey - gain * value - offset, 0.0)
@@ -68,9 +74,31 @@ class Leftover:
         self._weight = weight * inside
         u, v = np.clip(u, 1, width - 2), np.clip(v, 1, height - 2)
         self._slope = 0.5 * np.stack([grey[v, u + 1] - grey[v, u - 1], grey[v + 1, u] - grey[v - 1, u]], axis=1)
-        self._estimated = np.column_stack([level.J, level.grey, np.ones(len(level.rays))])
+        self._by_motion, self._by_light = level.J, np.column_stack([level.grey, np.ones(len(level.rays))])
         self._cell = (level.pixels[:, 1] * _CELLS / height).astype(np.int64) * _CELLS
         self._cell += (level.pixels[:, 0] * _CELLS / width).astype(np.int64)
+
+    def _place(self, inverse_depth: Matrix) -> None:
+        """Where pixels with these inverse depths (n,) are in the frame."""
+        self.inverse_depth = inverse_depth
+        self.Y = self.m @ self._R.T + inverse_depth[:, None] * self._t
+        projected, by_point, _, is_ahead = self._camera.project_with_jacobians(self.Y)
+        self.seen_at = np.where(is_ahead[:, None], projected, -1.0)
+        self._P = np.nan_to_num(by_point)
+
+    def smoothed(self) -> Leftover:
+        """The same with inverse depths of a smooth surface through all of them, which the error of a single one hardly moves."""
+        low, high = self.pixels.min(axis=0), self.pixels.max(axis=0)
+        u, v = (2.0 * (self.pixels - low) / np.maximum(high - low, 1.0) - 1.0).T
+        powers = np.stack([u**i * v**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1)
+        root = np.sqrt(self._weight)
+        coefficients = np.linalg.lstsq(powers * root[:, None], self.inverse_depth * root, rcond=None)[0]
+        smooth = np.maximum(powers @ coefficients, _LEAST_SMOOTH * float(np.median(self.inverse_depth)))
+        other = copy.copy(self)
+        other._place(smooth)
+        other._by_motion = self._by_motion.copy()
+        other._by_motion[:, 3:] *= (smooth / self.inverse_depth)[:, None]
+        return other
 
     def turned(self, d: Matrix) -> Matrix:
         """P_Y R d (n, 2) [pixels], P_Y = ∂π/∂Y, for d (n, 3)."""
@@ -90,21 +118,29 @@ class Leftover:
         by_depth = (self._slope * self.by_inverse_depth).sum(axis=1) * self.inverse_depth * error
         return np.asarray(self._sigma**2 / (self._sigma**2 + by_depth**2))
 
-    def explained_by(self, motions: list[Matrix], share: Matrix | None = None) -> tuple[Matrix, Matrix] | None:
+    def columns(self, motions: list[Matrix]) -> Matrix:
+        """J (n, 8 + k) of e by ξ, light and k causes that move pixels by `motions`, ∂p₂/∂q, (n, 2) for each of q [pixels]."""
+        causes = np.stack([-(self._slope * motion).sum(axis=1) for motion in motions], axis=1)
+        return np.column_stack([self._by_motion, self._by_light, causes])
+
+    def explained_by(
+        self, motions: list[Matrix], share: Matrix | None = None, instruments: Matrix | None = None
+    ) -> tuple[Matrix, Matrix] | None:
         """q (k,) and its covariance (k, k); None where the frame does not say it.
 
         Args:
-            motions: ∂p₂/∂q, (n, 2) for each of q [pixels].
+            motions: as in `columns`.
             share: (n,) of each pixel that counts; all by default.
+            instruments: Z (n, 8 + k), `columns` that errors of the inverse depths are not in; J by default.
         """
         weight = self._weight if share is None else self._weight * share
-        causes = np.stack([-(self._slope * motion).sum(axis=1) for motion in motions], axis=1)
-        J = np.column_stack([self._estimated, causes])
+        J = self.columns(motions)
         scale = 1.0 / np.sqrt(np.maximum((weight[:, None] * J**2).sum(axis=0), 1e-300))
+        Z = (J if instruments is None else instruments) * scale
         J = J * scale
-        rows = weight[:, None] * J
+        rows = weight[:, None] * Z
         H, g = rows.T @ J, rows.T @ self._e
-        if np.linalg.cond(H) > _CONDITION:
+        if not np.linalg.cond(H) <= _CONDITION:
             return None
         inverse = np.linalg.inv(H)
         x = -inverse @ g
@@ -112,7 +148,7 @@ class Leftover:
         scores = np.zeros((_CELLS * _CELLS, J.shape[1]))
         np.add.at(scores, self._cell, rows * left[:, None])
         factor = _CELLS**2 / (_CELLS**2 - J.shape[1])
-        covariance = factor * (inverse @ (scores.T @ scores) @ inverse) * scale[:, None] * scale
+        covariance = factor * (inverse @ (scores.T @ scores) @ inverse.T) * scale[:, None] * scale
         k = len(motions)
         return (x * scale)[-k:], covariance[-k:, -k:]
 

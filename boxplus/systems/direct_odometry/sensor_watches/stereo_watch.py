@@ -25,7 +25,7 @@ from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.camera.photometric_sampling import sample
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
-from boxplus.systems.direct_odometry.leftover import Combined
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Combined
 
 Matrix = NDArray[np.float64]
 _PATCH = np.array([(u, v) for u in range(-2, 3) for v in range(-2, 3) if abs(u) + abs(v) <= 2], np.int64)

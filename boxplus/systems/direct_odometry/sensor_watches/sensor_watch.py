@@ -12,12 +12,12 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch, Depths
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
-from boxplus.systems.direct_odometry.depth_watch import DepthWatch, Surfaces
-from boxplus.systems.direct_odometry.leftover import Leftover
-from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
-from boxplus.systems.direct_odometry.stereo_watch import StereoWatch
+from boxplus.systems.direct_odometry.sensor_watches.calibration_watch import CalibrationWatch, Depths
+from boxplus.systems.direct_odometry.sensor_watches.depth_watch import DepthWatch, Surfaces
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
+from boxplus.systems.direct_odometry.sensor_watches.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.sensor_watches.stereo_watch import StereoWatch
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.sensors.image import Image
-from boxplus.systems.direct_odometry.registration_watch import RegistrationWatch
+from boxplus.systems.direct_odometry.sensor_watches.registration_watch import RegistrationWatch
 
 SHAPE = (240, 320)
 
@@ -40,6 +40,17 @@ def contradiction(seed: int, u: int, v: int, keyframes: int = 8) -> str:
 def test_registered_depths_are_not_contradicted(seed: int) -> None:
     assert contradiction(seed, 0, 0) == ""
     assert contradiction(seed, 1, -1) == ""  # no closer than a sensor may put its edges
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5, 28])
+def test_texture_that_happens_to_lie_along_edges_says_nothing(seed: int) -> None:
+    """Surfaces end where grey values do not change, and every keyframe sees the same: chance is not told by its scatter."""
+    rng, watch = np.random.default_rng(seed), RegistrationWatch()
+    (grey, _), (_, depth) = boxes(rng), boxes(rng)
+    for _ in range(8):
+        noise = rng.normal(0.0, 2.0, (2, *SHAPE))
+        watch.add(Image((grey + noise[0]).astype(np.float32)), (depth * (1.0 + 0.001 * noise[1])).astype(np.float32))
+    assert watch.contradiction == ""
 
 
 @pytest.mark.parametrize(("u", "v"), [(16, 0), (-8, 0), (0, 12), (-10, 6)])

@@ -13,11 +13,11 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import track
-from boxplus.systems.direct_odometry.calibration_causes import by_focal_length, by_readout, by_turn_of_second
-from boxplus.systems.direct_odometry.calibration_watch import CalibrationWatch, Depths
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
-from boxplus.systems.direct_odometry.leftover import Leftover
+from boxplus.systems.direct_odometry.sensor_watches.calibration_causes import by_focal_length, by_readout, by_turn_of_second
+from boxplus.systems.direct_odometry.sensor_watches.calibration_watch import CalibrationWatch, Depths
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Matrix, Room
 
 LENS = replace(CAMERA, distortion=RadialTangential(-0.28, 0.07, 1e-4, 2e-5))
@@ -47,12 +47,17 @@ def watched(
     turn: float = 0.0,
     readout_s: float = 0.0,
     knows_velocities: bool = True,
+    yaw: float = 0.0,
 ) -> CalibrationWatch:
-    """Eight frames turned by up to ten degrees, each tracked against a first one with this camera, drawn with the true one."""
+    """Eight frames turned by up to ten degrees, each tracked against a first one with this camera, drawn with the true one.
+
+    Args:
+        yaw: of the first frame [rad]; 0 faces a wall, 0.7 a corner of the room.
+    """
     rng, of_motion, room = np.random.default_rng(seed), np.random.default_rng([seed, 1]), Room(seed)
     T_stated = se3.compose(se3.exp([0.0, turn, 0.0, 0.0, 0.0, 0.0]), LEFT_RIGHT)
     stereo = StereoPair(stated, T_stated) if depths == "stereo" else None
-    watch, odometry, start = CalibrationWatch(depths, stereo), DirectOdometry(stated), se3.SE3.identity()
+    watch, odometry, start = CalibrationWatch(depths, stereo), DirectOdometry(stated), se3.exp([0.0, yaw, 0.0, 0.0, 0.0, 0.0])
 
     def noisy(grey: Matrix) -> Image:
         return Image.from_array(grey + rng.normal(0.0, 1.5, SHAPE))
@@ -61,14 +66,15 @@ def watched(
         w, v = rng.normal(size=(2, 3))
         velocities = tuple(of_motion.normal(size=6) * ([0.6] * 3 + [0.3] * 3) for _ in range(2))
         T = se3.exp(np.concatenate([np.radians(7.0) * w / np.linalg.norm(w), 0.1 * v / np.linalg.norm(v)]))
-        (one, z), (two, _) = room.render(start, true), room.render(T, true)
+        there = se3.compose(start, T)
+        (one, z), (two, _) = room.render(start, true), room.render(there, true)
         if readout_s:
-            one, two = rolled(room, start, velocities[0], readout_s), rolled(room, T, velocities[1], readout_s)
+            one, two = rolled(room, start, velocities[0], readout_s), rolled(room, there, velocities[1], readout_s)
         first, second = noisy(one), noisy(two)
         if stereo is None:
             sensed = rgbd_depth(z, first, (0.001, 0.002, 0.4))
         else:
-            sensed = stereo.depth(first, noisy(room.render(se3.inverse(LEFT_RIGHT), true)[0]), stated)
+            sensed = stereo.depth(first, noisy(room.render(se3.compose(start, se3.inverse(LEFT_RIGHT)), true)[0]), stated)
         if depths == "motion":
             sensed = SensedDepth(sensed.z * rng.normal(1.0, 0.05), sensed.sigma, np.zeros_like(sensed.is_measured))
         keyframe = odometry._keyframe(0, first, sensed, start, 0.0)
@@ -97,8 +103,9 @@ def test_wrong_focal_length_and_principal_point_are(seed: int) -> None:
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("depths", ["stereo", "motion"])
 def test_wrong_focal_lengths_are_whatever_tells_the_depths(seed: int, camera: Pinhole, depths: Depths) -> None:
-    said = watched(longer(camera, 1.12), seed, true=camera, depths=depths).contradiction
-    assert "contradict the focal length: they ask for -" in said
+    for factor, sense in ((1.12, "-"), (1.0 / 1.12, "+")):
+        said = watched(longer(camera, factor), seed, true=camera, depths=depths, yaw=0.7).contradiction
+        assert f"contradict the focal length: they ask for {sense}" in said
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -117,6 +124,17 @@ def test_a_second_camera_that_turned_in_the_plane_of_the_baseline_is_named(seed:
     assert "in the plane of the baseline" in watch.contradiction and watch.remark == ""
     q, _ = watch._found.estimate()
     assert turn < q[1] < 0.5 * turn
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_turns_of_both_senses_are_told_alike(seed: int) -> None:
+    """Depths of a wall vary less than they err, which is no reason for a turn: 0.1 and 0.15 degrees of it without instruments."""
+    turn = np.radians(0.3)
+    (to, *_), (fro, *_) = (
+        watched(CAMERA, seed, depths="stereo", turn=sense * turn)._found.estimate()[0][1:] for sense in (1.0, -1.0)
+    )
+    assert 0.4 * turn < to < turn and -turn < fro < -0.4 * turn
+    assert abs(to + fro) / 2.0 < np.radians(0.05)
 
 
 def test_a_second_camera_without_its_depths_is_refused() -> None:

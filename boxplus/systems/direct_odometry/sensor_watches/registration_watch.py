@@ -8,8 +8,9 @@ a tenth of the image:
 
 Registered depths have the peak of c at 0, others where they should be moved to. It is believed when edges of surfaces are
 clearly edges of the image there, much more so than at 0, keyframe after keyframe, and farther away than a sensor may put the
-edges of its depths. Surroundings without edges (a wall, sheets of metal all alike) say nothing. The normalisation by d + d₀ and
-|∇I| + m₀ keeps a few strong edges from deciding alone.
+edges of its depths. Keyframes that see the same agree about where texture happens to lie along edges as well; but then c has many
+such peaks, and the largest of them does not stand out from all other shifts. Surroundings without edges (a wall, sheets of metal
+all alike) say nothing. The normalisation by d + d₀ and |∇I| + m₀ keeps a few strong edges from deciding alone.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ _LEAST_SHIFT = 2  # pixels of the octave; sensors put the edges of their depths 
 _LEAST_HEIGHT = 0.04  # of the peak, by the largest that c can be
 _LEAST_DROP = 0.3  # of it to c at no shift, by the peak
 _LEAST_RISE = 5.0  # standard deviations of that, over keyframes
+_LEAST_LEAD = 4.5  # standard deviations of c over the shifts by which the peak stands out from them
+_OF_PEAK = 4  # pixels of the octave around the peak that are of it
 
 
 class RegistrationWatch:
@@ -69,13 +72,20 @@ class RegistrationWatch:
         rise = float(drops.mean() / max(drops.std(ddof=1) / np.sqrt(len(each)), 1e-12))
         is_clear = mean[row, column] > _LEAST_HEIGHT and drops.mean() > _LEAST_DROP * mean[row, column] and rise > _LEAST_RISE
         is_border = max(abs(u), abs(v)) == reach  # the peak may lie beyond
-        if not is_clear or is_border or max(abs(u), abs(v)) < _LEAST_SHIFT:
+        if not is_clear or is_border or max(abs(u), abs(v)) < _LEAST_SHIFT or _lead(mean, row, column) < _LEAST_LEAD:
             return ""
         return (
             "depths lie on other pixels than their grey values: edges of surfaces agree with edges of the image when depths are "
             f"moved by {u * self._octave_px:+d} pixels along u and {v * self._octave_px:+d} along v ({rise:.0f} standard "
             f"deviations better than as they are, over {len(each)} keyframes); register the depth to the images"
         )
+
+
+def _lead(mean: Matrix, row: int, column: int) -> float:
+    """By how many of its standard deviations over all other shifts c is larger at its peak than there."""
+    rows, columns = np.ogrid[: mean.shape[0], : mean.shape[1]]
+    others = mean[np.maximum(np.abs(rows - row), np.abs(columns - column)) > _OF_PEAK]
+    return float((mean[row, column] - others.mean()) / max(others.std(), 1e-12))
 
 
 def _surface(grey: Matrix, rho: Matrix) -> Matrix | None:

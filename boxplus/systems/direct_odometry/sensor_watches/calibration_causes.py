@@ -27,7 +27,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
-from boxplus.systems.direct_odometry.leftover import Leftover
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
 
 Matrix = NDArray[np.float64]
 

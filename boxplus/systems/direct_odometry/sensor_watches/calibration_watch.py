@@ -2,8 +2,9 @@
 
 What is asked for depends on where depths come from (`calibration_causes.py`). Depths of a sensor do not change with the
 intrinsics. Those of a stereo pair do, with the focal lengths of both cameras, and with a turn of the second one as well, which
-puts all disparities off alike. Depths by the motion follow the intrinsics in a way of their own: they are taken for known to a
-fifth only, so that pixels count whose gradient runs across where the depth moves them.
+puts all disparities off alike; as they err pixel by pixel, a smooth surface through them gives instruments (`leftover.py`).
+Depths by the motion follow the intrinsics in a way of their own: they are taken for known to a fifth only, so that pixels count
+whose gradient runs across where the depth moves them.
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.systems.direct_odometry.calibration_causes import by_focal_length, by_principal_point, by_readout, by_turn_of_second
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
-from boxplus.systems.direct_odometry.leftover import Combined, Leftover
+from boxplus.systems.direct_odometry.sensor_watches.calibration_causes import (
+    by_focal_length,
+    by_principal_point,
+    by_readout,
+    by_turn_of_second,
+)
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Combined, Leftover
 
 Matrix = NDArray[np.float64]
 Depths = Literal["sensed", "stereo", "motion"]
@@ -33,7 +39,7 @@ _LEAST: dict[Cause, float] = {
     "focal length": 0.02,
     "along u": 0.02,
     "along v": 0.02,
-    "turn of the second camera": 0.01,  # sound stereo pairs come to 0.006, and twice that is told as half of it
+    "turn of the second camera": 0.004,
     "readout": 0.006,
 }
 """Smaller errors than these do not need to be told: shares of the focal length, radians, seconds."""
@@ -81,7 +87,14 @@ class CalibrationWatch:
             moved = self._moved(cause, leftover, camera, height, velocities)
             if moved is not None and _LEAST[cause] * np.sqrt(np.mean(moved**2)) > _SHOWN_PX:
                 asked[k] = moved
-        found = leftover.explained_by(list(asked.values()), share) if asked else None
+        if not asked:
+            return
+        instruments = None
+        if self._stereo is not None:
+            smooth = leftover.smoothed()
+            of_smooth = [self._moved(self._causes[k], smooth, camera, height, velocities) for k in asked]
+            instruments = smooth.columns([moved for moved in of_smooth if moved is not None])
+        found = leftover.explained_by(list(asked.values()), share, instruments)
         if found is not None:
             self._found.add(*found, list(asked))
 

@@ -13,9 +13,9 @@ from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import track
 from boxplus.systems.direct_odometry.depth.sensed_depth import rgbd_depth
-from boxplus.systems.direct_odometry.depth_watch import DepthWatch, Surfaces
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
-from boxplus.systems.direct_odometry.leftover import Leftover
+from boxplus.systems.direct_odometry.sensor_watches.depth_watch import DepthWatch, Surfaces
+from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 Depth = NDArray[np.float64]

@@ -12,7 +12,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
 from boxplus.sensors.image import Image
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
-from boxplus.systems.direct_odometry.stereo_watch import StereoWatch
+from boxplus.systems.direct_odometry.sensor_watches.stereo_watch import StereoWatch
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 
 T_RIGHT_LEFT = np.array([1.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0])

@@ -1,0 +1,1 @@
+"""Whether grey values, depths and the calibration of direct odometry agree: what the frames so far contradict."""
