@@ -193,7 +193,7 @@ def _judged(
         )
     used = found.is_used
     doubts = [
-        _heights(graph, attached, p_enu, lever, height_drift, config),
+        _heights(graph, attached, p_enu, lever, height_drift, found, config),
         _other_antenna(graph, attached, p_enu, T_enu_map, start, found, lever, config),
     ]
     warnings = warnings + [text for text in doubts if text is not None]
@@ -212,12 +212,20 @@ def _judged(
 
 
 def _heights(
-    graph: MapGraph, attached: AttachedFixes, p_enu: Floats, lever: Floats | None, drift: Floats, config: GeoreferenceConfig
+    graph: MapGraph,
+    attached: AttachedFixes,
+    p_enu: Floats,
+    lever: Floats | None,
+    drift: Floats,
+    found: Fit,
+    config: GeoreferenceConfig,
 ) -> str | None:
     """What is wrong with the heights of the fixes."""
     p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
     seconds = float(attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
-    climb = climb_of(p_level, p_enu[:, 2], drift[attached.map_of], seconds, config.correlation)
+    off = np.linalg.norm(found.errors[found.is_used, :2], axis=1) / (math.sqrt(2.0) * attached.sigma[found.is_used])
+    noise = float(np.median(np.sqrt(attached.covariance[:, 2, 2]))) * max(1.0, float(np.sqrt((off**2).mean())))
+    climb = climb_of(p_level, p_enu[:, 2], drift[attached.map_of], noise, seconds, config.correlation)
     return None if climb is None else climb.doubt
 
 

@@ -285,6 +285,20 @@ def test_heights_that_do_not_go_along_are_named_where_the_way_climbs(climbs: boo
     assert all(says is not None and says in text for text in said)
 
 
+@pytest.mark.parametrize("feet", [True, False])
+def test_feet_over_low_hills_are_told_by_the_noise_that_is_stated(feet: bool) -> None:
+    """Errors that stay for a minute leave the ratio to three of its standard deviations; in metres they scatter as stated."""
+    there = drive(HILLS * [1.0, 1.0, 0.75], seed=2)
+    usual = GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.5, "claimed": 0.7})
+    for seed in (1, 2, 3):
+        fixes = there.fixes(usual, seed)
+        lla = fixes.lat_lon_alt.copy()
+        lla[:, 2] /= 0.3048 if feet else 1.0
+        given = replace(fixes, lat_lon_alt=lla)
+        result = georeference(there.graph, given, there.time_ns, there.T_odo_imu, None, np.array(LEVER))
+        assert any("they are in feet" in text for text in result.warnings) is feet, result.warnings
+
+
 def test_a_lever_arm_with_the_wrong_sign_is_named(laps: Drive) -> None:
     precise = GOOD.model_copy(update={"sigma": 0.02, "slow_sigma": 0.0, "claimed": 0.02})
     wrong = found(laps, precise, lever=(-LEVER[0], -LEVER[1], LEVER[2]))
