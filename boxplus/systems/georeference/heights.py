@@ -7,8 +7,8 @@ Up to a constant, which no comparison shows, and a tilt of the odometry's world,
 b is 1. Where the way is level b is not known, and nothing is claimed.
 
 How well b is known is told by what the ratio leaves, which counts as few errors as stay for long within a recording: on a short
-way over low hills that is not enough for feet of a usual receiver. But in another unit its noise grows as the hills do. Read in the
-right one, the heights then scatter as the receiver states, and as its places do; as they are, several times as much.
+way over low hills that is not enough for feet of a usual receiver. But in another unit its noise grows as the hills do. Read in
+the right one, the heights then scatter as the receiver states, and as its places do; as they are, several times as much.
 """
 
 from __future__ import annotations
@@ -64,9 +64,7 @@ class Climb:
         )
 
 
-def climb_of(
-    p_level: Floats, up: Floats, drift: Floats, noise: float, seconds: float, correlation: float
-) -> Climb | None:
+def climb_of(p_level: Floats, up: Floats, drift: Floats, noise: float, seconds: float, correlation: float) -> Climb | None:
     """The ratio of the heights; None where the way is level, or a plane.
 
     Args:
