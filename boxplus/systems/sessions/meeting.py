@@ -44,6 +44,7 @@ from boxplus.systems.slam.verification import verify
 
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _SIGMAS_OF_REACH = 7.0  # standard deviations of the position of a proposal that make up the reach in which rivals are tried
+_CLEAR = 0.35  # lead over other alignments up to which two of a kind cannot be excluded: warehouses with other pallets reach 0.23
 _TILT, _YAW = 0.03, 0.1  # rad, of a proposal
 _RIVAL_AGREEMENT = 0.6  # of density images, for a rival that is turned
 _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
@@ -132,13 +133,21 @@ class _Meeting:
             why = f"what stands lies {100.0 * lead.share:.0f} % nearer to surfaces of the other than {lead.over or 'anywhere'}"
             why = f"two places of a kind, perhaps: {why}, {100.0 * asked:.0f} % are asked for"
             return self._refused(why, predicted, confirmed, share)
+        doubt = None
+        if lead.over is not None and lead.share < _CLEAR:
+            doubt = (
+                f"are at the same place or at two of a kind: what stands lies only {100.0 * lead.share:.0f} % nearer to surfaces "
+                f"of the other than {lead.over}"
+            )
         against = "contradicts the encounters that agree with each other"
         final = [
             loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)
             for loop in self.loops.values()
         ]
         final = [replace(loop, weight=float(loop.refusal is None)) for loop in final]
-        return Meeting(*self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share)
+        return Meeting(
+            *self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share, doubt=doubt
+        )
 
     def _refused(self, why: str, predicted: int = 0, confirmed: int = 0, standing: float = math.nan) -> Meeting:
         return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)

@@ -43,7 +43,7 @@ def upright_where_seen(
     q = se3.act(T_there_own, points.astype(np.float64)).reshape(-1, 3)
     points = points[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)]
     is_level = np.abs(plane_normals(points, own, config)[:, 2]) > _LEVEL
-    return points[_above_ground(points) & ~is_level]
+    return np.asarray(points[_above_ground(points) & ~is_level])
 
 
 def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:

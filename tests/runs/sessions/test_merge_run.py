@@ -23,6 +23,7 @@ from boxplus.manifolds import se3
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig
+from boxplus.runs.sessions.joined import merge_facts
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.sessions.update_run import update_map
@@ -228,6 +229,14 @@ def test_scans_that_are_not_all_there_are_no_smaller_map(
     summary.model_copy(update={"spool_bytes": size + 1000}).write(cut / "run.json")
     with pytest.raises(InputError, match=f"expected the {size + 1000} bytes of .*scans.spool – got {size}: it was cut"):
         update_map(merged[0], [cut])
+
+
+def test_what_may_be_two_places_of_a_kind_is_joined_with_a_warning(merged: tuple[Path, MergeResult]) -> None:
+    alignment = merged[1].alignment
+    meetings = [replace(m, doubt="are at two places, perhaps") for m in alignment.meetings]
+    told = merge_facts(replace(alignment, meetings=meetings), ["a", "b", "c"], [None] * 3).warnings
+    assert told == ["friday and monday are at two places, perhaps; look at the map before you trust it"]
+    assert merge_facts(alignment, ["a", "b", "c"], [None] * 3).warnings == []
 
 
 def test_an_update_goes_on_with_a_map(

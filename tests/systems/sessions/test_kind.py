@@ -16,7 +16,7 @@ NEXT_BAY = HERE + np.array([0.0, 0.0, 0.0, 0.0, BAY, 0.0, 0.0])
 
 
 def aisle(seed: int, moved: float = 0.0) -> NDArray[np.float64]:
-    """12 bays on either side of an aisle along x, posts and backs the same everywhere, pallets by chance; a share of them moved."""
+    """12 bays on either side of an aisle along x, posts and backs the same everywhere, pallets by chance; a share moved."""
     is_moved = np.random.default_rng(seed).uniform(size=(2, 12)) < moved
     grid = np.stack(np.meshgrid(np.arange(-17.0, 17.1, 0.5), np.arange(-2.0, 2.1, 0.5), [0.0]), axis=-1).reshape(-1, 3)
     parts = [grid]
