@@ -168,12 +168,12 @@ def _rms(errors: NDArray[np.float64]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", default=",".join(CASES), help="comma-separated")
+    parser.add_argument("--cases", default=";".join(CASES), help="separated by semicolons")
     parser.add_argument("--seeds", default="1:13:2", help="first:last:step, the last one excluded")
     parser.add_argument("--verbose", action="store_true", help="a line a run")
     options = parser.parse_args()
     seeds = range(*(int(text) for text in options.seeds.split(":")))
-    for name in options.cases.split(","):
+    for name in options.cases.split(";"):
         rows = [run(name, seed) for seed in seeds]
         if options.verbose:
             for seed, (verdict, line, before, after, _) in zip(seeds, rows, strict=True):

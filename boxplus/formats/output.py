@@ -71,6 +71,21 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         raise
 
 
+def put_back(path: str | Path) -> None:
+    """Put back the folder that a process left beside `path` which was killed between the two renames of `replaced_folder`.
+
+    Raises:
+        OutputError: it cannot be renamed.
+    """
+    target = as_path(path, "a folder")
+    earlier = target.with_name(target.name + EARLIER_SUFFIX)
+    try:
+        if earlier.exists() and not target.exists():
+            os.rename(earlier, target)
+    except OSError as error:
+        raise output_error(target, error) from error
+
+
 @contextmanager
 def replaced_folder(path: str | Path) -> Iterator[Path]:
     """Yield a folder beside `path` to write into; when the block ends well, it takes the place of the folder at `path`.
@@ -83,9 +98,8 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
     """
     target = as_path(path, "a file")
     made, earlier = (target.with_name(target.name + ending) for ending in (TEMPORARY_SUFFIX, EARLIER_SUFFIX))
+    put_back(target)
     try:
-        if earlier.exists() and not target.exists():
-            os.rename(earlier, target)
         for leftover in (made, earlier):
             if leftover.exists():
                 shutil.rmtree(leftover)

@@ -64,7 +64,7 @@ class TrajectoryWriter:
         time_ns: int,
         R_world_imu: ArrayLike,
         p_world_imu: ArrayLike,
-        covariance_6x6: ArrayLike,
+        covariance_6x6: ArrayLike | None,
         status: str,
     ) -> None:
         """Write one pose to all three files.
@@ -73,7 +73,7 @@ class TrajectoryWriter:
             time_ns: absolute time, later than that of the pose before [ns].
             R_world_imu: (3, 3) rotation.
             p_world_imu: (3,) position [m].
-            covariance_6x6: (6, 6) covariance of the pose error, rotation first [rad², rad·m, m²].
+            covariance_6x6: (6, 6) covariance of the pose error, rotation first [rad², rad·m, m²]; None where it is not known.
             status: the estimator's verdict, e.g. `ok`.
 
         Raises:
@@ -81,7 +81,7 @@ class TrajectoryWriter:
             OutputError: the disk is full or the file cannot be written; also after `close`.
         """
         R, p = _checked(R_world_imu, (3, 3), "R_world_imu"), _checked(p_world_imu, (3,), "p_world_imu")
-        covariance = _checked(covariance_6x6, (6, 6), "covariance_6x6")
+        covariance = None if covariance_6x6 is None else _checked(covariance_6x6, (6, 6), "covariance_6x6")
         time = int(time_ns)
         if self._last_ns is not None and time <= self._last_ns:
             raise InputError(f"a time after {self._last_ns} ns", f"{time} ns", "append poses in order of time")

@@ -131,20 +131,19 @@ def update_command(
 ) -> None:
     """Go on with a joint map: join further runs with it, in its frame and with its settings.
 
-    Exit code 3: none of the runs met the map, which stays as it was.
+    Exit code 3: the map stays as it was, as none of the runs met it, or one of its own would no longer fit.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.terminal import Terminal
-    from boxplus.runs.sessions.update_run import update_map
+    from boxplus.runs.sessions.update_run import update_map, why_left_alone
 
     terminal = Terminal(quiet=quiet, as_json=as_json)
     with reported(_given(runs), merged, as_json=as_json) as outcome:
         result, alignment = update_map(merged, runs)
         if result is None:
-            for number, session in enumerate(alignment.sessions):
-                if number >= len(alignment.sessions) - len(runs):
-                    terminal.say(f"{session.name}: apart" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
-            terminal.doubt(f"none of the runs met the map: {merged} stays as it was")
+            for text in why_left_alone(alignment, len(runs)):
+                terminal.say(text)
+            terminal.doubt(f"the map cannot go on with any of the runs: {merged} stays as it was")
             outcome.end(None, untrusted=True)
             return
         _show(terminal, result.summary)

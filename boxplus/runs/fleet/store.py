@@ -17,7 +17,7 @@ from pathlib import Path
 from boxplus._extras import require
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
-from boxplus.runs.sessions.folder import replaced_merge
+from boxplus.runs.sessions.folder import claim_merge_folder
 from boxplus.runs.storage.folder_lock import locked_folder
 from boxplus.runs.storage.output_folder import SUMMARY
 
@@ -115,7 +115,7 @@ class SharedFolder(Store):
     @contextmanager
     def joint_map(self) -> Iterator[str]:
         """See `Store`; the earlier map stays whole until then."""
-        with replaced_merge(self.path / MERGED, overwrite=True) as made:
+        with claim_merge_folder(self.path / MERGED, overwrite=True) as claimed, claimed.replaced() as made:
             yield made.path.name
 
 

@@ -231,15 +231,17 @@ class _RefineRun:
             return replace(placed, loops=closed.loops(), fixes=closed.fixes(opened))
 
     def _write_trajectory(self, finished: FinishedRun, found: Refinement, scans: NDArray[np.int64], accepted: bool) -> None:
-        """The refined poses, or those of the run; status is the run's."""
+        """The refined poses with their covariances, or those of the run with what it has of them; status is the run's."""
         trajectory = self._run.trajectory
         rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
         T = (found.after if accepted else found.before).T_world_imu[scans]
         R = quaternion.to_matrix(T[:, :4])
         with TrajectoryWriter(self._folder.path) as writer:
             for k, (scan, row) in enumerate(zip(scans.tolist(), rows.tolist(), strict=True)):
-                own = None if accepted else trajectory.covariance
-                covariance = found.pose_covariance[scan] if own is None else own[row]
+                if accepted:
+                    covariance = found.pose_covariance[scan]
+                else:
+                    covariance = None if trajectory.covariance is None else trajectory.covariance[row]
                 status = "ok" if trajectory.status is None else trajectory.status[row]
                 writer.append(int(finished.time_ns[scan]), R[k], T[k, 4:], covariance, status)
 

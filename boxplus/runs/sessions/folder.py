@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.formats.output import replaced_folder
+from boxplus.formats.output import put_back, replaced_folder
 from boxplus.runs.run_folder import is_map_file
+from boxplus.runs.storage.folder_lock import locked_beside
 from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
 PROGRAM = "boxplus map merge"
@@ -66,28 +67,52 @@ class MergeFolder:
         return self.path / "sessions"
 
 
+@dataclass(frozen=True, slots=True)
+class ClaimedMerge:
+    """The folder of a merge while no other process writes there; it may not exist yet."""
+
+    path: Path
+
+    @contextmanager
+    def replaced(self) -> Iterator[MergeFolder]:
+        """A folder to write into, which takes the place of the claimed one when the block ends well; until then that stays whole.
+
+        Raises:
+            OutputError: it cannot be created, cleared or renamed.
+        """
+        with replaced_folder(self.path) as made:
+            yield MergeFolder(made)
+
+
 @contextmanager
-def replaced_merge(folder: str | Path, *, overwrite: bool = False) -> Iterator[MergeFolder]:
-    """A folder to write into, which takes the place of `folder` when the block ends well; until then what is there stays whole.
+def claim_merge_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[ClaimedMerge]:
+    """A folder for a joint map, locked while the block runs: from the look at what is there on, until it is replaced.
 
     Raises:
-        InputError: the folder holds something else, or an earlier merge and `overwrite` is not set.
-        OutputError: it cannot be created, cleared or renamed.
+        InputError: another process is writing there; the folder holds something else, or an earlier merge and `overwrite` is not
+            set.
+        OutputError: the folder that holds it cannot be written.
     """
-    path = Path(folder)
-    if path.is_dir() and (content := [file for file in path.rglob("*") if not file.is_dir()]):
-        names = {file: file.relative_to(path) for file in content}
-        is_own = (path / SUMMARY).is_file() and program_of(path / SUMMARY) == PROGRAM
-        foreign = [file for file, name in names.items() if not (_OWN.fullmatch(name.as_posix()) or _is_tile(name))]
-        if not is_own or foreign:
-            raise InputError("a new or empty output folder", f"other files in {path}", "choose another folder with --output")
-        if not overwrite:
-            raise InputError(
-                "a new or empty output folder", f"the results of an earlier merge in {path}",
-                "choose another folder with --output, or add --overwrite to replace them",
-            )  # fmt: skip
-    with replaced_folder(path) as made:
-        yield MergeFolder(made)
+    path = Path(folder).resolve()  # what takes the place of a link would leave the map that it leads to as it was
+    with locked_beside(path, PROGRAM):
+        put_back(path)
+        if path.is_dir():
+            _refuse_what_is_there(path, overwrite)
+        yield ClaimedMerge(path)
+
+
+def _refuse_what_is_there(path: Path, overwrite: bool) -> None:
+    names = [file.relative_to(path) for file in path.rglob("*") if not file.is_dir()]
+    if not names:
+        return
+    is_own = (path / SUMMARY).is_file() and program_of(path / SUMMARY) == PROGRAM
+    if not is_own or any(not (_OWN.fullmatch(name.as_posix()) or _is_tile(name)) for name in names):
+        raise InputError("a new or empty output folder", f"other files in {path}", "choose another folder with --output")
+    if not overwrite:
+        raise InputError(
+            "a new or empty output folder", f"the results of an earlier merge in {path}",
+            "choose another folder with --output, or add --overwrite to replace them",
+        )  # fmt: skip
 
 
 def _is_tile(name: Path) -> bool:

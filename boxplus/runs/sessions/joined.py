@@ -63,6 +63,10 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
         sessions.append(facts)
         if doubt is not None:
             warnings.append(f"{session.name} is not to be trusted itself: {doubt}")
+    for m in alignment.meetings:
+        if m.doubt is not None and m.refusal is None and m.place_session in row_of and m.query_session in row_of:
+            names = " and ".join(alignment.sessions[k].name for k in (m.query_session, m.place_session))
+            warnings.append(f"{names} {m.doubt}; look at the map before you trust it")
     for other in alignment.worlds[1:]:
         if is_joined and len(other.members) > 1:
             them = " and ".join(alignment.sessions[k].name for k in other.members)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from boxplus.maps.tiles.store import merge
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
-from boxplus.runs.sessions.folder import MergeFolder, replaced_merge
+from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_merge_folder
 from boxplus.runs.sessions.joined import merge_facts, write_session_trajectory
 from boxplus.runs.sessions.repeated import refuse_repeated
 from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
@@ -45,7 +46,7 @@ class MergeResult:
 
 def merge_runs(
     folders: Sequence[str | Path],
-    output: str | Path,
+    output: str | Path | ClaimedMerge,
     config: MergeConfig | None = None,
     *,
     remove_dynamic: bool = False,
@@ -58,6 +59,7 @@ def merge_runs(
     Args:
         folders: output folders of finished runs of 'boxplus slam', in order of time; the first that is joined gives the frame.
         output: created; docs/output_folder.md says what it holds. An earlier merge there stays whole until the new one is.
+            Or what `claim_merge_folder` yields.
         config: settings; each has a default.
         remove_dynamic: leave out of the map what rays of other stretches of way went through, and report what changed.
         overwrite: replace an earlier merge.
@@ -77,23 +79,32 @@ def merge_runs(
     runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
     sessions = [run.session for run in runs]
     refuse_repeated({run.session.name: run.identity for run in runs})
-    with replaced_merge(output, overwrite=overwrite) as own:
+    claimed = nullcontext(output) if isinstance(output, ClaimedMerge) else claim_merge_folder(output, overwrite=overwrite)
+    with claimed as place:
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
-        world = alignment.worlds[0]
-        places, doubts = [printable(str(run.folder.path.resolve())) for run in runs], [run.doubt for run in runs]
-        summary = merge_facts(alignment, places, doubts).model_copy(update={"remove_dynamic": remove_dynamic})
-        names = [run.session.name for run in runs]
-        with atomic_file(own.config) as file:
-            file.write(dump_merge_config(config).encode())
-        write_encounters(own.encounters, alignment.meetings, names)
-        if len(world.members) > 1:
-            update = _write_map(own, runs, world, config, remove_dynamic)
-            for number, T in zip(world.members, world.T_world_map, strict=True):
-                write_session_trajectory(own.sessions, runs[number], T)
-            summary = summary.model_copy(update=update)
-        summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
-        summary.write(own.summary)
+        with place.replaced() as own:
+            summary = _write(own, runs, alignment, config, remove_dynamic)
+            summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
+            summary.write(own.summary)
     return MergeResult(summary, alignment)
+
+
+def _write(
+    own: MergeFolder, runs: Sequence[SessionRun], alignment: SessionAlignment, config: MergeConfig, remove_dynamic: bool
+) -> MergeSummary:
+    """Everything but the summary."""
+    world = alignment.worlds[0]
+    places, doubts = [printable(str(run.folder.path.resolve())) for run in runs], [run.doubt for run in runs]
+    summary = merge_facts(alignment, places, doubts).model_copy(update={"remove_dynamic": remove_dynamic})
+    with atomic_file(own.config) as file:
+        file.write(dump_merge_config(config).encode())
+    write_encounters(own.encounters, alignment.meetings, [run.session.name for run in runs])
+    if len(world.members) == 1:
+        return summary
+    update = _write_map(own, runs, world, config, remove_dynamic)
+    for number, T in zip(world.members, world.T_world_map, strict=True):
+        write_session_trajectory(own.sessions, runs[number], T)
+    return summary.model_copy(update=update)
 
 
 def _write_map(

@@ -100,7 +100,8 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
         needs_scans: for the joint map; without them its local maps alone are looked at.
 
     Raises:
-        InputError: not a run of 'boxplus slam', one that did not come to its end, or one that kept no scans.
+        InputError: not a run of 'boxplus slam', one that did not come to its end, one whose scans are not all there; a local map
+            that is damaged.
     """
     own = SlamFolder(Path(folder))
     program = program_of(own.summary) if own.summary.is_file() else None
@@ -111,6 +112,8 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
         raise InputError("a run that came to its end", f"{own.path}: {summary.describe_state()}", "go on with it: --resume")
     if needs_scans and not own.spool.is_file():
         raise InputError("a run that kept its scans", f"no {own.spool.name} in {own.path}", _ADVICE)
+    if needs_scans and summary.spool_bytes is not None and (size := own.spool.stat().st_size) != summary.spool_bytes:
+        raise InputError(f"the {summary.spool_bytes} bytes of {own.spool}", f"{size}: it was cut or changed", _ADVICE)
     stored, outcome = LocalMapFolder(own.local_maps), read_graph(own.graph)
     placed = outcome.placed  # in the frame of its trajectory and map, which is the Earth's where it was laid onto it
     # Steps are known as the run's own loops found: no better than was assumed, worse where these say that it drifts more.

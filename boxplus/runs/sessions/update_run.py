@@ -1,13 +1,14 @@
-"""`boxplus map update`: a joint map goes on with further runs; where none of them met it, it stays as it is."""
+"""`boxplus map update`: a joint map goes on with further runs, or stays as it is: none of them met it, or it would fall apart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.runs.sessions.config import MergeConfig
-from boxplus.runs.sessions.folder import MergeFolder
+from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_merge_folder
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
 from boxplus.runs.sessions.repeated import refuse_repeated
 from boxplus.runs.sessions.session_run import open_session_run, session_names
@@ -22,7 +23,8 @@ def update_map(
 ) -> tuple[MergeResult | None, SessionAlignment]:
     """Join further runs with a joint map, with its own settings and in its frame: the sessions that it has are placed anew.
 
-    The map that is there stays whole until the new one is; where none of the runs met it, it is not touched.
+    The map that is there stays whole until the new one is. Where none of the runs met it, it is not touched; nor where one of its
+    own sessions would no longer be part of it: the new runs contradict it then, or one of its runs has been replaced.
 
     Args:
         merged: output folder of 'boxplus map merge', whose runs are where they were.
@@ -30,13 +32,22 @@ def update_map(
         progress: called with every pair of sessions.
 
     Returns:
-        What is in the folder now, None where it was left as it was; and where all sessions are.
+        What is in the folder now, None where it was left as it was (`why_left_alone`); and where all sessions are, the map's
+        world first.
 
     Raises:
-        InputError: no joint map; a run of it that is gone; a run that is in it already; what `merge_runs` refuses.
+        InputError: no joint map; a run of it that is gone; a run that is in it already; another process that is at it; what
+            `merge_runs` refuses.
         OutputError: the disk is full; the earlier map stays whole.
     """
-    own = MergeFolder(Path(merged))
+    with claim_merge_folder(merged, overwrite=True) as claimed:
+        return _updated(claimed, folders, progress)
+
+
+def _updated(
+    claimed: ClaimedMerge, folders: Sequence[str | Path], progress: Callable[[Meeting], None] | None
+) -> tuple[MergeResult | None, SessionAlignment]:
+    own = MergeFolder(claimed.path)
     before = read_merge_summary(own.summary)
     known = [Path(session.run) for session in before.joined]
     if not known:
@@ -52,8 +63,22 @@ def update_map(
     refuse_repeated({run.session.name: run.identity for run in runs})
     sessions = [run.session for run in runs]
     alignment = align_sessions(sessions, config.sessions, progress=progress)
-    world = alignment.worlds[0]
-    if 0 not in world.members or all(number < len(known) for number in world.members):
+    # Runs that met each other only may be more than the map has: that is no reason to leave it.
+    own_world = next(world for world in alignment.worlds if 0 in world.members)
+    alignment = replace(alignment, worlds=[own_world, *(world for world in alignment.worlds if world is not own_world)])
+    if not set(range(len(known))) < set(own_world.members):
         return None, alignment
-    result = merge_runs(paths, own.path, config, remove_dynamic=before.remove_dynamic, overwrite=True, align=lambda _: alignment)
+    result = merge_runs(paths, claimed, config, remove_dynamic=before.remove_dynamic, align=lambda _: alignment)
     return result, alignment
+
+
+def why_left_alone(alignment: SessionAlignment, more: int) -> list[str]:
+    """What keeps a map as it is, a text for each session: of so many new runs, which come last, or of its own that would go."""
+    known = len(alignment.sessions) - more
+    members = alignment.worlds[0].members
+    lost = [number for number in range(known) if number not in members]
+    said = []
+    for number in lost or range(known, known + more):
+        name, what = alignment.sessions[number].name, "would no longer be part of the map" if lost else "apart"
+        said.append(f"{name}: {what}" + "".join(f"\n  {text}" for text in alignment.why_apart(number)))
+    return said

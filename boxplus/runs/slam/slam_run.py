@@ -198,6 +198,7 @@ class _Run:
                 "largest_shift_m": float(shift.max()),
                 "last_shift_m": float(shift[-1]),
                 "map_points": stored,
+                "spool_bytes": None if spool is None else spool.mark().size,
                 "slam_s": slam_s,
                 "writing_s": time.perf_counter() - began,
                 "gnss": gnss,

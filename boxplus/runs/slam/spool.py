@@ -17,6 +17,8 @@ from boxplus.manifolds import quaternion
 from boxplus.maps.tiles.voxel_thinning import RecentVoxels
 
 _HEAD = struct.Struct("<qqB7d")  # time, points, whether with intensity, pose
+_POINT, _INTENSITY = 12, 4  # bytes
+_UNIT = 1e-6  # by which the length of a quaternion may differ from one
 
 
 class SpooledScan(NamedTuple):
@@ -121,7 +123,7 @@ class ScanSpool:
                 time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
                 times.append(time_ns)
                 poses.append(pose)
-                file.seek(count * (16 if has_intensity else 12), os.SEEK_CUR)
+                file.seek((_POINT + _INTENSITY * has_intensity) * count, os.SEEK_CUR)
         return np.array(times, dtype=np.int64), np.array(poses).reshape(-1, 7)
 
     def close(self) -> None:
@@ -144,13 +146,23 @@ def read_spool(path: Path) -> Iterator[SpooledScan]:
 
 
 def _next_scan(file: BinaryIO) -> SpooledScan | None:
-    """The scan at the position of a file, which moves on; None at its end."""
+    """The scan at the position of a file, which moves on; None at its end.
+
+    Raises:
+        ValueError: it ends within the scan, or what is there is none.
+    """
     if not (head := file.read(_HEAD.size)):
         return None
     time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
-    points = np.frombuffer(file.read(12 * count), dtype=np.float32).reshape(-1, 3)
-    intensity = np.frombuffer(file.read(4 * count), dtype=np.float32) if has_intensity else None
-    return SpooledScan(time_ns, np.array(pose), points, intensity)
+    T = np.array(pose)
+    if has_intensity not in (0, 1) or not (np.isfinite(T).all() and abs(np.linalg.norm(T[:4]) - 1.0) < _UNIT):
+        raise ValueError(f"no scan before byte {file.tell()}")
+    size = (_POINT + _INTENSITY * has_intensity) * count  # asked of the file before memory is: a damaged count may be any
+    if count < 0 or size > os.fstat(file.fileno()).st_size - file.tell():
+        raise ValueError(f"it ends within a scan, before byte {file.tell()}")
+    points = np.frombuffer(file.read(_POINT * count), dtype=np.float32).reshape(-1, 3)
+    intensity = np.frombuffer(file.read(_INTENSITY * count), dtype=np.float32) if has_intensity else None
+    return SpooledScan(time_ns, T, points, intensity)
 
 
 def _in_odometry(scan: SpooledScan) -> NDArray[np.float32]:

@@ -64,6 +64,7 @@ class SlamSummary(Part):
     largest_shift_m: float = Field(0.0, description="by which closing loops moved a local map at most [m]")
     last_shift_m: float = Field(0.0, description="and the last one [m]")
     map_points: int = Field(0, description="in the corrected map")
+    spool_bytes: int | None = Field(None, description="size of scans.spool; null where no scans were kept")
     slam_s: float = Field(0.0, description="seconds spent on local maps and loops")
     writing_s: float = Field(0.0, description="and on writing the corrected trajectory and map")
     warnings: list[str] = Field(default=[])

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.formats.output import output_error
+from boxplus.formats.output import make_folder, output_error
 
 LOCK = "run.lock"
+BESIDE = ".boxplus-lock"
+"""Ending of a lock that lies beside its folder."""
 _log = logging.getLogger(__name__)
 _LOCKED_BYTE = 1 << 20  # beyond the content, which stays readable on Windows
 
@@ -44,9 +46,27 @@ def locked_folder(folder: Path, program: str) -> Iterator[FolderLock]:
         InputError: another process holds the lock; the message names it.
         OutputError: the folder cannot be written.
     """
-    path = folder / LOCK
+    with _locked(folder / LOCK, folder, program) as lock:
+        yield lock
+
+
+@contextmanager
+def locked_beside(folder: Path, program: str) -> Iterator[FolderLock]:
+    """The same for a `folder` that another one takes the place of: the lock lies beside it, so that it stays where it is.
+
+    Raises:
+        InputError: another process holds the lock; the message names it.
+        OutputError: the folder that holds both cannot be written.
+    """
+    make_folder(folder.parent)
+    with _locked(folder.with_name(folder.name + BESIDE), folder, program) as lock:
+        yield lock
+
+
+@contextmanager
+def _locked(path: Path, folder: Path, program: str) -> Iterator[FolderLock]:
     try:
-        file = _lock(path)
+        file = _lock(path, folder)
         began_before = _content(file).get("program") == program
         os.ftruncate(file, 0)
         os.lseek(file, 0, os.SEEK_SET)
@@ -67,7 +87,7 @@ def locked_folder(folder: Path, program: str) -> Iterator[FolderLock]:
                 path.unlink()
 
 
-def _lock(path: Path) -> int:
+def _lock(path: Path, folder: Path) -> int:
     """A file descriptor that holds the lock of the file which is at `path`."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
@@ -75,7 +95,7 @@ def _lock(path: Path) -> int:
             if not _try_lock(file):
                 raise InputError(
                     "an output folder that no other run is writing to",
-                    f"process {_content(file).get('process', 'of an unknown number')} writing to {path.parent} at this moment",
+                    f"process {_content(file).get('process', 'of an unknown number')} writing to {folder} at this moment",
                     "wait for it, stop it, or choose another folder with --output",
                 )
             if os.name == "nt" or _is_at(file, path):

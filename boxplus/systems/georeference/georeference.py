@@ -95,8 +95,9 @@ def georeference(
     attached = attach(fixes, graph.time_ns, graph.T_odo, time_ns, T_odo_imu, config)
     none = Georeference(None, None, None, attached, dict(attached.left_out), [], [])
     try:
-        start, frame, warnings = _start(graph, attached, lever, config)
-        return _judged(graph, attached, frame, start, lever, warnings, config)
+        drift = _drift(graph)
+        start, frame, warnings = _start(graph, attached, lever, drift[0], config)
+        return _judged(graph, attached, frame, start, lever, drift[1], warnings, config)
     except _Refused as refused:
         return replace(none, refusal=str(refused))
     except SingularProblemError as error:
@@ -104,7 +105,7 @@ def georeference(
 
 
 def _start(
-    graph: MapGraph, attached: AttachedFixes, lever: Floats | None, config: GeoreferenceConfig
+    graph: MapGraph, attached: AttachedFixes, lever: Floats | None, drift: Floats, config: GeoreferenceConfig
 ) -> tuple[Start, EnuFrame, list[str]]:
     if len(attached) < _FEWEST:
         reasons = ", ".join(f"{count} {reason}" for reason, count in attached.left_out.items()) or "there are no others"
@@ -119,7 +120,7 @@ def _start(
             f"the antenna went {extent:.1f} m away while a fix is known to {sigma:.1f} m: the heading of the map is not "
             "determined; record a longer way"
         )
-    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + (_SIGMAS * _drift(graph)[0][attached.map_of]) ** 2
+    allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + (_SIGMAS * drift[attached.map_of]) ** 2
     speed = np.linalg.norm(attached.v_map, axis=1)
     allowed += (2.0 * config.delay_sigma * speed) ** 2
     allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2
@@ -166,6 +167,7 @@ def _judged(
     frame: EnuFrame,
     start: Start,
     lever: Floats | None,
+    height_drift: Floats,
     warnings: list[str],
     config: GeoreferenceConfig,
 ) -> Georeference:
@@ -191,7 +193,7 @@ def _judged(
         )
     used = found.is_used
     doubts = [
-        _heights(graph, attached, p_enu, lever, config),
+        _heights(graph, attached, p_enu, lever, height_drift, found, config),
         _other_antenna(graph, attached, p_enu, T_enu_map, start, found, lever, config),
     ]
     warnings = warnings + [text for text in doubts if text is not None]
@@ -210,13 +212,20 @@ def _judged(
 
 
 def _heights(
-    graph: MapGraph, attached: AttachedFixes, p_enu: Floats, lever: Floats | None, config: GeoreferenceConfig
+    graph: MapGraph,
+    attached: AttachedFixes,
+    p_enu: Floats,
+    lever: Floats | None,
+    drift: Floats,
+    found: Fit,
+    config: GeoreferenceConfig,
 ) -> str | None:
     """What is wrong with the heights of the fixes."""
     p_level = antennas(graph, attached, lever) @ level(graph.T_odo).T
     seconds = float(attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
-    drift = _drift(graph)[1][attached.map_of]
-    climb = climb_of(p_level, p_enu[:, 2], drift, seconds, config.correlation)
+    off = np.linalg.norm(found.errors[found.is_used, :2], axis=1) / (math.sqrt(2.0) * attached.sigma[found.is_used])
+    noise = float(np.median(np.sqrt(attached.covariance[:, 2, 2]))) * max(1.0, float(np.sqrt((off**2).mean())))
+    climb = climb_of(p_level, p_enu[:, 2], drift[attached.map_of], noise, seconds, config.correlation)
     return None if climb is None else climb.doubt
 
 

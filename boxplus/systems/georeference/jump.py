@@ -5,6 +5,10 @@ ends. But where it is the datum, and all fixes from there on may be shifted by t
 
 Near to the begin or the end of a recording it may be multipath as well that began before, or goes on after it: one side of the
 step is wrong all the same, and the map is bent between the two. That is said, though it is no proof of another datum.
+
+The fit with two datums bends the odometry before it lets a datum jump, as a fix counts for little beside those near to it in
+time: of a usual receiver much of a step may stay. Then the step itself is asked, from near (`step`), which also tells bursts
+from datums.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from numpy.typing import NDArray
 from boxplus.errors import SingularProblemError
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.fit import Fit
+from boxplus.systems.georeference.step import Step, step_at
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +34,7 @@ _NOISY = 3.0  # times what noise makes of it
 _GONE = 0.4  # of a step, what another datum leaves of it
 _LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
 _TRIED = 4  # steps, the largest first
+_BESIDE = 2  # fixes, by which a step may be off
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
 _SIDE_USED = 0.5  # of the fixes on the short side of a step, for the map to be bent by them
 _SIGMAS = 3.0
@@ -73,6 +79,7 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
     least = max(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
     left = np.where(is_near & enough & (steps >= least), steps, 0.0)
+    sigma = float(np.median(attached.sigma)) * found.noise_scale
     short: Jump | None = None
     tried = {False: 0, True: 0}  # of steps that last, and of short ones: many of these must not hide one that lasts
     while left.any():
@@ -90,13 +97,22 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
             continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
-        if gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before:
+        step = _sharpest(seconds, found, int(at[largest]), sigma)
+        is_explained = gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before
+        if not step.is_burst and (is_explained or (share < _LESS and gated <= before and step.is_told)):
             # Of the map that lies bent between both the errors step by less: it goes along.
-            jump = Jump(float(seconds[at[largest]]), float(np.linalg.norm(split.datum_step[:2])), not is_short)
+            metres = float(np.linalg.norm(split.datum_step[:2]))
+            jump = Jump(float(seconds[at[largest]]), metres if is_explained else max(metres, step.metres), not is_short)
             if jump.lasts:
                 return jump
             short = jump
     return short
+
+
+def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:
+    """The step at a fix or one beside it: means of a few fixes do not tell which."""
+    inside = range(max(at - _BESIDE, 1), min(at + _BESIDE + 1, len(seconds)))
+    return max((step_at(seconds, found.errors[:, :2], k, sigma) for k in inside), key=lambda step: step.gain)
 
 
 def _steps(errors: Floats) -> Floats:

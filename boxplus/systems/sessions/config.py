@@ -35,6 +35,9 @@ class SessionsConfig(Settings):
     least_standing: float = Field(
         0.7, ge=0, le=1, description="share of what stands upright in one session that stands at the same place in the other"
     )
+    least_lead: float = Field(
+        0.2, ge=0, lt=1, description="part by which what stands is less far off the other's surfaces than at any other alignment"
+    )
     rival_share: float = Field(
         0.5, gt=0, le=1, description="another alignment with this share of the encounters makes the first one ambiguous"
     )

@@ -36,6 +36,7 @@ class Meeting:
         standing: share of what stands upright in overlapping local maps of one and stands at the same place in the other; NaN
             where the meeting was refused before that was asked.
         refusal: why the two are not joined, in a sentence; None where they are.
+        doubt: what is left to doubt where they are, after their names; None where nothing is.
     """
 
     place_session: int
@@ -47,6 +48,7 @@ class Meeting:
     confirmed: int = 0
     standing: float = math.nan
     refusal: str | None = None
+    doubt: str | None = None
 
     @property
     def accepted(self) -> list[Encounter]:

@@ -15,6 +15,8 @@
 7. *What stands*: two streets have their ground and their fronts in common. What stands upright elsewhere has to as well; where
    nothing does, nothing tells them apart.
 8. *Wholes*: the sessions do not fit as well shifted or turned as wholes.
+9. *Kind*: what stands lies nearer to the surfaces of the other session than it does shifted or turned: two places of one kind
+   have their racks and columns in common, and nothing that stands in them.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
+from boxplus.systems.sessions.kind import lead_of
 from boxplus.systems.sessions.open_axis import moved_along, open_axis, shift_along
-from boxplus.systems.sessions.other_alignments import fits_otherwise
+from boxplus.systems.sessions.other_alignments import fits_otherwise, other_alignments
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.loop import Floats, Loop
@@ -41,6 +44,7 @@ from boxplus.systems.slam.verification import verify
 
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _SIGMAS_OF_REACH = 7.0  # standard deviations of the position of a proposal that make up the reach in which rivals are tried
+_CLEAR = 0.35  # lead over other alignments up to which two of a kind cannot be excluded: warehouses with other pallets reach 0.23
 _TILT, _YAW = 0.03, 0.1  # rad, of a proposal
 _RIVAL_AGREEMENT = 0.6  # of density images, for a rival that is turned
 _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
@@ -106,7 +110,7 @@ class _Meeting:
         return self._as_wholes(joined, kept, predicted, confirmed)
 
     def _as_wholes(self, joined: JoinedGraph, kept: set[int], predicted: int, confirmed: int) -> Meeting:
-        """Steps 3, 7 and 8, of encounters whose alignment nothing else speaks against."""
+        """Steps 3 and 7 to 9, of encounters whose alignment nothing else speaks against."""
         encounters, least = [loop for loop in self.loops.values() if id(loop) in kept], self.config.least_standing
         share = self._standing_share(encounters)
         if math.isnan(share):
@@ -120,15 +124,30 @@ class _Meeting:
             why = f"{len(encounters)} encounters agree, but the surfaces of all of them leave open how far along {where} it lies"
             why = f"{why}: {self._not_told}" if self._not_told else why
             return self._refused(why, predicted, confirmed, share)
-        if otherwise := fits_otherwise(self.place, self.query, joined.T_world_session[1], self.config):
+        T = joined.T_world_session[1]
+        others = other_alignments(self.place, self.query, T, self.config)
+        if otherwise := fits_otherwise(self.place, self.query, T, others, self.config):
             return self._refused(otherwise, predicted, confirmed, share)
+        lead, asked = lead_of(self.place, self.query, T, others, self.config), self.config.least_lead
+        if lead.share < asked:
+            why = f"what stands lies {100.0 * lead.share:.0f} % nearer to surfaces of the other than {lead.over or 'anywhere'}"
+            why = f"two places of a kind, perhaps: {why}, {100.0 * asked:.0f} % are asked for"
+            return self._refused(why, predicted, confirmed, share)
+        doubt = None
+        if lead.over is not None and lead.share < _CLEAR:
+            doubt = (
+                f"are at the same place or at two of a kind: what stands lies only {100.0 * lead.share:.0f} % nearer to surfaces "
+                f"of the other than {lead.over}"
+            )
         against = "contradicts the encounters that agree with each other"
         final = [
             loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)
             for loop in self.loops.values()
         ]
         final = [replace(loop, weight=float(loop.refusal is None)) for loop in final]
-        return Meeting(*self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share)
+        return Meeting(
+            *self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share, doubt=doubt
+        )
 
     def _refused(self, why: str, predicted: int = 0, confirmed: int = 0, standing: float = math.nan) -> Meeting:
         return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)

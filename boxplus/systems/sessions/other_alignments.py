@@ -25,8 +25,8 @@ _TOLERANCE = 2.5  # standard deviations from a plane within which a point fits
 _RMS_FLOOR = 0.02  # m: successive maps that fit better than this say nothing about others
 
 
-def fits_otherwise(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> str | None:
-    """A sentence on another alignment of two sessions whose local maps lie over each other as well; None where there is none.
+def other_alignments(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> list[Floats]:
+    """Alignments (7,) of two sessions at which they look nearly as alike from above as at the one that was found.
 
     Args:
         T_place_query: (7,) of the sessions' frames, as found.
@@ -41,20 +41,40 @@ def fits_otherwise(place: Places, query: Places, T_place_query: Floats, config: 
         moved = T.copy()
         moved[4:6] += shift
         others.append(moved)
+    return [se3.compose(other, se3.inverse(middle)) for other in others]
+
+
+def fits_otherwise(
+    place: Places, query: Places, T_place_query: Floats, others: list[Floats], config: SessionsConfig
+) -> str | None:
+    """A sentence on another alignment of two sessions whose local maps lie over each other as well; None where there is none.
+
+    Args:
+        T_place_query: (7,) of the sessions' frames, as found. others: from `other_alignments`.
+    """
     found = _AsFound(place, query, T_place_query, config)
-    for other in others:
-        alignment = se3.compose(other, se3.inverse(middle))
-        pairs = _pairs(place, query, alignment, config)
+    for alignment in others:
+        pairs = nearest_pairs(place, query, alignment, config)
         if len(pairs) < config.rival_share * len(found.places):
             continue
-        tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).round().astype(int))]
+        tried = spread(pairs, _PAIRS)
         fitting = sum(_fits(place, query, pair, alignment, found, config) for pair in tried)
         if fitting >= config.least_confirmed * len(tried):
-            xi = se3.log(se3.compose(se3.inverse(T), other))
-            turn = np.rad2deg(np.linalg.norm(xi[:3]))
-            how = f"turned by {turn:.0f}°" if turn > 45.0 else f"{np.linalg.norm(other[4:] - T[4:]):.1f} m away"
-            return f"as wholes they fit as well {how}"
+            return f"as wholes they fit as well {difference(query, T_place_query, alignment)}"
     return None
+
+
+def difference(query: Places, T_place_query: Floats, other: Floats) -> str:
+    """How another alignment of the query session differs, in words: turned by 180°, 4.0 m away."""
+    middle = np.concatenate([[1.0, 0.0, 0.0, 0.0], query.session.T_session_map[:, 4:].mean(axis=0)])
+    T, moved = se3.compose(T_place_query, middle), se3.compose(other, middle)
+    turn = np.rad2deg(np.linalg.norm(se3.log(se3.compose(se3.inverse(T), moved))[:3]))
+    return f"turned by {turn:.0f}°" if turn > 45.0 else f"{np.linalg.norm(moved[4:] - T[4:]):.1f} m away"
+
+
+def spread(pairs: list[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """So many of them at most, from the first to the last."""
+    return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, count).round().astype(int))] if pairs else []
 
 
 def _cloud(places: Places, T: Floats) -> NDArray[np.float32]:
@@ -68,7 +88,7 @@ def _cloud(places: Places, T: Floats) -> NDArray[np.float32]:
     return np.concatenate(parts).astype(np.float32)
 
 
-def _pairs(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> list[tuple[int, int]]:
+def nearest_pairs(place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> list[tuple[int, int]]:
     """For each local map of the query session the one of the other that lies nearest under an alignment, and near."""
     positions = place.session.T_session_map[:, 4:]
     found = []
@@ -89,7 +109,7 @@ class _AsFound:
 
     def __init__(self, place: Places, query: Places, T_place_query: Floats, config: SessionsConfig) -> None:
         self.T_place_query = T_place_query
-        self.places = dict(_pairs(place, query, T_place_query, config))
+        self.places = dict(nearest_pairs(place, query, T_place_query, config))
         self._sessions, self._config = (place, query), config.slam.registration
         self._share: dict[int, tuple[float, float]] = {}
 
@@ -113,6 +133,11 @@ class _AsFound:
         return fitting_share(own, there, found.T_target_source, tolerance, self._config), tolerance
 
 
+def is_same(xi: Floats, config: SessionsConfig) -> bool:
+    """Whether a registration from elsewhere came back to where a pair was found, xi (6,) away from there."""
+    return bool(np.linalg.norm(xi[:3]) < _SAME_TURN and np.linalg.norm(xi[3:]) < config.slam.rival_distance)
+
+
 def _fits(
     place: Places, query: Places, pair: tuple[int, int], T_other: Floats, as_found: _AsFound, config: SessionsConfig
 ) -> bool:
@@ -130,10 +155,8 @@ def _fits(
     if found is None:
         return False
     from_other, from_first = (se3.log(se3.compose(se3.inverse(A), found.T_target_source)) for A in (start, first))
-    if np.linalg.norm(from_other[3:]) > config.nearby:
+    if np.linalg.norm(from_other[3:]) > config.nearby or is_same(from_first, config):
         return False
-    if np.linalg.norm(from_first[:3]) < _SAME_TURN and np.linalg.norm(from_first[3:]) < config.slam.rival_distance:
-        return False  # it came back
     bound = config.slam.largest_rms * max(query.rms(number), place.rms(where), _RMS_FLOOR)
     if min(found.overlap) < config.slam.least_overlap or found.rms > bound:
         return False

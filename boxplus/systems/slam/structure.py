@@ -35,13 +35,20 @@ def standing_in_common(own: Surface, there: Surface, T_there_own: Floats, config
     return min((found for found in both if found[1]), key=lambda found: (found[0] / found[1], -found[1]), default=(0, 0))
 
 
-def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
+def upright_where_seen(
+    own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig
+) -> NDArray[np.float32]:
+    """(N, 3) points of a map that stand, in its frame, where the other one sees."""
     points = own.points[:: max(len(own.points) // _POINTS, 1)]
     q = se3.act(T_there_own, points.astype(np.float64)).reshape(-1, 3)
-    is_seen = np.linalg.norm(q[:, :2], axis=1) <= _sight(there)
-    points, q = points[is_seen], q[is_seen]
+    points = points[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)]
     is_level = np.abs(plane_normals(points, own, config)[:, 2]) > _LEVEL
-    near = there.tree.nearest(q[_above_ground(points) & ~is_level], 1, max_distance=config.near).counts > 0
+    return np.asarray(points[_above_ground(points) & ~is_level])
+
+
+def _one_way(own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig) -> tuple[int, int]:
+    q = se3.act(T_there_own, upright_where_seen(own, there, T_there_own, config).astype(np.float64)).reshape(-1, 3)
+    near = there.tree.nearest(q, 1, max_distance=config.near).counts > 0
     return int(near.sum()), len(near)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,9 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.refinement import refine_run
+from boxplus.runs.refinement.folder import claim_refine_folder
 from boxplus.runs.refinement.summary import RefineSummary
+from boxplus.runs.settings_file import load_settings
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.recording_writer import write_recording
 
@@ -86,6 +89,20 @@ def test_a_run_that_was_not_accepted_keeps_its_trajectory(
     assert before.covariance is not None and after.covariance is not None
     np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-6)
     assert not (tmp_path / "out" / "map.ply").exists()
+
+
+def test_a_rejected_run_without_covariances_is_given_none(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that was put together in Python may have none; those of the refinement are not those of its poses."""
+    monkeypatch.setattr(refine_run.Refinement, "refusal", property(lambda self: "because"))
+    run = refine_run.read_odometry_run(folders[0])
+    bare = replace(run, trajectory=replace(run.trajectory, covariance=None), rows=replace(run.rows, covariance=None))
+    config = load_settings(refine_run.RefineRunConfig, None, ["refinement.rounds=1"])
+    with claim_refine_folder(tmp_path / "out", folders[0]) as folder:
+        refine_run.refine_run(bare, folder, config)
+    after = read_trajectory(tmp_path / "out" / "trajectory.csv")
+    assert len(after) == len(run.trajectory) and after.covariance is None
 
 
 def test_what_is_no_run_or_another_recording_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:

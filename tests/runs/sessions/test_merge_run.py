@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,9 +23,12 @@ from boxplus.manifolds import se3
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig
+from boxplus.runs.sessions.joined import merge_facts
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
+from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.sessions.update_run import update_map
 from boxplus.runs.settings_file import load_settings
+from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.simulation.drifting_drive import DriftConfig, DriftingDrive
 from boxplus.simulation.worlds.world import World, box
 from boxplus.simulation.worlds.worlds import city
@@ -181,6 +185,58 @@ def test_an_update_that_met_nobody_leaves_the_map_alone(
     shown = CliRunner().invoke(map_app, ["update", str(out), str(runs[0][2])])
     assert shown.exit_code == 3 and "stays as it was" in shown.output and "elsewhere: apart" in shown.output
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def test_an_update_from_which_one_of_the_map_would_go_leaves_it_alone(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new run contradicts it, or its folder holds another recording by now; once it went without a word on the map."""
+    out, result = merged
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    joined, alone = result.alignment.worlds
+    worlds = [replace(joined, members=(0, 2)), replace(alone, members=(1,))]
+    found = replace(result.alignment, worlds=worlds)
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: found)
+    shown = CliRunner().invoke(map_app, ["update", str(out), str(runs[0][2])])
+    assert shown.exit_code == 3 and "stays as it was" in shown.output
+    assert "friday: would no longer be part of the map" in shown.output and "elsewhere" not in shown.output.split("\n")[0]
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def test_an_update_goes_on_although_more_runs_met_elsewhere(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, result = merged
+    joined, alone = result.alignment.worlds
+    own, others = replace(joined, members=(0, 1, 2)), replace(alone, members=(3, 4, 5, 6))
+    found = replace(result.alignment, worlds=[others, own])
+    taken = []
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: found)
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.merge_runs", lambda *_, align, **__: taken.append(align([])))
+    update_map(out, [runs[0][2]])
+    assert [world.members for world in taken[0].worlds] == [(0, 1, 2), (3, 4, 5, 6)]
+
+
+def test_scans_that_are_not_all_there_are_no_smaller_map(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], tmp_path: Path
+) -> None:
+    """Cut between two scans the file reads as a shorter one, and once the joint map had a hole that nobody mentioned."""
+    cut = tmp_path / "monday"
+    shutil.copytree(runs[0][0], cut)
+    size = (cut / "scans.spool").stat().st_size
+    summary = read_slam_summary(cut / "run.json")
+    assert open_session_run(cut, "monday").session.name == "monday"
+    summary.model_copy(update={"spool_bytes": size + 1000}).write(cut / "run.json")
+    with pytest.raises(InputError, match=f"expected the {size + 1000} bytes of .*scans.spool – got {size}: it was cut"):
+        update_map(merged[0], [cut])
+
+
+def test_what_may_be_two_places_of_a_kind_is_joined_with_a_warning(merged: tuple[Path, MergeResult]) -> None:
+    alignment = merged[1].alignment
+    meetings = [replace(m, doubt="are at two places, perhaps") for m in alignment.meetings]
+    told = merge_facts(replace(alignment, meetings=meetings), ["a", "b", "c"], [None] * 3).warnings
+    assert told == ["friday and monday are at two places, perhaps; look at the map before you trust it"]
+    assert merge_facts(alignment, ["a", "b", "c"], [None] * 3).warnings == []
 
 
 def test_an_update_goes_on_with_a_map(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,7 +82,7 @@ def test_the_folder_holds_the_corrected_results_and_the_odometry_s_own(finished:
     corrected, own = read_trajectory(folder.trajectory), read_trajectory(folder.odometry.trajectory)
     np.testing.assert_array_equal(corrected.times, own.times)
     assert corrected.status == own.status
-    assert folder.spool.stat().st_size > 0
+    assert folder.spool.stat().st_size == finished.result.summary.spool_bytes > 0
     points = len(read_ply(folder.map_ply).points)  # merging thins what came in apart from each other
     assert 0.95 * summary.map_points < points <= summary.map_points and points > 1000
 
@@ -205,6 +206,28 @@ def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path
     spool.close()
     assert [scan.time_ns for scan in read_spool(tmp_path / "spool")] == [0, 1, 2, 0, 0]
     (tmp_path / "spool").write_bytes((tmp_path / "spool").read_bytes()[:-5])
+    with pytest.raises(InputError, match="run it again"):
+        list(read_spool(tmp_path / "spool"))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[:-24],  # two points: what is left is points all the same
+        lambda data: data[:8] + (2**60).to_bytes(8, "little") + data[16:],  # once more memory was asked for than there is
+        lambda data: data[:8] + (-3).to_bytes(8, "little", signed=True) + data[16:],
+        lambda data: data[:17] + b"\xff" * 8 + data[25:],  # a pose that is no number
+        lambda data: data[:40] + data[48:],
+    ],
+)
+def test_a_spool_that_is_damaged_is_not_read_as_another_one(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    pose = np.array([1.0, 0, 0, 0, 5.0, 0, 0])
+    spool = ScanSpool(tmp_path / "spool", None)
+    for k in range(3):
+        spool.append(SpooledScan(k, pose, np.arange(30, dtype=np.float32).reshape(-1, 3), None))
+    spool.close()
+    assert len(list(read_spool(tmp_path / "spool"))) == 3
+    (tmp_path / "spool").write_bytes(damage((tmp_path / "spool").read_bytes()))
     with pytest.raises(InputError, match="run it again"):
         list(read_spool(tmp_path / "spool"))
 

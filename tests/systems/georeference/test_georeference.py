@@ -267,6 +267,26 @@ def test_a_step_near_to_the_begin_is_said_and_none_that_is_gated(laps: Drive) ->
         assert len(said) == is_bent, (metres, result.warnings)
 
 
+USUAL = GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.5, "claimed": 0.7})
+
+
+@pytest.mark.parametrize("seed", [14, 20, 24])
+def test_a_usual_receiver_that_jumps_early_is_named(laps: Drive, seed: int) -> None:
+    """The fit with two datums bends the odometry rather than let one of them jump, and left much of the step."""
+    fixes = laps.fixes(USUAL, seed)
+    seconds = (fixes.time_ns - fixes.time_ns[0]) * 1e-9
+    moved = shifted(fixes, np.array([2.4, 1.8, 0.0]), seconds >= 0.3 * seconds[-1])
+    result = georeference(laps.graph, moved, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
+    assert any("fixes jump by" in text for text in [*result.warnings, result.contradiction or ""])
+
+
+@pytest.mark.parametrize("seed", [7, 14, 16, 23])
+def test_bursts_too_small_to_be_gated_are_no_step(laps: Drive, seed: int) -> None:
+    fixes = laps.fixes(USUAL.model_copy(update={"multipath": 3, "multipath_s": 6.0, "multipath_m": 1.5}), seed)
+    result = georeference(laps.graph, fixes, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
+    assert not any("fixes jump by" in text for text in [*result.warnings, result.contradiction or ""])
+
+
 HILLS = np.column_stack([np.array(LAPS, float), [0.0, 12.0, -3.0, 9.0, 0.0, 12.0, 3.0]])
 
 
@@ -283,6 +303,19 @@ def test_heights_that_do_not_go_along_are_named_where_the_way_climbs(climbs: boo
     said = [text for text in result.warnings if text.startswith("heights of the fixes go")]
     assert len(said) == (says is not None and climbs)
     assert all(says is not None and says in text for text in said)
+
+
+@pytest.mark.parametrize("feet", [True, False])
+def test_feet_over_low_hills_are_told_by_the_noise_that_is_stated(feet: bool) -> None:
+    """Errors that stay for a minute leave the ratio to three of its standard deviations; in metres they scatter as stated."""
+    there = drive(HILLS * [1.0, 1.0, 0.75], seed=2)
+    for seed in (1, 2, 3):
+        fixes = there.fixes(USUAL, seed)
+        lla = fixes.lat_lon_alt.copy()
+        lla[:, 2] /= 0.3048 if feet else 1.0
+        given = replace(fixes, lat_lon_alt=lla)
+        result = georeference(there.graph, given, there.time_ns, there.T_odo_imu, None, np.array(LEVER))
+        assert any("they are in feet" in text for text in result.warnings) is feet, result.warnings
 
 
 def test_a_lever_arm_with_the_wrong_sign_is_named(laps: Drive) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.sessions.config import SessionsConfig
-from boxplus.systems.sessions.other_alignments import fits_otherwise
+from boxplus.systems.sessions.other_alignments import fits_otherwise, other_alignments
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.sessions.session import Session
 
@@ -44,12 +44,15 @@ def session(name: str, points: NDArray[np.float64], seed: int) -> Places:
     return Places(Session.of(name, maps), CONFIG.slam)
 
 
+def otherwise(points: NDArray[np.float64]) -> str | None:
+    a, b = session("a", points, 1), session("b", points, 2)
+    return fits_otherwise(a, b, HERE, other_alignments(a, b, HERE, CONFIG), CONFIG)
+
+
 def test_a_room_that_is_the_same_from_either_end_fits_turned_by_half() -> None:
-    points = room((6.0, 6.0))
-    told = fits_otherwise(session("a", points, 1), session("b", points, 2), HERE, CONFIG)
+    told = otherwise(room((6.0, 6.0)))
     assert told is not None and "as wholes they fit as well turned by 180°" in told
 
 
 def test_a_room_that_widens_does_not() -> None:
-    points = room((2.0, 9.0))
-    assert fits_otherwise(session("a", points, 1), session("b", points, 2), HERE, CONFIG) is None
+    assert otherwise(room((2.0, 9.0))) is None

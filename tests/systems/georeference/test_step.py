@@ -1,0 +1,49 @@
+"""A step in the errors of fixes from near: one that lasts, one that comes and goes, and none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from boxplus.systems.georeference.step import step_at
+
+SECONDS = np.arange(100.0)
+
+
+def noise(seed: int, white: float = 0.5, slow: float = 0.5) -> NDArray[np.float64]:
+    """(100, 2) of a usual receiver [m]."""
+    random = np.random.default_rng(seed)
+    keep, state = np.exp(-1.0 / 60.0), random.standard_normal(2)
+    stays = []
+    for _ in SECONDS:
+        stays.append(state)
+        state = keep * state + np.sqrt(1.0 - keep**2) * random.standard_normal(2)
+    return slow * np.array(stays) + white * random.standard_normal((100, 2))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_step_that_lasts_is_told_and_as_long_as_it_is(seed: int) -> None:
+    step = step_at(SECONDS, noise(seed) + 3.0 * np.outer(SECONDS >= 40.0, [0.8, 0.6]), 40, 0.7)
+    assert step.is_told and not step.is_burst and step.metres == pytest.approx(3.0, abs=1.2)
+
+
+@pytest.mark.parametrize("duration", [5.0, 12.0, 20.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_burst_is_one_where_it_begins_and_where_it_ends(seed: int, duration: float) -> None:
+    burst = np.abs(SECONDS - 39.75 - 0.5 * duration) < 0.5 * duration
+    errors = noise(seed) + 3.0 * np.outer(burst, [0.8, 0.6])
+    for at in (40, 40 + int(duration)):
+        step = step_at(SECONDS, errors, at, 0.7)
+        assert step.is_burst and not step.is_told
+
+
+def test_noise_is_no_step_nor_is_a_map_that_bends() -> None:
+    bend = np.outer(0.04 * SECONDS, [1.0, -1.0])
+    told = [step_at(SECONDS, noise(seed) + bend, at, 0.7).is_told for seed in range(20) for at in (35, 50, 65)]
+    assert not any(told)
+
+
+def test_near_to_the_begin_there_is_as_much_as_there_is() -> None:
+    errors = noise(1) + 4.0 * np.outer(SECONDS >= 8.0, [1.0, 0.0])
+    assert step_at(SECONDS, errors, 8, 0.7).metres == pytest.approx(4.0, abs=1.5)
