@@ -43,6 +43,7 @@ def without_noise(
     *,
     cov_prior: NDArray[np.float64],
     used: int,
+    since_match: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """A and b without what noise of the normals claims about the pose.
 
@@ -51,6 +52,8 @@ def without_noise(
         directions: of the pose; the weak ones are left out.
         cov_prior: (6, 6) covariance of the pose before; zero where all of it counts as known.
         used: how many points that is.
+        since_match: (6,) how the pose has moved since the planes were found: they stay, so all of A moves b, and only the share
+            of the true normals says something of the world.
 
     Returns:
         (12, 12), (12,) to be used like A and b, zero where the points measure nothing; None where a covariance is none.
@@ -58,7 +61,7 @@ def without_noise(
     A_left, b_left = np.zeros((_DOF, _DOF)), np.zeros(_DOF)
     per_normal = _POINTS_A_NORMAL / max(used, 1)
     V, ratios, weak = directions.basis, directions.ratios, ~directions.measured
-    if not _take_off(A, b, V, ratios, weak, cov_prior, per_normal, A_left, b_left):
+    if not _take_off(A, b, V, ratios, weak, cov_prior, per_normal, since_match, A_left, b_left):
         return None
     return A_left, b_left
 
@@ -72,6 +75,7 @@ def _take_off(
     weak: NDArray[np.bool_],
     cov_prior: NDArray[np.float64],
     per_normal: float,
+    since_match: NDArray[np.float64],
     A_left: NDArray[np.float64],
     b_left: NDArray[np.float64],
 ) -> bool:
@@ -85,7 +89,7 @@ def _take_off(
     _product(U, False, cov_prior, False, inner)
     _product(inner, False, U, True, P)
 
-    # T reads a motion along the measured directions, G makes one of it.
+    # T reads a motion along the measured directions, G makes one of it: D = G T.
     T, G = np.zeros((6, 6)), np.zeros((6, 6))
     if not _read_into(U, P, ratios, weak, per_normal, T):
         return False
@@ -93,6 +97,15 @@ def _take_off(
         if not weak[j]:
             for i in range(6):
                 G[i, j] = V[i, j] * (1.0 - 1.0 / ratios[j])
+    D = inner
+    _product(G, False, T, False, D)
+    told = b.copy()
+    for j in range(6):
+        noise = since_match[j]
+        for k in range(6):
+            noise -= D[j, k] * since_match[k]
+        for i in range(_DOF):
+            told[i] -= A[i, j] * noise
 
     # Along the measured directions the points say B, with the pull of the residuals and C with the mounting. Noise of variance Q
     # added to what is read makes (B⁻¹ + Q)⁻¹ = B − B M B of it, M = √Q (I + √Q B √Q)⁻¹ √Q; what it knows of the mounting shrinks
@@ -103,7 +116,7 @@ def _take_off(
     _product(G, True, np.ascontiguousarray(A[:6, 6:]), False, C)
     for i in range(6):
         for k in range(6):
-            pull[i] += G[k, i] * b[k]
+            pull[i] += G[k, i] * told[k]
         if not weak[i]:
             root[i] = math.sqrt(2.0 * per_normal * max(P[i, i], 0.0)) / (ratios[i] - 1.0)
     M = np.empty((6, 6))
@@ -129,7 +142,7 @@ def _take_off(
     _product(C, True, M, False, lost)
     _product(lost, False, C, False, change)
     for i in range(6):
-        b_left[i], b_left[6 + i] = 0.0, b[6 + i]
+        b_left[i], b_left[6 + i] = 0.0, told[6 + i]
         for j in range(6):
             b_left[i] += reach[i, j] * pull[j]
             b_left[6 + i] -= lost[i, j] * pull[j]

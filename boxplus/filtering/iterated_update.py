@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.errors_in_variables import without_noise
-from boxplus.filtering.nav_state import TANGENT, boxplus_into
+from boxplus.filtering.nav_state import TANGENT, boxminus_into, boxplus_into
 from boxplus.filtering.update_step import map_step, move_covariance
 
 _CONVERGED = 1e-3  # every component of the step, rad and m (docs/lidar_inertial_odometry.md, section 7)
@@ -28,7 +28,7 @@ class Information:
 
     Attributes:
         A, b: (12, 12), (12,), Hᵀ R⁻¹ H and Hᵀ R⁻¹ z.
-        pull: (12,) what noise of H alone is expected to make of b.
+        pull: (12,) what noise of H alone is expected to have made of b where the correspondences were searched.
         directions: which directions of the pose it determines.
         used: how many of its parts (points, pixels) took part.
         residual_rms: root mean square of their residuals [m].
@@ -98,10 +98,14 @@ def iterated_update(
     x = x_prior.copy()
     delta = np.zeros(TANGENT)
     cov = np.zeros((TANGENT, TANGENT))
+    since_match, x_match = np.zeros(TANGENT), x
     pose_prior = np.ascontiguousarray(cov_prior[:6, :6])
     rematch, converged_before, converged = True, False, False
     steps = 0
     while True:
+        if rematch:
+            x_match = x.copy()
+        boxminus_into(x, x_match, since_match)
         information = measurement.at(x, rematch=rematch)
         left = without_noise(
             information.A,
@@ -109,6 +113,7 @@ def iterated_update(
             information.directions,
             cov_prior=pose_prior,
             used=information.used,
+            since_match=since_match[:6],
         )
         if information.used < min_used or left is None or not map_step(x, x_prior, cov_prior, *left, delta, cov):
             nothing = np.zeros_like(information.A)

@@ -61,7 +61,6 @@ def _add_noise(
     beside: tuple[float, float],
     weight: float,
     with_extrinsic: bool,
-    with_criterion: bool,
     row: NDArray[np.float64],
     pull: NDArray[np.float64],
     noise: NDArray[np.float64],
@@ -83,11 +82,10 @@ def _add_noise(
         pulled = factor * beside[k]
         for i in range(size):
             pull[i] += pulled * row[i]
-        if with_criterion:
-            for i in range(6):
-                wh = factor * row[i]
-                for j in range(i, 6):
-                    noise[i, j] += wh * row[j]
+        for i in range(6):
+            wh = factor * row[i]
+            for j in range(i, 6):
+                noise[i, j] += wh * row[j]
 
 
 @kernel
@@ -120,7 +118,7 @@ def accumulate_planes(
         with_extrinsic: whether the six columns of the extrinsic are measured.
         A, b: (12, 12), (12,), added to.
         pull: (12,), added to: what noise of the normals is expected to make of b.
-        with_criterion: whether `signal` and `noise` are wanted.
+        with_criterion: whether `pull`, `signal` and `noise` are wanted.
         signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
             alone would give.
         sums: (2,) += [used points, Σ z²].
@@ -161,8 +159,8 @@ def accumulate_planes(
             b[i] += wh * z
             for j in range(i, size):
                 A[i, j] += wh * h[j]
-        _add_noise(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, with_criterion, row, pull, noise)
         if with_criterion:
+            _add_noise(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, row, pull, noise)
             for i in range(6):
                 wh = weight * h[i]
                 for j in range(i, 6):

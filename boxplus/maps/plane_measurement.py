@@ -83,6 +83,7 @@ class PlaneMeasurement:
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
         self._matched_at = np.zeros(PACKED)
+        self._pull = np.zeros(MEASURED_DOF)
         self._directions: PoseDirections
         squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
         self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
@@ -99,11 +100,12 @@ class PlaneMeasurement:
             total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=True)
         A, b, pull, signal, noise, sums = total
         if matches:  # in between the planes stay, and what they can tell
+            self._pull = pull
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
             self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
-        return Information(A * self._weight, b * self._weight, pull * self._weight, self._directions, used, rms)
+        return Information(A * self._weight, b * self._weight, self._pull * self._weight, self._directions, used, rms)
 
     def in_parts(
         self, x: NDArray[np.float64], bounds: Sequence[int], *, rematch: bool

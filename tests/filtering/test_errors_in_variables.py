@@ -29,7 +29,7 @@ def _taken(
     A: np.ndarray, b: np.ndarray, directions: PoseDirections, cov_prior: np.ndarray = KNOWN, used: int = MANY
 ) -> tuple[np.ndarray, np.ndarray]:
     """What is taken in of planes that were found at this pose."""
-    left = without_noise(A, b, directions, cov_prior=cov_prior, used=used)
+    left = without_noise(A, b, directions, cov_prior=cov_prior, used=used, since_match=np.zeros(6))
     assert left is not None
     return left
 
@@ -48,7 +48,7 @@ def test_a_covariance_that_is_none_makes_no_update() -> None:
     for axis in np.eye(3)[:2]:
         directions = with_weak_axis(directions, axis)
     impossible = np.diag([1.0, 1.0, 1.0, 3.0, -1.0, 1.0])
-    assert without_noise(np.eye(12), np.ones(12), directions, cov_prior=impossible, used=100) is None
+    assert without_noise(np.eye(12), np.ones(12), directions, cov_prior=impossible, used=100, since_match=np.zeros(6)) is None
 
 
 @given(seeds)
@@ -199,13 +199,12 @@ class HeldPlanes:
         self.steps.append(p.copy())
         if rematch:
             self.found_at = p.copy()
-        A, b, pull, N = np.zeros((12, 12)), np.zeros(12), np.zeros(12), 1e5 * np.eye(6)
+        A, b, N = np.zeros((12, 12)), np.zeros(12), 1e5 * np.eye(6)
         A[:3, :3] = 1e8 * np.eye(3)
         N[3:, 3:] = self.noise
         A[3:6, 3:6] = self.true + self.noise
         b[3:6] = self.true @ (self.found_at - self.p_world_imu) + A[3:6, 3:6] @ (p - self.found_at)
-        pull[3:6] = self.noise @ (p - self.found_at)
-        return Information(A, b, pull, pose_directions(A[:6, :6], N, 1.0, 1.3), MANY, 0.0)
+        return Information(A, b, np.zeros(12), pose_directions(A[:6, :6], N, 1.0, 1.3), MANY, 0.0)
 
     def has_moved(self, x: np.ndarray) -> bool:
         del x

@@ -83,9 +83,9 @@ class HeldMounting:
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """See `Measurement`."""
         self.last = self._measurement.at(x, rematch=rematch)
-        A, b = self.last.A.copy(), self.last.b.copy()
-        A[6:], A[:, 6:], b[6:] = 0.0, 0.0, 0.0
-        return replace(self.last, A=A, b=b)
+        A, b, pull = self.last.A.copy(), self.last.b.copy(), self.last.pull.copy()
+        A[6:], A[:, 6:], b[6:], pull[6:] = 0.0, 0.0, 0.0, 0.0
+        return replace(self.last, A=A, b=b, pull=pull)
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """See `Measurement`."""
@@ -153,6 +153,7 @@ def moved_sensitivity(
         information.directions,
         cov_prior=np.ascontiguousarray(cov_prior[_POSE, _POSE]),
         used=information.used,
+        since_match=np.zeros(6),
     )
     if left is None:
         return B
