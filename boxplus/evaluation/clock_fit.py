@@ -28,6 +28,7 @@ _LEAST_OF_RATE = 5  # stretches, as it takes two numbers
 _MOST_SAMPLES = 2000
 _SLOPE_S = 0.1  # shortest time over which a velocity is taken
 _TURN_S = 0.5  # over which rotations are compared
+_TOLD_BY_REST = 1e-6  # least eigenvalue of what all stretches but one tell, by what all of them do
 _GAP_S, _GAP_STEPS = 0.25, 5.0  # and that of median steps: what is farther apart is not interpolated
 _STEPS, _SETTLED_S = 10, 1e-5
 # Standard deviations, and times (of squares), by which an offset fits worse than another that refutes it.
@@ -150,6 +151,10 @@ class MotionPair:
             if abs(step[0]) + abs(step[1]) * half_s < _SETTLED_S:
                 break
         else:
+            return None
+        # Where one stretch alone tells them, how far they scatter is not known.
+        scale = np.sqrt(np.outer(told.diagonal(), told.diagonal()))
+        if not all(np.linalg.eigvalsh((told - part.told) / scale)[0] > _TOLD_BY_REST for part in parts):
             return None
         without = [
             np.linalg.solve(told - part.told, np.sum([other.pull for other in parts if other is not part], axis=0))

@@ -60,6 +60,7 @@ def locked_beside(folder: Path, program: str) -> Iterator[FolderLock]:
     """
     make_folder(folder.parent)
     with _locked(folder.with_name(folder.name + BESIDE), folder, program) as lock:
+        lock.keep_file = False  # what a killed process left beside the folder goes with the next one
         yield lock
 
 

@@ -37,11 +37,11 @@ class Lead:
     over: str | None
 
 
-def lead_of(place: Places, query: Places, T_place_query: Floats, others: list[Floats], config: SessionsConfig) -> Lead:
-    """The lead of an alignment (7,) of two sessions over others that look alike."""
+def lead_of(place: Places, query: Places, T_place_query: Floats, others: list[Floats], config: SessionsConfig) -> Lead | None:
+    """The lead of an alignment (7,) of two sessions over others that look alike; None where too little stands to compare."""
     here = _distance(place, query, T_place_query, None, config)
     if here is None:
-        return Lead(0.0, None)
+        return None
     rivals = [(d, other) for other in others if (d := _distance(place, query, other, T_place_query, config)) is not None]
     nearest, best = min(rivals, key=lambda rival: rival[0], default=(_FAR, None))
     share = 1.0 - here / max(nearest, 1e-9)

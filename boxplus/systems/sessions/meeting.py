@@ -129,12 +129,15 @@ class _Meeting:
         if otherwise := fits_otherwise(self.place, self.query, T, others, self.config):
             return self._refused(otherwise, predicted, confirmed, share)
         lead, asked = lead_of(self.place, self.query, T, others, self.config), self.config.least_lead
-        if lead.share < asked:
+        if lead is None and others:
+            why = "something else looks alike, and too little stands upright where they lie over each other to compare the two"
+            return self._refused(why, predicted, confirmed, share)
+        if lead is not None and lead.share < asked:
             why = f"what stands lies {100.0 * lead.share:.0f} % nearer to surfaces of the other than {lead.over or 'anywhere'}"
             why = f"two places of a kind, perhaps: {why}, {100.0 * asked:.0f} % are asked for"
             return self._refused(why, predicted, confirmed, share)
         doubt = None
-        if lead.over is not None and lead.share < _CLEAR:
+        if lead is not None and lead.over is not None and lead.share < _CLEAR:
             doubt = (
                 f"are at the same place or at two of a kind: what stands lies only {100.0 * lead.share:.0f} % nearer to surfaces "
                 f"of the other than {lead.over}"

@@ -33,6 +33,12 @@ def test_nothing_is_left_beside_it(street: Path) -> None:
     assert (street / "encounters.csv").read_text() == "new" and os.listdir(street.parent) == ["street"]
 
 
+def test_the_lock_that_a_killed_process_left_goes_with_the_next_one(street: Path) -> None:
+    (street.parent / "street.boxplus-lock").write_text('{"program": "boxplus map merge", "process": 1}')
+    go_on(street)
+    assert os.listdir(street.parent) == ["street"]
+
+
 def test_a_second_process_is_kept_out_from_the_first_look_on(street: Path) -> None:
     """Once it removed what the first one was writing, or took the place of its map: one of two updates was lost."""
     expected = f"expected an output folder that no other run is writing to – got process {os.getpid()} writing to {street}"

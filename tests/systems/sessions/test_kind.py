@@ -32,7 +32,9 @@ def aisle(seed: int, moved: float = 0.0) -> NDArray[np.float64]:
 
 
 def lead(first: NDArray[np.float64], second: NDArray[np.float64], others: list[NDArray[np.float64]]) -> float:
-    return lead_of(session("a", first, 1), session("b", second, 2), HERE, others, CONFIG).share
+    found = lead_of(session("a", first, 1), session("b", second, 2), HERE, others, CONFIG)
+    assert found is not None
+    return found.share
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -46,12 +48,18 @@ def test_an_aisle_is_told_from_another_one_of_its_kind(seed: int) -> None:
 
 def test_what_it_leads_over_is_said_where_there_is_anything() -> None:
     a, b = session("a", aisle(1), 1), session("b", aisle(1), 2)
-    assert lead_of(a, b, HERE, [NEXT_BAY], CONFIG).over == "2.8 m away"
-    alone = lead_of(a, b, HERE, [], CONFIG)
-    assert alone.over is None and alone.share > 0.5
+    over, alone = lead_of(a, b, HERE, [NEXT_BAY], CONFIG), lead_of(a, b, HERE, [], CONFIG)
+    assert over is not None and over.over == "2.8 m away"
+    assert alone is not None and alone.over is None and alone.share > 0.5
 
 
 def test_an_alignment_from_which_everything_comes_back_is_no_other_one() -> None:
     a, b = session("a", aisle(1), 1), session("b", aisle(1), 2)
     beside = se3.compose(HERE, np.array([1.0, 0.0, 0.0, 0.0, 0.2, 0.1, 0.0]))
-    assert lead_of(a, b, HERE, [beside], CONFIG).over is None
+    found = lead_of(a, b, HERE, [beside], CONFIG)
+    assert found is not None and found.over is None
+
+
+def test_what_stands_too_little_is_not_compared() -> None:
+    ground = np.stack(np.meshgrid(np.arange(-17.0, 17.1, 0.5), np.arange(-2.0, 2.1, 0.5), [0.0]), axis=-1).reshape(-1, 3)
+    assert lead_of(session("a", ground, 1), session("b", ground, 2), HERE, [NEXT_BAY], CONFIG) is None
