@@ -101,8 +101,7 @@ class IkdTree:
         if threads < 1:
             raise InputError("threads of at least 1", str(threads), "take 1")
         self._guard = ThreadGuard("IkdTree")
-        self.cell_size = cell_size
-        self.threads = threads
+        self.cell_size, self.threads = cell_size, threads
         self.origin: NDArray[np.float64] = np.zeros(3)
         self._rebuild = rebuild
         self._delete_ratio = delete_ratio
@@ -133,9 +132,8 @@ class IkdTree:
             self.origin = as_corner(origin, "origin")
         relative, not_finite, too_far = self._to_relative(world)
         self._pool = build_pool(np.pad(relative, ((0, 0), (0, 1))))
-        self._job["live"], self._job["queued"], self._job["depth"] = len(relative), 0, 0
-        self._revivable = 0
-        return InsertReport(len(relative), 0, not_finite, too_far, self._near(world))
+        self._job["live"], self._job["queued"], self._job["depth"], self._revivable = len(relative), 0, 0, 0
+        return InsertReport(len(relative), 0, not_finite, too_far, (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1))
 
     @changes
     def insert(self, points: ArrayLike, *, downsample: bool = False) -> InsertReport:
@@ -154,7 +152,7 @@ class IkdTree:
         operations = np.empty(len(relative), OPERATION)
         fill_operations(relative, INSERT_DOWNSAMPLED if downsample else INSERT, operations)
         inserted = self._update(operations)
-        stored = np.ones(len(world), bool) if len(relative) == len(world) else self._near(world)
+        stored = (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1)
         stored[stored] = operations["kind"] == INSERT
         return InsertReport(inserted, len(relative) - inserted, not_finite, too_far, stored)
 
@@ -314,8 +312,7 @@ class IkdTree:
 
     def _update_boxes(self, boxes: NDArray[np.float32], kind: np.int64) -> int:
         operations = np.empty(len(boxes), OPERATION)
-        operations["box"] = boxes
-        operations["kind"] = kind
+        operations["box"], operations["kind"] = boxes, kind
         return self._update(operations)
 
     def _update(self, operations: NDArray[np.void]) -> int:
@@ -380,15 +377,10 @@ class IkdTree:
         if not self._placed:
             finite = world[np.isfinite(world).all(axis=1)]
             if len(finite):
-                self.origin = np.round(np.median(finite, axis=0))
-                self._placed = True
+                self.origin, self._placed = np.round(np.median(finite, axis=0)), True
         relative = np.empty(world.shape, np.float32)
         kept, not_finite = keep_near(np.ascontiguousarray(world), self.origin, MAX_EXTENT, relative)
         return relative[:kept], not_finite, len(world) - kept - not_finite
-
-    def _near(self, world: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(N,) which of the points `_to_relative` keeps."""
-        return np.asarray((np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1))
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""

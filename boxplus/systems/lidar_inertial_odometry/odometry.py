@@ -74,8 +74,7 @@ class LidarInertialOdometry(Snapshots):
 
     def __init__(self, config: LioConfig | None = None, *, live: bool = False) -> None:
         self.config, self._live = as_settings(LioConfig, config), live
-        self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
-        self._arrivals = FirstArrivals(self.config.map_cell)
+        self.map, self._arrivals = IkdTree(cell_size=self.config.map_cell), FirstArrivals(self.config.map_cell)
         self.start: Start | None = None
         self.start_problem: str | None = None
         self._sequencer = Sequencer()
@@ -182,8 +181,7 @@ class LidarInertialOdometry(Snapshots):
         self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self.start, self._standstill = None, None
-        self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
-        self._arrivals = FirstArrivals(self.config.map_cell)
+        self.map, self._arrivals = IkdTree(cell_size=self.config.map_cell), FirstArrivals(self.config.map_cell)
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._excitation = RotationExcitation()
         return after_gap(frame)
