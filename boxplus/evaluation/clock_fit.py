@@ -160,7 +160,7 @@ class MotionPair:
             np.linalg.solve(told - part.told, np.sum([other.pull for other in parts if other is not part], axis=0))
             for part in parts
         ]
-        spread = np.sqrt((len(parts) - 1) / len(parts) * ((without - np.mean(without, axis=0)) ** 2).sum(axis=0))
+        spread = _scatter(np.array(without))
         rate, offset = (float(value) for value in at[::-1])
         return ClockRate(rate, float(spread[1]), offset, float(spread[0]), self._begin_ns + round(1e9 * middle_s), half_s)
 
@@ -327,8 +327,13 @@ def jackknife(pull: NDArray[np.float64], told: NDArray[np.float64]) -> float:
     without = told.sum() - told
     if len(told) < 2 or not (without > 0.0).all():
         return math.inf
-    offsets = (pull.sum() - pull) / without
-    return float(np.sqrt((len(offsets) - 1) / len(offsets) * ((offsets - offsets.mean()) ** 2).sum()))
+    return float(_scatter((pull.sum() - pull) / without))
+
+
+def _scatter(without: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of what k stretches tell together, from what is told (k, …) when each is left out."""
+    variance = (len(without) - 1) / len(without) * ((without - without.mean(axis=0)) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt(variance))
 
 
 class _Covered:

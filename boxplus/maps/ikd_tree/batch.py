@@ -36,18 +36,23 @@ from boxplus.maps.ikd_tree.update import (
 
 @kernel(borrow=True)
 def keep_near(
-    world: NDArray[np.float64], origin: NDArray[np.float64], extent: float, relative: NDArray[np.float32]
+    world: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    extent: float,
+    relative: NDArray[np.float32],
+    is_near: NDArray[np.bool_],
 ) -> tuple[np.int64, np.int64]:
     """Write the points (N, 3) that are within `extent` of the origin on each axis to the first rows of `relative` (N, 3).
 
-    Returns how many these are, and how many of the others are not finite.
+    Returns how many these are, and how many of the others are not finite; `is_near` (N,) receives which these are.
     """
     kept, not_finite = np.int64(0), np.int64(0)
     for row in range(len(world)):
         x, y, z = world[row, 0], world[row, 1], world[row, 2]
         not_finite += np.int64(not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)))
         x, y, z = x - origin[0], y - origin[1], z - origin[2]
-        if abs(x) <= extent and abs(y) <= extent and abs(z) <= extent:
+        is_near[row] = abs(x) <= extent and abs(y) <= extent and abs(z) <= extent
+        if is_near[row]:
             relative[kept, 0], relative[kept, 1], relative[kept, 2] = np.float32(x), np.float32(y), np.float32(z)
             kept += 1
     return kept, not_finite

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Literal, NamedTuple, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import run_chunks
 from boxplus._thread_guard import ThreadGuard, changes, reads
 from boxplus.errors import InputError
+from boxplus.maps.ikd_tree.answers import InsertReport, Neighbors
 from boxplus.maps.ikd_tree.batch import fill_operations, keep_near, update_batch
 from boxplus.maps.ikd_tree.check import check_tree
 from boxplus.maps.ikd_tree.collect import collect, nearest_batch
@@ -31,24 +32,6 @@ _BUDGET = 20_000  # point visits of a rebuild a call ...
 _BUDGET_PER_POINT = 800  # ... and for every point the call added or removed: large enough that a rebuild is over soon
 _ROOM = 128  # nodes made ready for a kernel call; it stops and asks again when they are used up
 _QUERY_CHUNK = 2048
-
-
-class InsertReport(NamedTuple):
-    """What became of the points given to `insert` or `build`."""
-
-    inserted: int  #: points stored (with downsampling: winners of their cells)
-    superseded: int  #: points not stored because their cell has one
-    not_finite: int  #: rejected: a coordinate is NaN or infinite
-    too_far: int  #: rejected: farther than 100 km from the origin on an axis
-    stored: NDArray[np.bool_]  #: (N,) which of the points given were stored
-
-
-class Neighbors(NamedTuple):
-    """The nearest neighbours of M queries."""
-
-    distances: NDArray[np.float64]  #: (M, k) ascending [m]; inf where there are fewer than k
-    points: NDArray[np.float64]  #: (M, k, 3) [m]; nan where there are fewer than k
-    counts: NDArray[np.int64]  #: (M,) how many were found
 
 
 class IkdTree:
@@ -101,7 +84,8 @@ class IkdTree:
         if threads < 1:
             raise InputError("threads of at least 1", str(threads), "take 1")
         self._guard = ThreadGuard("IkdTree")
-        self.cell_size, self.threads = cell_size, threads
+        self.cell_size = cell_size
+        self.threads = threads
         self.origin: NDArray[np.float64] = np.zeros(3)
         self._rebuild = rebuild
         self._delete_ratio = delete_ratio
@@ -130,10 +114,11 @@ class IkdTree:
         self._placed = origin is not None
         if origin is not None:
             self.origin = as_corner(origin, "origin")
-        relative, not_finite, too_far = self._to_relative(world)
+        relative, not_finite, stored = self._to_relative(world)
         self._pool = build_pool(np.pad(relative, ((0, 0), (0, 1))))
-        self._job["live"], self._job["queued"], self._job["depth"], self._revivable = len(relative), 0, 0, 0
-        return InsertReport(len(relative), 0, not_finite, too_far, (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1))
+        self._job["live"], self._job["queued"], self._job["depth"] = len(relative), 0, 0
+        self._revivable = 0
+        return InsertReport(len(relative), 0, not_finite, len(world) - len(relative) - not_finite, stored)
 
     @changes
     def insert(self, points: ArrayLike, *, downsample: bool = False) -> InsertReport:
@@ -148,12 +133,12 @@ class IkdTree:
         if downsample and self.cell_size is None:
             raise InputError("a cell_size for a downsampled insert", "none", "give IkdTree a cell_size, or insert all points")
         world = as_points(points, "points")
-        relative, not_finite, too_far = self._to_relative(world)
+        relative, not_finite, stored = self._to_relative(world)
         operations = np.empty(len(relative), OPERATION)
         fill_operations(relative, INSERT_DOWNSAMPLED if downsample else INSERT, operations)
         inserted = self._update(operations)
-        stored = (np.abs(world - self.origin) <= MAX_EXTENT).all(axis=1)
         stored[stored] = operations["kind"] == INSERT
+        too_far = len(world) - len(relative) - not_finite
         return InsertReport(inserted, len(relative) - inserted, not_finite, too_far, stored)
 
     @changes
@@ -312,7 +297,8 @@ class IkdTree:
 
     def _update_boxes(self, boxes: NDArray[np.float32], kind: np.int64) -> int:
         operations = np.empty(len(boxes), OPERATION)
-        operations["box"], operations["kind"] = boxes, kind
+        operations["box"] = boxes
+        operations["kind"] = kind
         return self._update(operations)
 
     def _update(self, operations: NDArray[np.void]) -> int:
@@ -372,15 +358,16 @@ class IkdTree:
             self._rebuilder.complete(self._pool)
             self._pool = self._rebuilder.swap(self._pool)
 
-    def _to_relative(self, world: NDArray[np.float64]) -> tuple[NDArray[np.float32], int, int]:
-        """(N, 3) float32 relative to the origin, and how many points were not finite or too far."""
+    def _to_relative(self, world: NDArray[np.float64]) -> tuple[NDArray[np.float32], int, NDArray[np.bool_]]:
+        """The points near enough, float32 relative to the origin; how many are not finite; (N,) which of all are near enough."""
         if not self._placed:
             finite = world[np.isfinite(world).all(axis=1)]
             if len(finite):
-                self.origin, self._placed = np.round(np.median(finite, axis=0)), True
-        relative = np.empty(world.shape, np.float32)
-        kept, not_finite = keep_near(np.ascontiguousarray(world), self.origin, MAX_EXTENT, relative)
-        return relative[:kept], not_finite, len(world) - kept - not_finite
+                self.origin = np.round(np.median(finite, axis=0))
+                self._placed = True
+        relative, is_near = np.empty(world.shape, np.float32), np.empty(len(world), np.bool_)
+        kept, not_finite = keep_near(np.ascontiguousarray(world), self.origin, MAX_EXTENT, relative, is_near)
+        return relative[:kept], not_finite, is_near
 
     def _relative_box(self, lo: ArrayLike, hi: ArrayLike) -> NDArray[np.float32]:
         """(1, 6) float32: `x ≥ lo` and `x < hi` have the same answer for a stored x after both are rounded up."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
-from boxplus.systems.sessions.other_alignments import difference, is_same, nearest_pairs, spread
+from boxplus.systems.sessions.other_alignments import difference, is_same, laid_over, nearest_pairs, spread
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats
 from boxplus.systems.slam.registration import mean_distance, register
@@ -55,18 +55,16 @@ def _distance(place: Places, query: Places, T_place_query: Floats, found: Floats
         found: (7,) the alignment that was found; a pair that comes back to it does not count.
     """
     registration, total, count = config.slam.registration, 0.0, 0
-    T_place, T_query = place.session.T_session_map, query.session.T_session_map
-    for number, where in spread(nearest_pairs(place, query, T_place_query, config), _PAIRS):
-        own, there = query.surface(number), place.surface(where)
+    for pair in spread(nearest_pairs(place, query, T_place_query, config), _PAIRS):
+        own, there = query.surface(pair[0]), place.surface(pair[1])
         if not (len(own.points) and len(there.points)):
             continue
-        laid = se3.compose(se3.inverse(T_place[where]), se3.compose(T_place_query, T_query[number]))
-        made = register(own, there, laid, registration)
+        made = register(own, there, laid_over(place, query, pair, T_place_query), registration)
         if made is None:
             continue
         T = made.T_target_source
         if found is not None:
-            first = se3.compose(se3.inverse(T_place[where]), se3.compose(found, T_query[number]))
+            first = laid_over(place, query, pair, found)
             if is_same(se3.log(se3.compose(se3.inverse(first), T)), config):
                 continue
         for a, b, T_b_a in ((own, there, T), (there, own, se3.inverse(T))):

@@ -100,6 +100,13 @@ def nearest_pairs(place: Places, query: Places, T_place_query: Floats, config: S
     return found
 
 
+def laid_over(place: Places, query: Places, pair: tuple[int, int], T_place_query: Floats) -> Floats:
+    """(7,) where an alignment of two sessions puts a local map of the query session in the frame of one of the other's."""
+    number, where = pair
+    T_place, T_query = place.session.T_session_map[where], query.session.T_session_map[number]
+    return se3.compose(se3.inverse(T_place), se3.compose(T_place_query, T_query))
+
+
 class _AsFound:
     """How well local maps of the query session lie where the alignment that was found has them; each looked at once.
 
@@ -125,8 +132,7 @@ class _AsFound:
         if where is None or not (len(query.session.maps[number].points) and len(place.session.maps[where].points)):
             return 0.0, _TOLERANCE * _RMS_FLOOR
         own, there = query.surface(number), place.surface(where)
-        T = place.session.T_session_map[where], query.session.T_session_map[number]
-        found = register(own, there, se3.compose(se3.inverse(T[0]), se3.compose(self.T_place_query, T[1])), self._config)
+        found = register(own, there, laid_over(place, query, (number, where), self.T_place_query), self._config)
         if found is None:
             return 0.0, _TOLERANCE * _RMS_FLOOR
         tolerance = _TOLERANCE * max(found.rms, _RMS_FLOOR)
@@ -148,8 +154,7 @@ def _fits(
     number, where = pair
     if not (len(query.session.maps[number].points) and len(place.session.maps[where].points)):
         return False
-    T = place.session.T_session_map[where], query.session.T_session_map[number]
-    start, first = (se3.compose(se3.inverse(T[0]), se3.compose(A, T[1])) for A in (T_other, as_found.T_place_query))
+    start, first = (laid_over(place, query, pair, A) for A in (T_other, as_found.T_place_query))
     own, there = query.surface(number), place.surface(where)
     found = register(own, there, start, config.slam.registration)
     if found is None:
