@@ -11,6 +11,7 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.formats.output import put_back, replaced_folder
 from boxplus.runs.run_folder import is_map_file
+from boxplus.runs.sessions.summary import MergeSummary, read_merge_summary
 from boxplus.runs.storage.folder_lock import locked_beside
 from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
@@ -101,12 +102,31 @@ def claim_merge_folder(folder: str | Path, *, overwrite: bool = False) -> Iterat
         yield ClaimedMerge(path)
 
 
+@contextmanager
+def claim_joint_map(folder: str | Path) -> Iterator[tuple[ClaimedMerge, MergeSummary]]:
+    """The folder of an earlier merge, which is to be replaced, locked while the block runs; and what is known of it.
+
+    Raises:
+        InputError: no results of 'boxplus map merge', or other files beside them; another process is writing there.
+        OutputError: the folder that holds it cannot be written.
+    """
+    path = Path(folder).resolve()
+    if not path.parent.is_dir():
+        read_merge_summary(path / SUMMARY)  # refuses what is not there, before a lock makes folders for it
+    with locked_beside(path, PROGRAM):
+        put_back(path)
+        before = read_merge_summary(path / SUMMARY)
+        if others := [name for name in _files(path) if not _is_own(name)]:
+            raise InputError("a joint map and nothing else", f"{path / others[0]}", "move it away: the whole folder is replaced")
+        yield ClaimedMerge(path), before
+
+
 def _refuse_what_is_there(path: Path, overwrite: bool) -> None:
-    names = [file.relative_to(path) for file in path.rglob("*") if not file.is_dir()]
+    names = _files(path)
     if not names:
         return
     is_own = (path / SUMMARY).is_file() and program_of(path / SUMMARY) == PROGRAM
-    if not is_own or any(not (_OWN.fullmatch(name.as_posix()) or _is_tile(name)) for name in names):
+    if not is_own or not all(map(_is_own, names)):
         raise InputError("a new or empty output folder", f"other files in {path}", "choose another folder with --output")
     if not overwrite:
         raise InputError(
@@ -115,5 +135,10 @@ def _refuse_what_is_there(path: Path, overwrite: bool) -> None:
         )  # fmt: skip
 
 
-def _is_tile(name: Path) -> bool:
-    return name.parts[0] == "map" and is_map_file(Path(*name.parts[1:]))
+def _files(path: Path) -> list[Path]:
+    return [file.relative_to(path) for file in path.rglob("*") if not file.is_dir()]
+
+
+def _is_own(name: Path) -> bool:
+    """Whether a merge writes a file of this name, relative to its folder."""
+    return bool(_OWN.fullmatch(name.as_posix())) or (name.parts[0] == "map" and is_map_file(Path(*name.parts[1:])))

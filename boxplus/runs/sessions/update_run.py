@@ -8,11 +8,11 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.runs.sessions.config import MergeConfig
-from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_merge_folder
+from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_joint_map
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
 from boxplus.runs.sessions.repeated import refuse_repeated
 from boxplus.runs.sessions.session_run import open_session_run, session_names
-from boxplus.runs.sessions.summary import read_merge_summary
+from boxplus.runs.sessions.summary import MergeSummary
 from boxplus.runs.settings_file import load_settings
 from boxplus.systems.sessions.encounter import Meeting
 from boxplus.systems.sessions.sessions import SessionAlignment, align_sessions
@@ -40,15 +40,17 @@ def update_map(
             `merge_runs` refuses.
         OutputError: the disk is full; the earlier map stays whole.
     """
-    with claim_merge_folder(merged, overwrite=True) as claimed:
-        return _updated(claimed, folders, progress)
+    with claim_joint_map(merged) as (claimed, before):
+        return _updated(claimed, before, folders, progress)
 
 
 def _updated(
-    claimed: ClaimedMerge, folders: Sequence[str | Path], progress: Callable[[Meeting], None] | None
+    claimed: ClaimedMerge,
+    before: MergeSummary,
+    folders: Sequence[str | Path],
+    progress: Callable[[Meeting], None] | None,
 ) -> tuple[MergeResult | None, SessionAlignment]:
     own = MergeFolder(claimed.path)
-    before = read_merge_summary(own.summary)
     known = [Path(session.run) for session in before.joined]
     if not known:
         raise InputError("a joint map", f"{own.path}, in which no two runs met", "use 'boxplus map merge' with all runs")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.runs.sessions.folder import claim_merge_folder
+from boxplus.runs.sessions.folder import claim_joint_map, claim_merge_folder
 
 SUMMARY = '{"program": "boxplus map merge"}'
 
@@ -80,3 +80,17 @@ def test_a_map_that_was_left_between_two_renames_is_put_back_before_anybody_look
     street.rename(street.with_name("street.boxplus-earlier"))
     with claim_merge_folder(street, overwrite=True) as claimed:
         assert (claimed.path / "encounters.csv").read_text() == "old"
+
+
+def test_an_update_of_what_is_no_map_makes_no_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="street"), claim_joint_map(tmp_path / "mistyped" / "street"):
+        pass
+    assert not os.listdir(tmp_path)
+
+
+def test_an_update_replaces_no_file_that_is_not_of_the_map(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("boxplus.runs.sessions.folder.read_merge_summary", lambda _: None)  # this one is too short to be read
+    (street / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"notes\.txt – move it away"), claim_joint_map(street):
+        pass
+    assert (street / "notes.txt").read_text() == "mine" and os.listdir(street.parent) == ["street"]
