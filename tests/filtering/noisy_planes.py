@@ -22,13 +22,12 @@ def information(x: NavState, normals: np.ndarray, p_imu: np.ndarray, z: np.ndarr
 
 def noise(x: NavState, normals: np.ndarray, p_imu: np.ndarray, tilt: float = TILT) -> np.ndarray:
     """N of the same points: what normals that are off by `tilt` about each axis in the plane contribute by themselves."""
-    N = np.zeros((6, 6))
-    for u, s in zip(normals, p_imu, strict=True):
-        _, _, frame = np.linalg.svd(u[None, :])
-        for g in tilt * frame[1:]:
-            row = np.concatenate([np.cross(s, x.R_world_imu.T @ g), g])
-            N += 1e4 * np.outer(row, row)
-    return N
+    # [θ, p] moves a point by p_imu × (Rᵀ g) + g along a tilt g; tilts of both axes together are tilt² (I − u uᵀ).
+    lever = np.cross(p_imu[:, None, :], x.R_world_imu[None, :, :]).transpose(0, 2, 1)
+    rows = np.concatenate([lever, np.broadcast_to(np.eye(3), lever.shape)], axis=1)
+    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    total: np.ndarray = 1e4 * tilt**2 * np.einsum("nij,njk,nlk->il", rows, across, rows, optimize=True)
+    return total
 
 
 def tilted(random: np.random.Generator, normals: np.ndarray, tilt: float = TILT) -> np.ndarray:
