@@ -1,7 +1,8 @@
-# make demo    simulate a walk, run the odometry on it, compare with the truth, write demo/report.html
-# make test    run the test suite
-# make lint    ruff and mypy
-# make docs    the documentation as a site, site/index.html; a warning is an error
+# make demo       simulate a walk, run the odometry on it, compare with the truth, write demo/report.html
+# make test       run the test suite, but for what takes long
+# make test-slow  run the rest of it: long recordings, many repetitions, whole commands
+# make lint       ruff and mypy
+# make docs       the documentation as a site, site/index.html; a warning is an error
 #
 # Each target sets up what it needs in .venv, once. PYTHON names another interpreter, 3.11 or later.
 
@@ -15,13 +16,16 @@ DEMO_ARGS ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input --quiet --quiet
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test test-slow lint docs clean
 
 demo: $(VENV)/.runtime
 	@$(BIN)/boxplus demo -o $(OUTPUT) $(DEMO_ARGS)
 
 test: $(VENV)/.dev
-	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.dev
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow $(PYTEST_ARGS)
 
 lint: $(VENV)/.dev
 	@$(BIN)/ruff check .
