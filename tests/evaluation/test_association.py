@@ -123,6 +123,7 @@ def wandering(seed: int, speed: float, late_s: float = 0.0, noise_m: float = 0.0
     return Trajectory(start[rows] + round(late_s * 1e9), noisy[rows], q[rows]), truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [0.0, 0.01, 0.3])
 def test_the_offset_of_a_clock_comes_with_a_deviation_that_holds(late_s: float) -> None:
     ratios = []
@@ -217,6 +218,7 @@ def _walked_in_circles(late_s: float, seed: int) -> tuple[Trajectory, Trajectory
     return Trajectory(exact.times + round(late_s * 1e9), p, exact.q_wxyz), walked(np.arange(0.0, 60.0, 0.02))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [0.0, 0.7])
 def test_of_motion_that_repeats_itself_all_offsets_are_told(late_s: float) -> None:
     for seed in range(3):
@@ -244,6 +246,7 @@ def test_laps_that_differ_tell_a_lap_from_the_next() -> None:
         assert found.offset_s == pytest.approx(-late_s, abs=0.01) and not found.others_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 5])
 @pytest.mark.parametrize("offset", [0.1, 0.25, 0.0])
 def test_of_a_hundred_steps_that_fit_the_nearest_is_found(offset: float, seed: int) -> None:

@@ -22,6 +22,7 @@ from tests.evaluation.smooth_paths import SmoothPath, disturbed, moved
 T = np.arange(0.0, 28.0, 0.1)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 1000))
 def test_errors_do_not_depend_on_the_frames(seed: int) -> None:
@@ -91,6 +92,7 @@ def test_files_that_mean_something_else_are_told() -> None:
     assert not any(word in plain for word in ("quaternions", "never", "inverted", "as large", "scatter by"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("alignment", ["none", "origin", "yaw", "se3", "sim3"])
 def test_a_wrong_scale_is_told_however_the_frames_are_aligned(alignment: str, seed: int) -> None:
@@ -144,6 +146,7 @@ def test_doubts_are_said() -> None:
     assert all(warning in result.summary() for warning in result.warnings)
 
 
+@pytest.mark.slow
 def test_an_offset_is_advised_only_where_the_error_gets_smaller_with_it() -> None:
     advised, withheld = 0, 0
     for seed in range(7):
@@ -188,6 +191,7 @@ def _of(trajectory: Trajectory, rows: slice) -> Trajectory:
     return Trajectory(trajectory.time_ns[rows], trajectory.p[rows], trajectory.q_wxyz[rows])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_clocks_that_agree_are_not_doubted(seed: int) -> None:
     truth, estimate = _wandering(seed, turning=0.03)

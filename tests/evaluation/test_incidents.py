@@ -168,6 +168,7 @@ def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(metho
     assert evaluate(sound.select(rows), truth, method=method).warnings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alignment", KINDS)
 def test_sound_estimates_have_no_incidents(alignment: str) -> None:
     for seed in range(10, 20):

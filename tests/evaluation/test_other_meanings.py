@@ -94,6 +94,7 @@ def _drive(seed: int, turned: np.ndarray) -> tuple[Trajectory, Trajectory]:
     return estimate, Trajectory(stamps, p, quaternion.from_matrix(R))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alignment", ["se3", "sim3"])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_another_body_frame_is_told_on_a_straight_way_about_every_axis_that_it_shows(axis, alignment):
@@ -103,6 +104,7 @@ def test_another_body_frame_is_told_on_a_straight_way_about_every_axis_that_it_s
         assert len(told) == 1
 
 
+@pytest.mark.slow
 def test_no_other_body_frame_is_told_on_a_straight_way_where_there_is_none():
     wrong = 0.0
     for seed in range(20):

@@ -5,6 +5,7 @@ from the same estimates; what its covariance means there is said in docs/lidar_i
 """
 
 import numpy as np
+import pytest
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.filtering.nav_state import TANGENT, NavState, boxminus_into, boxplus_into
@@ -73,6 +74,7 @@ def _run(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return error, cov
 
 
+@pytest.mark.slow
 def test_average_nees_lies_within_the_band() -> None:
     errors, covariances = (np.array(values) for values in zip(*(_run(seed) for seed in range(RUNS)), strict=True))
     for block, dof in ((slice(0, 6), 6), (slice(0, 9), 9), (slice(0, 15), 15)):

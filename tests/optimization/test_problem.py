@@ -39,6 +39,7 @@ def scipy_minimum(problem, loss="linear") -> float:
     return float(least_squares(residuals, np.zeros(size), method="trf", x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-12).cost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_ring_reaches_the_minimum_that_scipy_finds(ring, method):
     ring.problem.fix(ring.poses[0])
@@ -48,6 +49,7 @@ def test_ring_reaches_the_minimum_that_scipy_finds(ring, method):
     assert np.abs(SE3.boxminus(solution[ring.poses], ring.truth)).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linear_solver", ("dense", "sparse", "schur"))
 def test_scene_reaches_the_minimum_that_scipy_finds(linear_solver):
     scene = make_scene(cameras=4, points=15)

@@ -61,6 +61,7 @@ class _Page(HTMLParser):
             self._in_heading = False
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_counted_by_its_rows(folder: Path, tmp_path: Path) -> None:
     killed = tmp_path / "killed"
     shutil.copytree(folder, killed)

@@ -195,6 +195,7 @@ def test_without_noise_the_truth_is_found(seed: int) -> None:
         assert np.abs(error(solution, made, name)).max() < 1e-8, name
 
 
+@pytest.mark.slow
 def test_with_noise_the_covariance_is_that_of_the_errors() -> None:
     """Groups of variables by themselves and all together; one of a thousand would be outside of its band by chance."""
     runs = 40

@@ -32,6 +32,7 @@ def call(*words: object) -> tuple[int, str, str]:
     return result.exit_code, re.sub(r"\s+", " ", result.stdout), re.sub(r"\s+", " ", result.stderr)
 
 
+@pytest.mark.slow
 def test_lio_without_configuration(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, err = call("lio", bag)
@@ -120,6 +121,7 @@ def test_view_without_the_extra(bag: Path, tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT is sent differently on Windows")
 def test_ctrl_c_finishes_the_files_with_exit_code_130(tmp_path: Path) -> None:
     long = write_recording(simulate("walk", duration_s=30.0, lidar=LIDAR), tmp_path / "long", "ros1")
@@ -142,6 +144,7 @@ def test_ctrl_c_finishes_the_files_with_exit_code_130(tmp_path: Path) -> None:
     assert '<span class="state interrupted">' in (out / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGTERM ends a process at once on Windows")
 def test_a_signal_before_the_first_scan_leaves_a_word(bag: Path, tmp_path: Path) -> None:
     """It comes while the extrinsic is looked for, which takes seconds; the process used to end without a trace."""
@@ -172,6 +175,7 @@ def test_report_of_another_folder(tmp_path: Path) -> None:
     assert "error: expected the output folder of a run, with run.json – got" in err
 
 
+@pytest.mark.slow
 def test_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
     code, out, err = call("demo", "-o", tmp_path, "--duration", "5")
     assert code == 0, err
@@ -184,6 +188,7 @@ def test_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
     assert "simulated before, used again" in out
 
 
+@pytest.mark.slow
 def test_warmup_says_what_it_did() -> None:
     code, out, err = call("warmup")
     assert code == 0, err

@@ -31,6 +31,7 @@ def call(*words: object) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
+@pytest.mark.slow
 def test_json_is_all_of_the_standard_output_and_the_ground_truth_is_compared_with(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = call("lio", folder / "monday.bag", "-o", out, *FAST, "--json", "--gt", folder / "monday.gt.tum")

@@ -67,6 +67,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, number: int, signals: int = 1)
     monkeypatch.setattr(odometry_run._Run, "keep", kept)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT is sent differently on Windows")
 @pytest.mark.parametrize("signals", [1, 2])
 def test_a_batch_that_was_stopped_goes_on_where_it_was(
@@ -96,6 +97,7 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
     assert all((out / name / "trajectory.csv").read_bytes() == expected for name in NAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT is sent differently on Windows")
 def test_ctrl_c_after_the_last_scan_of_one_leaves_the_next_one_alone(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -113,6 +115,7 @@ def test_ctrl_c_after_the_last_scan_of_one_leaves_the_next_one_alone(
     assert again.exit_code == 0 and "a: finished before" in again.stderr
 
 
+@pytest.mark.slow
 def test_what_was_finished_with_other_settings_is_not_passed_off_as_these(bags: Path, tmp_path: Path) -> None:
     assert call("lio", bags / "in" / "a.bag", "-o", tmp_path / "a", *FAST).exit_code == 0
     result = call("lio", bags / "in", "-o", tmp_path, *FAST, "--resume", "--json", "--set", "map_cell=0.4")
@@ -137,6 +140,7 @@ def test_what_was_finished_before_a_setting_was_added_is_finished_still(bags: Pa
     assert refused.exit_code == 2 and "map_cell: 0.25" in lines(refused)["a"]["error"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT is sent differently on Windows")
 @pytest.mark.parametrize("batch", [False, True])
 def test_what_was_stopped_under_another_boxplus_begins_anew(
@@ -154,6 +158,7 @@ def test_what_was_stopped_under_another_boxplus_begins_anew(
     assert found["outcome"] == "finished" and found["run"]["resumed"] == 0 and found["run"]["scans"] == 29
 
 
+@pytest.mark.slow
 def test_one_that_fails_as_nobody_foresaw_leaves_the_others_unharmed(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +192,7 @@ def test_a_folder_with_one_recording_takes_a_ground_truth(bags: Path, tmp_path: 
     assert json.loads((tmp_path / "out" / "a" / "evaluation.json").read_text()) == lines(result)["a"]["evaluation"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spoilt", "code"), [({}, 2), ({"contradiction": "they differ"}, 3), ({"state": "interrupted"}, 130)])
 def test_a_ground_truth_that_does_not_fit_hides_nothing(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: dict[str, str], code: int

@@ -119,6 +119,7 @@ def test_an_earlier_run_is_replaced_only_on_request(adjusted: tuple[Path, Result
     assert (folder / "new" / "report.html").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["text", "binary"])
 def test_colmap_goes_back_to_colmap(tmp_path: Path, format: str) -> None:
     model = colmap_model("SIMPLE_RADIAL", format)

@@ -65,6 +65,7 @@ def test_toro_goes_back_to_toro(tmp_path: Path, dimension: int) -> None:
     assert len(written.ids) == 24 and not (tmp_path / "out" / "report.html").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("with_poses", [True, False])
 def test_the_page_shows_file_start_and_result(tmp_path: Path, dimension: int, with_poses: bool) -> None:

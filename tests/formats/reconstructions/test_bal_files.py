@@ -161,6 +161,7 @@ def test_a_cut_bzip2_file_is_explained(tmp_path: Path, share: float) -> None:
             read(cut)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [b"0 " * 500_000, b"0 0 1.0 2.0\n" * 100_000])
 def test_a_bzip2_file_that_would_fill_the_memory_is_refused(tmp_path: Path, line: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 MB from some kilobytes, where 6 are allowed: as one line, and as lines that are all in order."""

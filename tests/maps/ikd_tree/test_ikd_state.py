@@ -129,6 +129,7 @@ class TreesAgainstBruteForce(RuleBasedStateMachine):
             tree.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_place", [40, 1500])
 def test_trees_agree_with_brute_force(in_place: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # Low thresholds make small trees go through everything that large ones do.

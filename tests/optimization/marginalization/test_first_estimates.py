@@ -23,6 +23,7 @@ def test_the_simulated_residuals_have_the_right_jacobians():
     assert check_jacobian(view_residual(np.zeros((3, 2))), SE3.identity(), ahead).passed
 
 
+@pytest.mark.slow
 def test_two_hundred_marginalisations_leak_nothing():
     _, _, leaks, _ = drive(0, 204, window=4)
     assert len(leaks) == 200 and not any(leak.is_anchored for leak in leaks)
@@ -83,6 +84,7 @@ def test_a_prior_keeps_its_cost_when_a_variable_leaves_it():
     np.testing.assert_allclose(prior.J.T @ (prior.r0 + prior.J @ delta), J[:, 6:].T @ Q @ Q.T @ r, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_estimates", [True, False])
 def test_a_sliding_window_stays_consistent(first_estimates):
     """A window of 5 poses over an odometry of 40 with links over one and over three: NEES of the newest pose over many runs."""

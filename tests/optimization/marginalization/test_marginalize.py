@@ -165,6 +165,7 @@ def test_landmark_by_landmark_equals_all_at_once(seed):
     assert_close(found[1], g)
 
 
+@pytest.mark.slow
 def test_many_rows_and_long_tracks_pass_through_the_batches():
     # A landmark with more rows than a batch holds, next to hundreds with few.
     rng = np.random.default_rng(0)

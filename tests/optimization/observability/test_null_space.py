@@ -84,6 +84,7 @@ def model_of(problem: Problem, linear_solver: str = "dense") -> LeastSquares:
     return model
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_random_problems(seed):

@@ -56,6 +56,7 @@ def write(folder: Path, seen: TargetSession) -> list[object]:
     return [folder / "corners.csv", "--target", folder / "target.yaml", "--resolution", f"{SIZE[0]}x{SIZE[1]}"]
 
 
+@pytest.mark.slow
 def test_a_rig_with_an_imu_is_calibrated_written_read_back_and_reported(tmp_path: Path) -> None:
     seen = session(RADTAN, RADTAN, frames=60, rate_hz=5.0, time_offset_s=0.004, imu=ImuModel())
     given = [*write(tmp_path, seen), "--lens", "pinhole-radtan", "--max-views", 16]
@@ -170,6 +171,7 @@ def test_what_of_an_imu_table_is_not_used_is_counted(tmp_path: Path) -> None:
     assert [text.split(" of imu.csv ")[0] for text in found.left_out] == ["1 lines", "1 samples", "1 samples"]
 
 
+@pytest.mark.slow
 def test_the_corners_of_euroc_give_the_published_rig(shared_data: Path, tmp_path: Path) -> None:
     corners = shared_data / "cameras" / "euroc_april_calib" / "detected_corners.json"
     (tmp_path / "target.yaml").write_text("target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n")

@@ -28,6 +28,7 @@ def late(event: CameraEvent, offset_ns: int) -> CameraEvent:
     return dataclasses.replace(event, time_ns=event.time_ns + offset_ns) if isinstance(event, ImuSamples) else event
 
 
+@pytest.mark.slow
 def test_a_sound_recording_has_no_cause(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:
     info, events = recorded
     assert likely_causes(info, iter(events), 1, None) == []

@@ -42,6 +42,7 @@ def run(runner: Runner, config: Any, recorded: Path, folder: Path, events: int |
         return runner(recording, folder, config, resume=resume, should_stop=lambda: events is not None and next(asked) >= events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("runner", "config", "stops"),
     [

@@ -207,6 +207,7 @@ def test_one_camera_that_only_sees_its_first_frames_is_refused_with_the_reason(r
     assert json.loads((tmp_path / "out" / "run.json").read_text())["frames_before_start"] == 3
 
 
+@pytest.mark.slow
 def test_a_stereo_run_that_is_not_to_be_trusted_says_what_may_be_the_cause(tmp_path: Path) -> None:
     simulation = simulate_cameras("room_moving", 1, duration_s=2.5, rig=make_rig("stereo", "pinhole", 0.35, 10.0))
     swapped = as_camera_recording(simulation, make_camera_fault("swapped_cameras"))

@@ -81,6 +81,7 @@ def merging() -> MergeConfig:
     return load_settings(MergeConfig, None, QUICK)
 
 
+@pytest.mark.slow
 def test_recordings_that_met_are_joined_and_failed_ones_named(
     tmp_path: Path, merging: MergeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,6 +267,7 @@ def test_a_file_moved_over_another_is_a_new_one(tmp_path: Path) -> None:
     assert bag.stat().st_mtime == 1e9 and tasks._changed_at(bag) > before - 60.0
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_there_twice_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A copy under another name would vouch for the first one wherever they are looked at."""
 

@@ -114,6 +114,7 @@ def test_without_an_extrinsic_it_is_estimated(tmp_path: Path) -> None:
     assert found["R_imu_lidar"].text.startswith("estimate R_imu_lidar = [")
 
 
+@pytest.mark.slow
 def test_a_mounting_can_be_given(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", Room())
     T = np.eye(4)
@@ -123,6 +124,7 @@ def test_a_mounting_can_be_given(tmp_path: Path) -> None:
         assert (found["T_imu_lidar"].value, found["R_imu_lidar"].verdict) == ("given", verdict)
 
 
+@pytest.mark.slow
 def test_a_clock_offset(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", Room(late_s=0.05))
     found = {e.key: e for e in diagnose(path).evidence}

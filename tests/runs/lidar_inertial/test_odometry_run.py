@@ -101,6 +101,7 @@ def test_cut_last_row_of_the_scan_log_is_left_out(finished: tuple[RunFolder, Run
     assert len(read_scan_log(cut)) < finished[1].scans
 
 
+@pytest.mark.slow
 def test_config_of_a_run_repeats_it_to_the_bit(finished: tuple[RunFolder, RunSummary], tmp_path: Path) -> None:
     folder, _ = finished
     config = load_run_config(folder.config)
@@ -153,6 +154,7 @@ def test_keyboard_interrupt_leaves_a_readable_folder(tmp_path: Path) -> None:
     assert len(read_trajectory(tmp_path / "out" / "trajectory.csv")) == summary.scans >= 15
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL on Windows")
 def test_killed_run_is_readable_and_says_so(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "out")
@@ -238,6 +240,7 @@ def test_foreign_folder_is_refused_and_earlier_run_too(tmp_path: Path) -> None:
         run_odometry(walk(2.0), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_overwriting_replaces_a_run_and_nothing_else(tmp_path: Path) -> None:
     out = tmp_path / "out"
     run_odometry(walk(2.0), out)
@@ -283,6 +286,7 @@ def test_gaps_are_found(tmp_path: Path) -> None:
     assert any("IMU gap of" in warning.text and warning.count > 1 for warning in summary.warnings)
 
 
+@pytest.mark.slow
 def test_corridor_says_what_was_not_measured(tmp_path: Path) -> None:
     summary = run_odometry(as_recording(simulate("corridor", duration_s=6.0, lidar=LIDAR)), tmp_path / "out")
     assert summary.status["weak"] > 0.5 * summary.scans
@@ -305,6 +309,7 @@ def test_view_sees_every_estimate(tmp_path: Path) -> None:
     np.testing.assert_array_equal(eye.times, read_trajectory(tmp_path / "out" / "trajectory.csv").times)
 
 
+@pytest.mark.slow
 def test_extrinsic_is_estimated_when_nobody_gives_it() -> None:
     simulation = simulate("spin", duration_s=8.0, lidar=SpinningLidar(azimuth_steps=400))
     recording = as_recording(simulation)
@@ -336,6 +341,7 @@ def test_extrinsic_without_any_turn_is_identity_with_the_reason() -> None:
     assert "nobody gave T_imu_lidar, and the motion did not show it" in extrinsic.unknown
 
 
+@pytest.mark.slow
 def test_a_mounting_that_was_assumed_is_not_trusted_unless_the_motion_bears_it_out(tmp_path: Path) -> None:
     def without_mounting(scenario: str, duration_s: float) -> Recording:
         simulation = simulate(scenario, duration_s=duration_s, lidar=SpinningLidar(azimuth_steps=300))
@@ -351,6 +357,7 @@ def test_a_mounting_that_was_assumed_is_not_trusted_unless_the_motion_bears_it_o
     assert moving.contradiction is None
 
 
+@pytest.mark.slow
 def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
     simulation = simulate("walk", duration_s=4.0, lidar=LIDAR)
     middle_ns = (simulation.start_ns + simulation.end_ns) // 2

@@ -47,6 +47,7 @@ def flight(request: pytest.FixtureRequest) -> Simulation:
     return simulate(make_scenario("stress_fast", seed=request.param), duration_s=12.0, lidar=LIDAR)
 
 
+@pytest.mark.slow
 def test_the_mounting_at_its_end_is_better_and_as_good_as_it_claims(flight: Simulation) -> None:
     config = _guess(flight.T_imu_lidar, 1.0, 0.1, seed=3)
     found = rehearse(as_recording(flight), config, _never)
@@ -65,6 +66,7 @@ def test_what_finds_no_start_says_so(flight: Simulation) -> None:
     assert rehearse(scans, LioConfig(), _never) == "it found no start"
 
 
+@pytest.mark.slow
 def test_a_run_that_the_sensors_contradict_says_so(flight: Simulation) -> None:
     T = flight.T_imu_lidar.copy()
     T[:3, :3] = T[:3, :3] @ so3.exp(np.array([0.0, 1.0, 0.0]))
@@ -101,6 +103,7 @@ def test_it_reads_a_minute_of_events_even_where_nothing_starts() -> None:
     assert len(read) < 70
 
 
+@pytest.mark.slow
 def test_a_run_without_a_mounting_begins_with_what_the_first_one_found(flight: Simulation, tmp_path: Path) -> None:
     recording: Recording = as_recording(flight)
     recording.info.T_imu_lidar = None

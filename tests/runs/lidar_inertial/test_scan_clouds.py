@@ -43,6 +43,7 @@ def clouds(folder: Path) -> dict[int, bytes]:
     return {int(path.stem): path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["pcd", "laz"])
 def test_they_are_the_scans_at_the_poses_of_the_trajectory(recording: Recording, tmp_path: Path, ending: str) -> None:
     if ending == "laz":

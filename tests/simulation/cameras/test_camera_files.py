@@ -137,6 +137,7 @@ def test_formats_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         Recorded(tiny("mono"), make_camera_fault("wrong_baseline"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERA_FAULTS)
 def test_every_fault_has_words_and_a_stream(name: str) -> None:
     fault = make_camera_fault(name)

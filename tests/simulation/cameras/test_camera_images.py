@@ -133,6 +133,7 @@ def test_what_is_seen_twice_looks_the_same(lens: LensKind) -> None:
         assert 1.4826 * np.median(np.abs(left)) < 1.1 * np.sqrt(variance + 1.2**2)
 
 
+@pytest.mark.slow
 @needs_cv2
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_tracked_corners_are_where_they_belong(seed: int) -> None:

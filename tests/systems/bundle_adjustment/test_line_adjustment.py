@@ -103,6 +103,7 @@ def test_points_that_are_matched_wrongly_are_named_and_not_trusted():
         assert any("residuals of points of 002 (7" in note for note in result.notes), result.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_points", [True, False])
 @pytest.mark.parametrize("seed", [10, 11, 12])
 def test_cameras_that_only_turn_are_told_from_those_that_move_apart(seed: int, use_points: bool) -> None:

@@ -71,6 +71,7 @@ def test_the_start_finds_the_focal_length_without_a_guess() -> None:
     assert 0.7 < best.parameters[0] / RADTAN.parameters[0] < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seeds"), [("pinhole-radtan", 8), ("pinhole-equi", 4), ("ds-none", 4)])
 def test_covariance_is_that_of_the_errors(kind: LensKind, seeds: int) -> None:
     model = LENSES[kind]

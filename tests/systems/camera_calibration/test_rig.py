@@ -36,6 +36,7 @@ def stereo() -> TargetCorners:
     return session(RADTAN, RADTAN, frames=16, rate_hz=4.0, seed=11).corners
 
 
+@pytest.mark.slow
 def test_a_sound_session_has_no_findings_and_the_mounting_of_the_truth(stereo: TargetCorners) -> None:
     found, findings = calibrate(stereo)
     assert found.lens == "pinhole-radtan" and not findings and found.rig is not None and found.rig_holds
@@ -47,6 +48,7 @@ def test_a_sound_session_has_no_findings_and_the_mounting_of_the_truth(stereo: T
     assert all(half < 2.0 for half in found.halves)
 
 
+@pytest.mark.slow
 def test_covariance_of_the_rig_is_that_of_the_errors() -> None:
     nees = []
     for seed in range(4):
@@ -69,6 +71,7 @@ def test_frontal_views_are_refused_with_the_parameter_and_its_sigma() -> None:
     assert "do not determine the focal length: fx " in findings["focal_open"].text and "±" in findings["focal_open"].text
 
 
+@pytest.mark.slow
 def test_a_wrong_lens_shows_in_the_pattern_of_residuals_and_the_right_one_is_named() -> None:
     corners = session(FISHEYE, seed=4).corners
     found, findings = calibrate(corners)
@@ -132,6 +135,7 @@ def test_focal_length_on_the_axis_is_what_small_angles_show() -> None:
         np.testing.assert_allclose(sigma**2, np.diag(by_intrinsics @ covariance @ by_intrinsics.T), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
 def test_mirrored_images_are_told(axis: int) -> None:
     """They fit as well as the true ones: a plane seen from its back."""

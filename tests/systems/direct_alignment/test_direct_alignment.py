@@ -183,6 +183,7 @@ def test_tsukuba_neighbours_reach_the_rendered_poses(shared_data: Path) -> None:
         assert found.status == "converged" and degrees < 0.05 and metres < 0.002, f"201 to {201 + k}: {degrees}, {metres}"
 
 
+@pytest.mark.slow
 def test_slambook_pairs_agree_with_each_other(shared_data: Path) -> None:
     """Turns of 49 and 36 degrees from identity.
 

@@ -38,6 +38,7 @@ def drives() -> list[Drive]:
     return [drive(seed, 22) for seed in range(20, 26)]
 
 
+@pytest.mark.slow
 def test_poses_are_true_and_covariances_honest(drives: list[Drive]) -> None:
     """Rotation and translation parallel to a wall are hard to tell apart: 2 cm at 3 m are 0.4 degrees."""
     of_end = []

@@ -46,6 +46,7 @@ def start_of(greys: list[Matrix]) -> tuple[TwoViews | None, str]:
     return None, start.problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 7, 9])
 def test_two_views_give_the_motion_up_to_scale(seed: int) -> None:
     room, T = Room(seed), sideways(seed, 25)
@@ -86,6 +87,7 @@ def run(greys: list[Matrix]) -> tuple[DirectOdometry, list[Estimate | None]]:
     return odometry, [odometry.push_mono(round(k * 1e9 / 30.0), grey) for k, grey in enumerate(greys)]
 
 
+@pytest.mark.slow
 def test_the_path_is_true_up_to_scale() -> None:
     simulation = simulate_cameras("room_moving", 1, duration_s=2.6, rig=make_rig("mono", None, 0.45, 20.0))
     frames = [simulation.image(0, k) for k in range(simulation.image_count)]
@@ -121,6 +123,7 @@ def test_the_unit_of_length_is_held() -> None:
     assert np.sqrt(np.trace(odometry.window.covariance(second)[3:, 3:])) > 2.0 * share * np.linalg.norm(way)
 
 
+@pytest.mark.slow
 def test_after_a_view_that_was_lost_for_good_nothing_is_trusted() -> None:
     greys = images(Room(7), sideways(7, 75), 7)
     greys[25:60] = [np.full(SHAPE, 20.0)] * 35
@@ -132,6 +135,7 @@ def test_after_a_view_that_was_lost_for_good_nothing_is_trusted() -> None:
     assert {e.status for e in again} <= {"lost", "weak"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjustments", [0, 5])
 def test_a_new_start_knows_its_pose_no_better_than_the_loss_allows(adjustments: int) -> None:
     """35 frames of 1/30 s without light, at 1 m/s and 1 rad/s; both keyframes rest on the first."""

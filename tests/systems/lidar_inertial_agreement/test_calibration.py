@@ -37,6 +37,7 @@ def calibrations() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return [errors(seed, 0.03 * (-1) ** seed * (seed + 1) / 8) for seed in SEEDS]
 
 
+@pytest.mark.slow
 def test_mounting_clocks_and_scales_are_found(calibrations: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
     for error, _, _ in calibrations:
         assert np.degrees(np.linalg.norm(error[THETA])) < 0.5
@@ -53,6 +54,7 @@ def test_the_stated_covariances_hold(calibrations: list[tuple[np.ndarray, np.nda
     assert 0.05 < np.mean(alone) < 2.0
 
 
+@pytest.mark.slow
 def test_a_second_stretch_adds_to_the_first() -> None:
     simulation = handheld(1, seconds=10.0)
     scans, imu = data(simulation)

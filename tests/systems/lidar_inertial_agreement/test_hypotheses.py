@@ -25,6 +25,7 @@ from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data,
 FEET = 3.28084
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 3, 6])
 def test_sound_sensors_are_not_contradicted(seed: int) -> None:
     simulation = handheld(seed)
@@ -35,6 +36,7 @@ def test_sound_sensors_are_not_contradicted(seed: int) -> None:
     assert judges_lengths(agreement)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "cause", "words"), [
     (faults.gyro_in_deg(), "gyro_unit", "reports deg/s"),
     (faults.gyro_in_rad_as_deg(), "gyro_unit", "were taken for deg/s and are rad/s"),
@@ -52,6 +54,7 @@ def test_mistakes_are_named(fault: Fault, cause: str, words: str) -> None:
     assert words in found[0].text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_ms", [-500, -100, -20, 20, 50, 300])
 def test_clock_offsets_are_measured(offset_ms: int) -> None:
     simulation = handheld(2)
@@ -75,6 +78,7 @@ def test_a_given_offset_makes_the_clocks_agree() -> None:
     assert agreement.rotation is not None and abs(agreement.rotation.offset_s) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [5.0, 10.0, 20.0])
 def test_wrong_mountings_are_named(degrees: float) -> None:
     simulation = handheld(3)
@@ -92,6 +96,7 @@ def test_an_inverted_mounting_is_named() -> None:
     assert found[0].cause == "extrinsic" and "its inverse fits" in found[0].text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0])
 def test_the_imu_of_another_platform_is_named(seed: int) -> None:
     simulation, other = handheld(seed), handheld(seed + 5)
@@ -102,6 +107,7 @@ def test_the_imu_of_another_platform_is_named(seed: int) -> None:
     assert [finding.cause for finding in found] == ["not_together"]
 
 
+@pytest.mark.slow
 def test_drifting_clocks_are_named() -> None:
     simulation = handheld(5, seconds=12.0)
     T = simulation.T_imu_lidar
@@ -136,6 +142,7 @@ def test_too_few_scans_or_samples_are_no_verdict() -> None:
         assert agreement.rotation is None and contradictions(agreement, np.eye(4)) == []
 
 
+@pytest.mark.slow
 def test_stretches_together_show_lengths() -> None:
     simulation = handheld(2, seconds=9.0, speed=2.2, rate=1.0)
     T = simulation.T_imu_lidar
@@ -149,6 +156,7 @@ def test_stretches_together_show_lengths() -> None:
     assert found is not None and "the points are not in metres" in found.text
 
 
+@pytest.mark.slow
 def test_a_path_that_misses_a_rotation_shows_no_lengths() -> None:
     """From rest a registration may lag behind: it misses the accelerations as well as the turn."""
     simulation = handheld(4)
@@ -171,6 +179,7 @@ def test_a_path_that_accelerates_out_of_nothing_flips_no_sign() -> None:
     assert contradictions(astray, T) == []
 
 
+@pytest.mark.slow
 def test_a_mounting_that_explains_little_replaces_none(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = handheld(4)
     T = simulation.T_imu_lidar
@@ -184,6 +193,7 @@ def test_a_mounting_that_explains_little_replaces_none(monkeypatch: pytest.Monke
         assert np.array_equal(compared.R_imu_lidar, T[:3, :3]) == kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", range(3))
 def test_points_that_may_be_mirrored_are_said_to_be(axis: int) -> None:
     """Half a turn about an axis of the points, and more about one that the motion does not show."""
@@ -203,6 +213,7 @@ def test_points_that_may_be_mirrored_are_said_to_be(axis: int) -> None:
     assert "mirrored" not in contradictions(replace(seen, rotation=other), T)[0].text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("std_deg", "off_deg", "named"), [(4.0, 80.0, True), (4.0, 15.0, False), (15.0, 80.0, False)])
 def test_a_quarter_turn_is_seen_where_the_mounting_is_known_coarsely(std_deg: float, off_deg: float, named: bool) -> None:
     """As from attitudes of a stairwell, none of whose axes is known to three degrees."""

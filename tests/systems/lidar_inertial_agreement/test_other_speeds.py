@@ -31,6 +31,7 @@ def circle(world: World, height: float) -> tuple[Simulation, np.ndarray | None, 
     return simulation, other_speed(path, scans, CONFIG, guesses), found, sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_speed_over_open_ground_is_right_or_not_known_or_not_the_only_one(seed: int) -> None:
     """From rest the fields 0 to 5 end at 2.4, 2.3, 7.7, 4.7, 2.3 and 0.1 m/s; 2 and 3 have another speed, 5 knows nothing."""
@@ -43,6 +44,7 @@ def test_a_speed_over_open_ground_is_right_or_not_known_or_not_the_only_one(seed
         assert np.linalg.norm(other - found) > 0.3
 
 
+@pytest.mark.slow
 def test_in_a_room_there_is_one_speed() -> None:
     _, other, found, _ = circle(worlds.room((24.0, 20.0, 5.0)), 1.5)
     assert other is None and abs(np.linalg.norm(found) / SPEED - 1.0) < 0.1

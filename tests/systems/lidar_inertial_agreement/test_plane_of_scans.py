@@ -77,6 +77,7 @@ def _gyro(motion: Trajectory, samples: ImuSamples) -> ImuSamples:
     return ImuSamples(samples.time_ns, rates.gyro[index], samples.accel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gyroscope_that_tilts_while_the_ground_does_not_is_another_ones(seed: int) -> None:
     swinging = manoeuvres.handheld(5.0, LOW, HIGH, 1.0, 2.5, standstill_s=0.0, seed=seed)

@@ -103,6 +103,7 @@ def test_of_attitudes_known_coarsely_over_half_of_the_path_is_asked_for(rate_hz:
         assert known - 0.1 < fit.covered <= min(known + 0.02, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [40, 120])
 @pytest.mark.parametrize("second", [0.0, 0.005, 0.02, 0.2])
 def test_the_mounting_is_as_far_off_as_it_says(count: int, second: float) -> None:
@@ -123,6 +124,7 @@ def test_the_mounting_is_as_far_off_as_it_says(count: int, second: float) -> Non
     assert np.median(largest) < 2.0 if second > 0.1 else True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude_deg_s", [2.0, 5.0])
 @pytest.mark.parametrize("density", [0.0, 4e-4])
 def test_the_noise_of_a_gyroscope_brings_no_clocks_together(density: float, amplitude_deg_s: float) -> None:

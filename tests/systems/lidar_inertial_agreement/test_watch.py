@@ -20,6 +20,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import SLOPE
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, FINE, data, handheld, true_poses, true_twists, turned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
 def test_lengths_are_named_by_several_comparisons(monkeypatch: pytest.MonkeyPatch, slope: float, named: bool) -> None:
     simulation = handheld(4)
@@ -50,6 +51,7 @@ def test_lengths_are_named_by_several_comparisons(monkeypatch: pytest.MonkeyPatc
     assert (following.contradiction is not None) == named == any(said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.5, 20.0, 120.0])
 def test_a_mounting_that_nobody_gave_is_borne_out_or_contradicted(degrees: float) -> None:
     simulation = handheld(5)

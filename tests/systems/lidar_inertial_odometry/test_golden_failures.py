@@ -57,6 +57,7 @@ def test_without_a_fault_nothing_is_said(healthy: Run) -> None:
     assert healthy.distance.max() < 0.02
 
 
+@pytest.mark.slow
 def test_corridor_is_weak_along_its_axis_and_nowhere_else() -> None:
     corridor = run("corridor", 20.0)
     inside = corridor.between(3.0, 20.0)
@@ -81,6 +82,7 @@ def test_corridor_is_weak_along_its_axis_and_nowhere_else() -> None:
     assert abs(corridor.position_error[-1, 0]) < 5.0 * sigma[0]
 
 
+@pytest.mark.slow
 def test_leaving_a_corridor_it_is_ok_again() -> None:
     """The end wall comes into view after 10 m."""
     length = 44.0
@@ -109,6 +111,7 @@ def test_spinning_on_the_spot_is_tracked() -> None:
     assert spin.warnings == []
 
 
+@pytest.mark.slow
 def test_dropped_imu(healthy: Run) -> None:
     gap = walk(faults.drop_imu(AT_S, 1.0))
     assert "lost" not in gap.status
@@ -121,6 +124,7 @@ def test_dropped_imu(healthy: Run) -> None:
     assert_recovers(gap, healthy, AT_S + 1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "missing", "counted"), [
     (faults.drop_scans(AT_S, 0.5), 5, {}),
     (faults.empty_scans(AT_S, 0.5), 5, {"scan without a valid point": 5}),
@@ -133,6 +137,7 @@ def test_dropped_and_empty_scans(healthy: Run, fault: Fault, missing: int, count
     assert_recovers(failed, healthy, AT_S + 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "reasons"), [
     (faults.repeat_stamps(AT_S, 0.3), {"IMU sample with a repeated time", "scan with a repeated time"}),
     (faults.backward_stamps(AT_S, 0.3), {"IMU sample going back in time", "scan going back in time"}),
@@ -175,6 +180,7 @@ def test_accelerometer_taken_for_one_in_g_is_refused_at_the_start() -> None:
         run("walk", 2.0, Fault("multiplied", "m/s² taken for g", multiplied), SPARSE)
 
 
+@pytest.mark.slow
 def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
     unbiased = ImuModel(gyro_bias=(0.0, 0.0, 0.0))  # a bias in degrees alone refuses the start
     failed = run("walk", WALK_S, faults.gyro_in_deg(), SPARSE, imu=unbiased)
@@ -188,6 +194,7 @@ def test_gyroscope_in_degrees_is_named_and_the_estimate_called_lost() -> None:
     assert first_warning <= wrong_by_a_metre + 300_000_000
 
 
+@pytest.mark.slow
 def test_a_bias_that_no_gyroscope_has_refuses_the_start() -> None:
     simulation = simulate("walk", 0, duration_s=4.0, lidar=SPARSE)
     odometry = LidarInertialOdometry(LioConfig(T_imu_lidar=simulation.T_imu_lidar.tolist()))
@@ -200,6 +207,7 @@ def test_a_bias_that_no_gyroscope_has_refuses_the_start() -> None:
     assert "times as far as the LiDAR: it reports deg/s" in str(odometry.start_problem)
 
 
+@pytest.mark.slow
 def test_inverted_extrinsic_is_named() -> None:
     failed = walk(faults.inverted_extrinsic())
     assert any("under the given T_imu_lidar" in text for text in failed.warnings)
@@ -208,6 +216,7 @@ def test_inverted_extrinsic_is_named() -> None:
     assert failed.odometry.contradiction in failed.warnings
 
 
+@pytest.mark.slow
 def test_saturated_accelerometer(healthy: Run) -> None:
     failed = walk(faults.saturate_accel(11.0))
     told = [e for e in failed.estimates if e.warnings]
@@ -227,6 +236,7 @@ def test_quantised_values_at_rest_are_no_saturation() -> None:
     assert not any("saturated" in text for text in still.warnings)
 
 
+@pytest.mark.slow
 def test_wrong_unit_of_the_point_times() -> None:
     failed = walk(faults.wrong_time_unit(1e-3))
     (text,) = {text for text in failed.warnings if "span" in text}
@@ -243,6 +253,7 @@ def test_readers_recognise_g(tmp_path: Path) -> None:
     assert np.linalg.norm(accel.mean(axis=0)) == pytest.approx(9.81, abs=0.3)
 
 
+@pytest.mark.slow
 def test_doctor_sees_the_inverted_extrinsic(tmp_path: Path) -> None:
     path = write_recording(simulate("walk", duration_s=8.0), tmp_path / "inverted", fault=faults.inverted_extrinsic())
     found = {evidence.key: evidence for evidence in diagnose(path).evidence}

@@ -263,6 +263,7 @@ def _spoil(event: Scan | ImuSamples, fault: str, random: np.random.Generator) ->
     return None if fault == "no scan" else event
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     st.lists(st.tuples(st.sampled_from(FAULTS), st.floats(0, 4), st.floats(0.01, 0.6)), min_size=1, max_size=3),

@@ -31,6 +31,7 @@ def _run(events: list[Scan | ImuSamples], T_imu_lidar: np.ndarray) -> tuple[Lida
     return odometry, estimates + odometry.flush()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["everything for ten hours", "the scans for seven seconds"])
 def test_after_a_long_gap_it_starts_anew_and_says_so(kind: str) -> None:
     simulation = simulate("walk", 3, duration_s=16.0, lidar=SPARSE)

@@ -8,6 +8,7 @@ the simulator draws it from.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.manifolds import so3
@@ -51,6 +52,7 @@ def _errors(seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return errors, [estimate.pose_covariance for estimate in asked]
 
 
+@pytest.mark.slow
 def test_average_nees_of_the_pose_is_cautious_and_not_careless() -> None:
     """6 is exact. Streets seen by a dense LiDAR are the smooth end of what the odometry allows for: there it is cautious, by
     a factor of three to four in the standard deviation; coarse LiDARs in halls need all of it.

@@ -12,6 +12,7 @@ from boxplus.simulation.worlds import sites
 from tests.systems.lidar_inertial_odometry.simulated_runs import run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "duration_s", "metres", "degrees"), [
     pytest.param("stress_flips", None, 0.06, 0.3, id="flips at 1000 deg/s"),
     pytest.param("stress_fast", 15.0, 0.06, 0.3, id="7 m/s and 100 deg/s"),
@@ -33,6 +34,7 @@ def test_stress_run(scenario: str, duration_s: float | None, metres: float, degr
     assert stress.rotation_error_deg.max() < degrees
 
 
+@pytest.mark.slow
 def test_moving_start_says_how_fast() -> None:
     stress = run("moving_start", 2.0)
     assert stress.odometry.start is not None

@@ -175,6 +175,7 @@ def test_a_scan_not_asked_about_the_mounting_moves_the_state_as_for_any_mounting
     assert np.allclose(shift, (after @ step)[3:], atol=1e-3 * np.abs(shift).max() + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_lever_arm_that_nobody_knows_is_found_or_its_covariance_says_so(seed: int) -> None:
     random = np.random.default_rng(seed)

@@ -42,6 +42,7 @@ def _errors(simulation: Simulation, estimates: Sequence[Estimate]) -> tuple[np.n
     return distance, angle
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("begin_s", "most_m", "most_deg"), [(0.0, 0.03, 0.5), (4.0, 0.05, 1.0)])
 def test_a_walk_is_followed_to_centimetres(begin_s: float, most_m: float, most_deg: float) -> None:
     """From rest, and from the middle of a step, where what the first scan was undistorted with places the world."""

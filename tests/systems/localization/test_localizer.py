@@ -112,6 +112,7 @@ def test_another_warehouse_with_the_same_racks_is_not_taken_for_the_one_of_the_m
     assert search is not None and search.candidates[0].refusal is None and "place of the same kind" in search.verdict
 
 
+@pytest.mark.slow
 def test_a_place_that_fits_as_one_alike_does_is_noticed_to_be_another_one() -> None:
     place_map = known_map(warehouse(seed=31), [[-12, 0], [12, 0]], INDOORS, seed=31)
     bay, drive = 2.8, drive_of(warehouse(seed=31), [[-8, 0.4], [-4.5, 0.4]], seed=5)

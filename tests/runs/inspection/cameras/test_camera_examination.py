@@ -76,6 +76,7 @@ def test_offset_and_rotation_come_back_within_their_deviations(seed: int) -> Non
     assert found.unlike < 0.15
 
 
+@pytest.mark.slow
 def test_findings_of_a_right_and_of_wrong_calibrations() -> None:
     R = Rotation.from_rotvec([0.3, -1.2, 0.9]).as_matrix()
     turns, imu = turning(1, 0.0, R)
@@ -161,6 +162,7 @@ def test_missing_images_and_calibration_are_found(tmp_path: Path) -> None:
     assert "2 without a partner" in said["cam0_cam1_synchronisation"]["text"]
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_a_rendered_flight_is_as_it_should_be(shared_data: Path) -> None:
     path = shared_data / "cameras" / "mh05_stereo"
@@ -172,6 +174,7 @@ def test_a_rendered_flight_is_as_it_should_be(shared_data: Path) -> None:
     assert float(said["cam0_cam1_epipolar"].value.split()[0]) < 0.2
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_a_real_flight_with_the_calibration_of_swapped_cameras_and_a_late_clock(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "cameras" / "euroc_mh01_stereo_imu_11s"

@@ -78,6 +78,7 @@ def turning(seed: int, readout_s: float, lens: LensKind = "radtan") -> tuple[Cam
     return simulation, turns, simulation.imu.samples(simulation.start_ns, simulation.end_ns, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "readout_s"), [(1, 0.0), (3, 0.0), (5, 0.012), (7, -0.02)])
 def test_the_time_from_row_to_row_comes_back(seed: int, readout_s: float) -> None:
     simulation, turns, imu = turning(seed, readout_s)
@@ -210,6 +211,7 @@ def filmed() -> CameraSimulation:
     return simulation
 
 
+@pytest.mark.slow
 @needs_cv2
 @pytest.mark.parametrize(
     ("name", "key"),

@@ -85,6 +85,7 @@ def watched(
     return watch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("depths", ["sensed", "stereo", "motion"])
@@ -93,12 +94,14 @@ def test_a_right_calibration_is_not_contradicted(seed: int, camera: Pinhole, dep
     assert watch.contradiction == "" and watch.remark == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_focal_length_and_principal_point_are(seed: int) -> None:
     assert "contradict the focal length: they ask for -" in watched(longer(CAMERA, 1.12), seed).contradiction
     assert "principal point along u: they ask for -" in watched(replace(CAMERA, cx=79.5 + 12.0), seed).contradiction
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("depths", ["stereo", "motion"])
@@ -115,6 +118,7 @@ def test_intrinsics_are_asked_for_where_velocities_are_not_known(seed: int) -> N
     assert "contradict the focal length: they ask for -" in watch.contradiction and watch.remark == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_second_camera_that_turned_in_the_plane_of_the_baseline_is_named(seed: int) -> None:
     """The sense is right; how far it turned is told too small, as the pose's lengths follow the depths in part."""
@@ -126,6 +130,7 @@ def test_a_second_camera_that_turned_in_the_plane_of_the_baseline_is_named(seed:
     assert turn < q[1] < 0.5 * turn
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_turns_of_both_senses_are_told_alike(seed: int) -> None:
     """Depths of a wall vary less than they err, which is no reason for a turn: 0.1 and 0.15 degrees of it without instruments."""
@@ -144,6 +149,7 @@ def test_a_second_camera_without_its_depths_is_refused() -> None:
         CalibrationWatch("motion", StereoPair(CAMERA, LEFT_RIGHT))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_rolling_shutter_is_a_remark(seed: int) -> None:
     watch = watched(CAMERA, seed, readout_s=0.012)

@@ -67,11 +67,13 @@ def watched(spoil: Spoil, seed: int, frames: int = 14) -> DepthWatch:
     return watch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_right_depths_are_not_contradicted(seed: int) -> None:
     assert watched(right, seed).contradiction == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "looks_like"),
     [

@@ -39,6 +39,7 @@ def run(seed: int, step_s: float, camera: Pinhole = CAMERA, too_far: float = 0.0
     return odometry
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_s", [0.1, 0.25, 0.5])
 def test_frames_are_asked_at_any_rate(step_s: float) -> None:
     assert "contradict the focal length: they ask for -" in run(0, step_s, camera=LONG).contradiction

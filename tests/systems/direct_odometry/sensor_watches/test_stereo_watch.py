@@ -32,6 +32,7 @@ def watched(seed: int, camera: Pinhole, stated: Pinhole, turn: tuple[float, floa
     return watch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_right_calibration_is_not_contradicted(seed: int, camera: Pinhole) -> None:
@@ -41,6 +42,7 @@ def test_a_right_calibration_is_not_contradicted(seed: int, camera: Pinhole) -> 
     assert (np.abs(q) < 5.0 * sigma + 2e-4).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_what_is_off_is_named(seed: int) -> None:
     assert (

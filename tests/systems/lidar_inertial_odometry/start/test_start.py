@@ -51,6 +51,7 @@ def test_at_rest(gravity_aligned: bool) -> None:
     assert np.allclose(reading - state.bias_accel + down_imu, 0, atol=0.01)
 
 
+@pytest.mark.slow
 def test_moving() -> None:
     simulation = simulate("moving_start", duration_s=1.6)
     found = find_start(frames(simulation.events()), config(simulation))
