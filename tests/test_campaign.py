@@ -199,6 +199,7 @@ def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespa
     assert shares["corridor"] < 1e-6 < 0.01 < shares["room"]
 
 
+@pytest.mark.slow
 def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     draw = campaign.draws.draw(seed)
     short = replace(draw, duration_s=4.0)

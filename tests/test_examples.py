@@ -36,6 +36,7 @@ def test_every_example_is_known() -> None:
     assert {example.stem for example in EXAMPLES} == set(SHOWS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", [pytest.param(path, id=path.stem) for path in EXAMPLES])
 def test_example_runs(example: Path, tmp_path: Path) -> None:
     assert len(example.read_text(encoding="utf-8").splitlines()) <= (100 if example.stem == "own_vio" else 60)
@@ -55,6 +56,7 @@ def test_the_page_of_own_vio_shows_its_code() -> None:
     assert len(shown) > 40 and not [line for line in shown if line not in code]
 
 
+@pytest.mark.slow
 def test_odometry_from_arrays_is_accurate(tmp_path: Path) -> None:
     script = next(example for example in EXAMPLES if example.stem == "odometry_from_arrays")
     output = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=True).stdout

@@ -115,6 +115,7 @@ print(twice(4.0), compiled)
 """
 
 
+@pytest.mark.slow
 @compiles
 def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(_PROGRAM)
@@ -166,6 +167,7 @@ except ValueError as error:
     assert run() == ["5.665 False", "nothing to double"]
 
 
+@pytest.mark.slow
 @compiles
 def test_a_file_under_another_module_name_has_kernels_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(_PROGRAM)

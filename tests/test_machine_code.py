@@ -64,6 +64,7 @@ def _run(folder: Path, *arguments: str) -> str:
     return done.stdout.strip() + done.stderr
 
 
+@pytest.mark.slow
 def test_what_is_loaded_can_be_linked_to(tmp_path: Path) -> None:
     assert _run(tmp_path) == "2.0 120 factorial half halves 1"
     assert _run(tmp_path) == "2.0 120 0"

@@ -87,6 +87,7 @@ def test_the_readme_has_the_two_commands_and_the_main_job() -> None:
     assert any(" lio " in command for command in COMMANDS)
 
 
+@pytest.mark.slow
 def test_make_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
     output = make("demo", f"OUTPUT={tmp_path}", "DEMO_ARGS=--duration 8")
     accuracy, speed, report = output.strip().splitlines()[-3:]
@@ -96,6 +97,7 @@ def test_make_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
     assert "report" in report and Path(report.split()[1]).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_make_test_runs_the_suite_on_two_processes() -> None:
     output = make("test", "PYTEST_ARGS=tests/test_package.py -k version")
     assert re.search(r"\d+ passed", output.splitlines()[-1])
@@ -115,6 +117,7 @@ def test_a_python_that_is_too_old_is_refused_with_a_sentence(tmp_path: Path) -> 
     assert not (tmp_path / "venv").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [pytest.param(page, id=page.name) for page in PYTHON_PAGES])
 def test_python_of_the_pages_runs(page: Path, workspace: Path) -> None:
     code = blocks(page, "python")

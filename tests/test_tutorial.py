@@ -43,6 +43,7 @@ def test_the_notebook_is_small() -> None:
     assert set(kinds) == {"stream", "display_data"} and kinds.count("display_data") == 1
 
 
+@pytest.mark.slow
 def test_every_cell_runs_and_prints_what_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib.pyplot as plt
 

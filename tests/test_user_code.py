@@ -334,6 +334,7 @@ def test_what_holds_an_address_of_this_process_is_not_kept(cache: Path) -> None:
     assert _value_and_compiled(again["f"]) == (9.0, True)
 
 
+@pytest.mark.slow
 @compiles
 def test_a_new_process_compiles_nothing_of_a_loss_and_a_residual(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
@@ -366,6 +367,7 @@ def test_a_new_process_compiles_nothing_of_a_loss_and_a_residual(tmp_path: Path)
     assert run("# one line more\n" + text.replace("x[0] - z", "x[0] - z - 1.0")) == "0.333333333 True"
 
 
+@pytest.mark.slow
 @compiles
 def test_arrays_written_to_between_two_compilations_do_not_reach_other_processes(tmp_path: Path) -> None:
     program = tmp_path / "program.py"

@@ -72,6 +72,7 @@ def assert_same(folder: Path, whole: Path) -> None:
     assert not (folder / "checkpoint.npz").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stops", [(2,), (60,), (40, 30)])
 def test_an_interrupted_run_goes_on(whole: Path, tmp_path: Path, stops: tuple[int, ...]) -> None:
     """Before the start was found, in the middle, and twice."""
@@ -83,6 +84,7 @@ def test_an_interrupted_run_goes_on(whole: Path, tmp_path: Path, stops: tuple[in
     assert read_summary(out / "run.json").resumed == len(stops)
 
 
+@pytest.mark.slow
 def test_rows_after_the_checkpoint_are_written_once(whole: Path, tmp_path: Path) -> None:
     """The checkpoint is seconds old when a process is killed, and the last row may be cut."""
     out = tmp_path / "out"
@@ -96,6 +98,7 @@ def test_rows_after_the_checkpoint_are_written_once(whole: Path, tmp_path: Path)
     assert_same(out, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
 def test_a_killed_process_goes_on(tmp_path: Path) -> None:
     bag = write_recording(simulate("walk", duration_s=12.0, lidar=LIDAR), tmp_path / "walk", "ros1")
@@ -123,6 +126,7 @@ def rewritten(path: Path, *without: str, **texts: str) -> None:
     np.savez(path, **kept | {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()})
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_code_is_refused(tmp_path: Path) -> None:
     """Its objects may lack what this code expects of them."""
     out = tmp_path / "out"
@@ -160,6 +164,7 @@ def test_whose_checkpoint_it_is(tmp_path: Path) -> None:
     assert not state_codec.is_of_this_program(path)
 
 
+@pytest.mark.slow
 def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     stopped_after(out, 40)

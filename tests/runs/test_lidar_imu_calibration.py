@@ -41,6 +41,7 @@ def carried() -> Simulation:
     return Simulation(Scenario("carried", worlds.room(seed=4), motion, LIDAR, T_imu_lidar=T_IMU_LIDAR), 4, 8.0)
 
 
+@pytest.mark.slow
 def test_the_file_is_a_configuration(tmp_path: Path) -> None:
     path = write_recording(swung(), tmp_path / "swung", fault=faults.clock_offset(0.04))
     file = tmp_path / "new" / "calibration.yaml"
@@ -67,6 +68,7 @@ def test_the_file_is_a_configuration(tmp_path: Path) -> None:
     assert result.exit_code == 2 and "exists" in result.output
 
 
+@pytest.mark.slow
 def test_what_the_motion_does_not_show_is_not_written() -> None:
     found = calibrate_lidar_imu(as_recording(carried()))
     assert not found.has_mounting and calibration_facts(found).T_imu_lidar is None

@@ -63,6 +63,7 @@ def test_they_are_the_scans_at_the_poses_of_the_trajectory(recording: Recording,
         assert (body.intensity is None) == (estimate.intensity is None)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_as_if_nothing_had_happened(recording: Recording, tmp_path: Path) -> None:
     config = load_run_config(settings=[*SETTINGS, "scans.frame=world"])
     run_odometry(recording, tmp_path / "whole", config)
@@ -93,6 +94,7 @@ def test_scans_that_are_lost_have_no_place_in_the_world(
         assert bool(clouds(tmp_path / frame / "scans")) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["pcd", "ply", "las", "laz", "e57"])
 def test_of_several_lidars_the_number_is_kept_or_the_ending_refused(recording: Recording, tmp_path: Path, ending: str) -> None:
     for library in {"las": ["laspy"], "laz": ["laspy"], "e57": ["pye57"]}.get(ending, []):

@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from boxplus.manifolds import so3
 from boxplus.recordings import Recording, RecordingOptions
@@ -42,6 +43,7 @@ def run(recording: Recording, folder: Path, **options: object) -> RunSummary:
     return run_odometry(recording, folder, CONFIG, extrinsic=given, **options)
 
 
+@pytest.mark.slow
 def test_facts_and_faults_of_each_lidar_and_the_same_bits_when_resumed(tmp_path: Path) -> None:
     """The other LiDAR is silent for 1.5 s and its clock is late."""
     recording = as_recording(simulation(), others=rear(faults.drop_scans(1.0, 1.5).then(faults.lidar_clock_offset(0.05))))

@@ -76,6 +76,7 @@ def test_what_may_be_behind_it_is_said() -> None:
     assert warning.text.endswith("its start, its IMU and what it saw tell no more")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [True, False])
 def test_a_lever_arm_that_nobody_gave_is_told(tmp_path: Path, given: bool) -> None:
     """A turn about one axis shows it only in part, and moves the path by as much."""

@@ -81,6 +81,7 @@ def draw(folder: Path, result: LocalizationResult) -> str:
     return write_localization_report(folder, without).read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_path: Path) -> None:
     simulation = drive(((15.0, 2.0), (-14.0, 2.0)), seed=2)
     bag = write_recording(simulation, tmp_path / "tuesday", "ros1")
@@ -114,6 +115,7 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
         pass
 
 
+@pytest.mark.slow
 def test_in_the_map_of_another_place_there_is_no_pose(mapped: Path, tmp_path: Path) -> None:
     cloud = read_ply(mapped / "map.ply").points
     cloud = cloud[np.abs(cloud).max(axis=1) < 20.0]

@@ -42,6 +42,7 @@ def refined(tmp_path_factory: pytest.TempPathFactory) -> Refined:
     return Refined(base / "slam", base / "out", result)
 
 
+@pytest.mark.slow
 def test_it_begins_where_loops_and_satellites_put_the_run(refined: Refined) -> None:
     """And ends on the Earth, with the origin of the run, nearer to the truth."""
     closed = read_trajectory(refined.slam / "trajectory.csv")

@@ -53,6 +53,7 @@ def refined(folders: tuple[Path, Path]) -> tuple[Path, str]:
     return run.with_name("run_refined"), err
 
 
+@pytest.mark.slow
 def test_folder_holds_everything(folders: tuple[Path, Path], refined: tuple[Path, str]) -> None:
     folder, out = refined
     summary = RefineSummary.model_validate_json((folder / "run.json").read_bytes())

@@ -70,6 +70,7 @@ def of_van(points: np.ndarray, drive: DriftingDrive) -> np.ndarray:
     return np.asarray((np.abs(p - VAN) <= [2.7, 1.2, 1.3]).all(axis=1) & (p[:, 2] > 0.5))
 
 
+@pytest.mark.slow
 def test_runs_that_met_are_one_map_and_the_other_is_apart(
     runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult]
 ) -> None:
@@ -239,6 +240,7 @@ def test_what_may_be_two_places_of_a_kind_is_joined_with_a_warning(merged: tuple
     assert merge_facts(alignment, ["a", "b", "c"], [None] * 3).warnings == []
 
 
+@pytest.mark.slow
 def test_an_update_goes_on_with_a_map(
     runs: tuple[list[Path], list[DriftingDrive]],
     merged: tuple[Path, MergeResult],

@@ -69,6 +69,7 @@ def stopped_after(folder: SlamFolder, events: int, *, resume: bool = False) -> N
     assert result.summary.state == "interrupted" and folder.spool.exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_with_the_same_bits(whole: SlamFolder, tmp_path: Path) -> None:
     out = SlamFolder(tmp_path / "out")
     stopped_after(out, 70)
@@ -86,6 +87,7 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(whole: SlamFolder, tmp_pa
         run_slam(walk(), out.path, CONFIG, resume=True)
 
 
+@pytest.mark.slow
 def test_a_run_that_failed_after_its_odometry_goes_on_from_there(
     whole: SlamFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

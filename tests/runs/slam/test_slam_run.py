@@ -75,6 +75,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return Finished(folder, result, round_a_block())
 
 
+@pytest.mark.slow
 def test_the_folder_holds_the_corrected_results_and_the_odometry_s_own(finished: Finished) -> None:
     folder, summary = finished.folder, finished.result.summary
     assert json.loads(folder.summary.read_text())["program"] == "boxplus slam" and summary.state == "finished"
@@ -134,6 +135,7 @@ def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
     assert np.linalg.norm((points - expected)[:2]) < 15.0
 
 
+@pytest.mark.slow
 def test_the_folder_says_all_that_the_run_did(finished: Finished) -> None:
     """The report is drawn again from the folder alone, and programs find poses and loops there."""
     again = load_slam_result(finished.folder.path)

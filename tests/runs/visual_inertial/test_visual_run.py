@@ -210,6 +210,7 @@ def test_a_second_run_replaces_the_first_only_when_asked(
     assert {path.name for path in folder.iterdir()} >= {"notes.txt", "run.json"} and not (folder / "landmarks.ply").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_everything_up_to_its_last_frame(recorded: Path, tmp_path: Path) -> None:
     folder = VioFolder(tmp_path / "killed")
     command = [sys.executable, "-c", "from boxplus.cli import main; main()", "vio", str(recorded), "-o", str(folder.path)]
@@ -278,6 +279,7 @@ def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Pat
     assert unknown.exit_code == 2
 
 
+@pytest.mark.slow
 def test_cameras_that_are_swapped_end_with_exit_code_3(tmp_path: Path) -> None:
     simulation = simulate_cameras("room", 2, duration_s=5.5, rig=make_rig("stereo", None, 0.3, 10.0))
     swapped = write_camera_recording(simulation, tmp_path / "swapped", "euroc", make_camera_fault("swapped_cameras"))

@@ -31,6 +31,7 @@ def test_a_fit_is_judged_by_its_degrees_of_freedom(dimension):
     assert "all starts end in the same minimum" in note and "too optimistic" in note
 
 
+@pytest.mark.slow
 def test_further_starts_are_tried_where_the_first_ends_badly():
     """Odometry that turns by 20° of noise in a step: the chordal start ends in local minima of some walks."""
     lowered = 0

@@ -53,6 +53,7 @@ def test_loops_are_judged_right_and_the_map_is_that_of_the_true_ones(dimension, 
     np.testing.assert_allclose(result.loops.innovations, result.errors, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [losses.Tukey(4.685), losses.Welsch(2.985), losses.GemanMcClure(3.787)], ids=lambda x: x.name)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_losses_that_forget_start_from_the_loops_that_are_believed(dimension, loss):
@@ -119,6 +120,7 @@ def two_robots(dimension, seed, true, false, *, twice=False):
     return graph, off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(("true", "false"), [(1, 0), (0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (3, 1), (4, 0), (5, 2)])
 def test_robots_that_few_loops_join_wrongly_are_doubted(dimension, true, false):

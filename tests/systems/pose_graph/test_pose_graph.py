@@ -101,6 +101,7 @@ def test_optima_of_the_shared_graphs(shared_data, name, expected):
     assert chi2(result.graph, result.graph.poses) == result.chi2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "optimum", "digits"),
     [

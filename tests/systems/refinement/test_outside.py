@@ -120,6 +120,7 @@ def _loops_of(case: Case, shift: float) -> RunLoops:
     return RunLoops(run.time_ns[scans], none, np.array([0]), np.array([2]), Z[None], information)
 
 
+@pytest.mark.slow
 def test_a_false_loop_where_planes_are_shared_moves_nothing_and_is_told(case: Case) -> None:
     ends = np.flatnonzero(case.run.is_end)
     for shift, is_false in ((0.0, False), (0.5, True)):

@@ -37,6 +37,7 @@ def lead(first: NDArray[np.float64], second: NDArray[np.float64], others: list[N
     return found.share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_aisle_is_told_from_another_one_of_its_kind(seed: int) -> None:
     """Racks lie over each other in both; what is in them lies where it did only in one of them."""

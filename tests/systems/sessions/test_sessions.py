@@ -46,6 +46,7 @@ def alignment(sessions: Sessions) -> SessionAlignment:
     return align_sessions(sessions[0], QUICK)
 
 
+@pytest.mark.slow
 def test_sessions_that_met_are_in_one_world(sessions: Sessions, alignment: SessionAlignment) -> None:
     world = alignment.worlds[0]
     assert world.members == (0, 1)
@@ -70,6 +71,7 @@ def test_another_city_is_left_apart_and_named(alignment: SessionAlignment) -> No
     assert len(why) == 2 and all(text.startswith("elsewhere and ") and len(text) > 30 for text in why)
 
 
+@pytest.mark.slow
 def test_two_corridors_that_are_the_same_are_not_joined() -> None:
     """What they have in common fits at every door, and turned round."""
     world = parallel_corridors()
@@ -80,6 +82,7 @@ def test_two_corridors_that_are_the_same_are_not_joined() -> None:
     assert alignment.meetings[0].T_place_query is None
 
 
+@pytest.mark.slow
 def test_two_stretches_of_one_street_are_not_one() -> None:
     """182 m apart: ground and fronts lie over each other, 60 to 72 % of all points, and seven local maps agree where."""
     solids, few_rays = city(40, 2, seed=5).solids, DriftConfig(channels=16, azimuth_steps=180, step_m=2.0, max_range=45.0)
@@ -97,6 +100,7 @@ def test_two_stretches_of_one_street_are_not_one() -> None:
     assert meeting.confirmed == 7 and meeting.standing < 0.65  # no fit speaks against it
 
 
+@pytest.mark.slow
 def test_how_far_along_a_street_of_even_fronts_is_told_by_all_encounters_together() -> None:
     """Two drives share 26 m of it; their starts lie 14 m apart, and each encounter fits at 11.7 m, where likeness put it."""
     solids, few_rays = city(40, 2, seed=5).solids, DriftConfig(channels=16, azimuth_steps=180, step_m=2.0, max_range=45.0)

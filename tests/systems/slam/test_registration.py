@@ -33,6 +33,7 @@ def pose(random: np.random.Generator, x: float, y: float) -> NDArray[np.float64]
     return np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw), x, y, 1.6])
 
 
+@pytest.mark.slow
 def test_visits_are_laid_over_each_other_within_the_covariance() -> None:
     """From up to half a metre and 3° off. NEES of six degrees of freedom: below 6 where the floor speaks, never far above."""
     nees = []

@@ -41,6 +41,7 @@ def slam(block: MappedDrive) -> Slam:
     return closed(block)
 
 
+@pytest.mark.slow
 def test_a_block_driven_round_is_closed(block: MappedDrive, slam: Slam) -> None:
     accepted = [loop for loop in slam.loops if loop.is_accepted]
     assert len(accepted) >= 2
@@ -86,6 +87,7 @@ def test_an_odometry_that_claims_too_much_is_doubted(block: MappedDrive, slam: S
     assert sure.doubt is not None and "standard deviations from the odometry: it drifts more" in sure.doubt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [12, 26])
 def test_with_three_times_the_drift_nothing_is_laid_beside_its_place(seed: int) -> None:
     """Two metres beside the ends of the houses nothing tells where along the street one is, and a loop stayed where the odometry

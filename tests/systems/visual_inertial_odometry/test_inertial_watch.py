@@ -62,6 +62,7 @@ def test_a_few_per_cent_of_length_are_measured_and_named() -> None:
     assert all(watch.contradiction is None and abs(watch.length[0]) < 3.0 * watch.length[1] for watch in sound)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shaking", "bias"), [(0.05, 0.0), (0.05, 0.006), (0.2, 0.0)])
 def test_standing_still_for_minutes_says_nothing_of_lengths(shaking: float, bias: float) -> None:
     """What the IMU errs by is all of what it measures there; shaking [m/s²] a sample, as of an engine that idles."""
@@ -103,6 +104,7 @@ def stretched(its: Rig, scale: float) -> Rig:
     return Rig.of([c.model for c in its.cameras], mountings, [(c.width, c.height) for c in its.cameras], its.noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "is_named"), [(1.0, False), (1.25, True), (0.8, True)])
 def test_a_wrong_baseline_is_contradicted(scale: float, is_named: bool) -> None:
     flight, true = Flight(3, 10.0), rig()

@@ -48,6 +48,7 @@ def ran(
     return vio, known, float(np.abs(off).max())
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_a_camera_that_stalls_in_motion_does_not_stop_the_odometry() -> None:
     sound, everything, off_sound = ran((9.0, 9.0))
@@ -57,6 +58,7 @@ def test_a_camera_that_stalls_in_motion_does_not_stop_the_odometry() -> None:
     assert len(everything) - len(known) == stalled.counters[REPEATED] / 2
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_the_other_camera_goes_on_where_one_stalls() -> None:
     _, everything, off_sound = ran((9.0, 9.0))

@@ -17,6 +17,7 @@ from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VisualInert
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_a_flight_from_rest_is_followed_to_half_a_centimetre(shared_data: Path) -> None:
     folder = shared_data / "cameras" / "mh05_stereo"

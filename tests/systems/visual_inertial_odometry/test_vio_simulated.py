@@ -69,6 +69,7 @@ def test_landmarks_are_where_the_points_are(flown) -> None:
     assert len(last.landmark_ids) == len(last.landmarks) == len(set(last.landmark_ids.tolist()))
 
 
+@pytest.mark.slow
 def test_errors_of_position_and_yaw_have_the_covariance_stated() -> None:
     total, count = 0.0, 0
     for seed in range(6):
@@ -144,6 +145,7 @@ def test_a_dark_while_is_weak_then_lost_and_the_map_frame_is_kept() -> None:
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all() and vio.contradiction is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_a_silent_imu_is_bridged_by_the_images_taken_meanwhile(cameras: int) -> None:
     flight = Flight(703, 6.0)

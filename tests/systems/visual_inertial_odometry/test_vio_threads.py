@@ -27,6 +27,7 @@ def _digest_of_a_run() -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(os.environ.get("NUMBA_DISABLE_JIT")), reason="too slow without the compiler")
 def test_the_threads_of_blas_change_no_bit() -> None:
     root = str(Path(__file__).parents[3])

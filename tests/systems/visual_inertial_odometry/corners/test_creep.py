@@ -87,6 +87,7 @@ class Creeping(SimulatedTracker):
         return np.asarray(super()._project(camera, which) + self._walked[self._at // IMAGE_EVERY][which])
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_stated_although_corners_creep() -> None:
     """Without it the normalised square is 17 in the mean; 4 is exact. Few and correlated samples spread it widely."""
     means = []

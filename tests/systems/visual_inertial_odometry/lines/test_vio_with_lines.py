@@ -36,6 +36,7 @@ def test_lines_are_where_they_are_and_are_told(flown) -> None:
     assert len(last.line_ids) == len(ends) == len(off) > 8 and np.median(off) < 0.15
 
 
+@pytest.mark.slow
 def test_errors_of_position_and_yaw_have_the_covariance_stated() -> None:
     total, count = 0.0, 0
     for seed in range(80, 84):

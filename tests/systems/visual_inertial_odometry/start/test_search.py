@@ -49,6 +49,7 @@ def looked(possible_from_s: float, seconds: float = 60.0) -> tuple[float | None,
     return None, attempts
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 50.0))
 def test_a_start_is_found_a_fifth_of_the_wait_after_it_became_possible_and_two_seconds_at_most(possible_from_s: float) -> None:
     found_s, attempts = looked(possible_from_s)

@@ -42,6 +42,7 @@ def seed_of(bench: ModuleType, motion: str, cameras: int, number: int = 0) -> in
     return fits[number]
 
 
+@pytest.mark.slow
 def test_most_starts_are_found_and_none_is_wrong(bench) -> None:
     """A part of `benchmarks/bench_vio_start.py`."""
     lines = [bench.run_seed(seed) for seed in range(3001, 3049, 2)]
