@@ -40,7 +40,7 @@ def unconverged_findings(
     if len(creeping):
         notes.append(
             f"{counted(len(creeping), 'point')} whose depth is not determined {either(len(creeping), 'was', 'were')} still "
-            f"moving when the adjustment ended ({solution.reason}), which is a matter of distance alone: {names_text(creeping, ids)}"
+            f"moving when the adjustment ended ({solution.reason}), a matter of their distance alone: {names_text(creeping, ids)}"
         )
     if few and len(late) and doubt is None:
         notes.append(
