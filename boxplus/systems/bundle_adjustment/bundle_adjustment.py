@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings, require
+from boxplus._words import counted, either
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
@@ -38,7 +39,7 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_notes,
     structure_notes,
 )
-from boxplus.systems.bundle_adjustment.readings import reading_doubt
+from boxplus.systems.bundle_adjustment.readings import reading_doubt, refuse_other_columns
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     add_reconstruction,
     adjusted_reconstruction,
@@ -133,6 +134,8 @@ def adjust_bundle(
             f"not a single observation of a point ({getattr(reconstruction, 'source', 'reconstruction')})",
             "triangulate first",
         )
+    if isinstance(reconstruction, BalProblem):
+        refuse_other_columns(reconstruction)
     refuse_focal_lengths(reconstruction)
     other_axes = reading_doubt(
         reconstruction, is_lens_held=not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
@@ -282,7 +285,7 @@ def _doubt(
     """Why the result is not to be trusted, beside what was `said` of it."""
     reasons = [text for text in said if text]
     if left <= 0:
-        reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
+        reasons.append(f"{counted(-left, 'unknown')} more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:  # no minimum, either, and more steps lead to none
         reasons.append(NOT_APART)
     elif unconverged:
@@ -290,8 +293,9 @@ def _doubt(
     if cheirality.bad_share > _BAD_SHARE:
         count = cheirality.behind + cheirality.left_out
         reasons.append(
-            f"{count} of {cheirality.count} observations ({cheirality.bad_share:.1%}) are of points behind their cameras at the "
-            "end, or were left out for it"
+            f"{count} of {counted(cheirality.count, 'observation')} ({cheirality.bad_share:.1%}) "
+            f"{either(count, 'is of a point behind its camera', 'are of points behind their cameras')} at the end, or "
+            f"{either(count, 'was', 'were')} left out for it"
         )
     faded = max(solution.faded.values(), default=0.0)
     if faded > _MOST:

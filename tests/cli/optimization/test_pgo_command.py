@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner, Result
 
+from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.errors import SingularProblemError
 from boxplus.formats.graphs.g2o import read_g2o, write_g2o
@@ -256,7 +257,7 @@ def test_without_the_libraries_of_reports_there_is_none_and_that_is_said(
     write_g2o(tmp_path / "loops.g2o", loop_graph(2))
     result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    assert "no report is drawn, for want of matplotlib or plotly: pip install 'boxplus[report]'" in words(result)
+    assert f"no report is drawn, for want of matplotlib or plotly: {installation('report')}" in words(result)
     assert (tmp_path / "out" / "optimized.g2o").exists() and not (tmp_path / "out" / "report.html").exists()
     quiet = call(tmp_path / "loops.g2o", "-o", tmp_path / "asked", "--no-report")
     assert "for want of" not in quiet.output
