@@ -22,6 +22,7 @@ from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.incidents import incident_doubts
+from boxplus.evaluation.rounded_stamps import rounding_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
 from boxplus.evaluation.time_offset import TimeOffset
@@ -266,8 +267,12 @@ def evaluate(
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
-        *incident_doubts(aligned, truth, translation, estimate, ground_truth),
+        *incident_doubts(aligned, truth, translation),
     ]
+    if association.method != "index":
+        on_clock = replace(estimate, time_ns=estimate.times + round(offset_s * 1e9), lines=None)
+        moved = projected(transform.apply(on_clock), plane), projected(ground_truth, plane)
+        warnings += rounding_doubts(aligned, truth, (estimate, ground_truth), moved)
     relative = []
     for delta in deltas:
         try:

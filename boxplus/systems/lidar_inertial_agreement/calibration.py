@@ -63,6 +63,7 @@ class Calibration:
         covariance: (9, 9) of [θ about the IMU's axes, p_imu_lidar, offset, log gyro_scale, slope].
         sigma_rotation, sigma_position: what the fit leaves of the LiDAR's attitudes [rad] and positions [m] along an axis.
         poses: of the LiDAR that were compared.
+        last_step: (9,) what the last round would still have moved, in the order of `covariance`; nothing where it came to rest.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -75,6 +76,12 @@ class Calibration:
     sigma_rotation: float
     sigma_position: float
     poses: int
+    last_step: NDArray[np.float64]
+
+    @property
+    def moving(self) -> NDArray[np.float64]:
+        """(9,) the last step in standard deviations: what is beyond one had not come to rest where the rounds ended."""
+        return np.asarray(np.abs(self.last_step) / self.std)
 
     @property
     def std(self) -> NDArray[np.float64]:
@@ -100,6 +107,7 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
     noise = _Noise(_SIGMA_ROTATION, 0.1), _Noise(_SIGMA_POSITION, 0.4)
     size = _SHARED + sum(window.size for window in windows)
     covariance: NDArray[np.float64] = np.eye(size)
+    step = np.full(size, np.inf)
     for number in range(_ROUNDS):
         H, b = np.zeros((size, size)), np.zeros(size)
         H[range(_SHARED), range(_SHARED)] = 1.0 / _PRIOR_STD**2
@@ -155,6 +163,7 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
         noise[0].white,
         noise[1].white,
         sum(window.poses for window in windows),
+        step[:_SHARED],
     )
 
 
