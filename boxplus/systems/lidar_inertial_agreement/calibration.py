@@ -30,6 +30,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 _PIECE_S = 2.0
 _FEWEST_POSES = 6
 _ROUNDS, _PLAIN_ROUNDS = 14, 4
+_NOISE_ROUNDS = 8  # after which it is held: its ratio has steps, between which the fit would go to and fro for ever
 _SETTLED = 1e-6
 _SIGMA_ROTATION, _SIGMA_POSITION = 2e-3, 4e-3  # rad, m: to begin with
 _LEAST_ROTATION, _LEAST_POSITION = 3e-4, 1e-3
@@ -141,7 +142,8 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
         for window in windows:
             window.move(step[first : first + window.size])
             first += window.size
-        noise = _noise_of(left[0], 0), _noise_of(left[1], 1)
+        if number < _NOISE_ROUNDS:
+            noise = _noise_of(left[0], 0), _noise_of(left[1], 1)
         if number > _PLAIN_ROUNDS and np.abs(step[:_SHARED]).max() < _SETTLED:
             break
     covariance = covariance * _CORRELATED**2

@@ -78,7 +78,7 @@ def test_a_search_that_did_not_come_to_rest_says_what_was_still_moving(monkeypat
     scans, imu = data(simulation, faults.clock_offset(0.03))
     stretches = [(compare_sensors(scans, imu, CONFIG, refine=True), usable(imu))]
     settled = calibrate(stretches)
-    assert settled is not None and settled.moving.max() < 0.5
+    assert settled is not None and settled.moving.max() < 0.02
     assert not [row.advice for row in _quantities(settled, 0.0) if "come to rest" in row.advice]
     monkeypatch.setattr(calibration, "_ROUNDS", 1)
     started = calibrate(stretches)
