@@ -21,7 +21,7 @@ from boxplus.evaluation.ate import rotation_differences, translation_errors
 from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
-from boxplus.evaluation.incidents import incident_doubts
+from boxplus.evaluation.incidents import incident_doubts, jump_doubts
 from boxplus.evaluation.rounded_stamps import rounding_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
@@ -250,6 +250,7 @@ def evaluate(
     rotation = rotation_differences(aligned, truth)
     warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
+    warnings += jump_doubts(estimate, ground_truth)
     noticed = association.time_offset
     by_rate = None
     if noticed is not None and noticed.rate is not None and noticed.rate.shows:

@@ -27,6 +27,18 @@ def incident_doubts(aligned: Trajectory, truth: Trajectory, translation: NDArray
     return [*_far_off(aligned, translation), *_jumps(aligned, truth, translation), *_stands(aligned, truth)]
 
 
+def jump_doubts(estimate: Trajectory, ground_truth: Trajectory) -> Iterator[str]:
+    """Stamps that jump by more than all the rest of a file lasts."""
+    for poses, name in ((estimate, "estimate"), (ground_truth, "ground truth")):
+        steps = np.zeros(0) if poses.time_ns is None else np.diff(poses.time_ns) * 1e-9
+        if len(steps) >= _LEAST and steps.max() > max(float(steps.sum() - steps.max()), _LEAST * float(np.median(steps))):
+            row = int(np.argmax(steps))
+            yield (
+                f"the stamps of the {name} jump by {steps[row]:.6g} s after pose {row} of {len(poses)}, more than all the rest "
+                "lasts: two runs, or two clocks, in one file? Poses on one side of it may not be compared at all"
+            )
+
+
 def _when(trajectory: Trajectory, row: int) -> str:
     return f"pose {row}" if trajectory.time_ns is None else f"{(trajectory.time_ns[row] - trajectory.time_ns[0]) * 1e-9:.2f} s"
 

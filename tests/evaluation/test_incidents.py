@@ -193,3 +193,12 @@ def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(metho
 def test_sound_estimates_have_no_incidents(alignment: str) -> None:
     for seed in range(10, 20):
         assert told(path(seed, 0.03), alignment=alignment) == ""
+
+
+def test_stamps_that_jump_are_told_and_gaps_are_not() -> None:
+    truth, estimate = path(), path(1, 0.003)
+    late = estimate.times + np.where(np.arange(600) < 300, 0, 3600 * 10**9)
+    said = " ".join(evaluate(replace(estimate, time_ns=late), truth).warnings)
+    assert "the stamps of the estimate jump by 3600.1 s after pose 299 of 600" in said
+    rows = np.flatnonzero((np.arange(600) < 200) | (np.arange(600) > 350))  # lost for a while
+    assert "jump by" not in " ".join(evaluate(estimate.select(rows), truth).warnings)

@@ -64,7 +64,10 @@ def _readings(information: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.flo
     ):
         scale = np.ones(dim)
         scale[places] = unit
-        yield information * np.outer(scale, scale), f"{name}: give it per square {'radian' if unit < 1e3 else 'metre'}"
+        yield (
+            np.asarray(information * np.outer(scale, scale), dtype=np.float64),
+            f"{name}: give it per square {'radian' if unit < 1e3 else 'metre'}",
+        )
     try:
         yield np.linalg.inv(information), "they are covariances: give their inverses"
     except np.linalg.LinAlgError:
