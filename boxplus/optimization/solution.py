@@ -229,9 +229,9 @@ class Solution:
         Example:
             >>> problem = bp.Problem()
             >>> x = problem.add_variables(bp.Euclidean(1), [0.0])
-            >>> group = problem.add_residuals(bp.residuals.Prior(bp.Euclidean(1), [2.0], sigma=0.5), x)
-            >>> problem.solve(max_iterations=0).remainder().variables
-            (array([4.]),)
+            >>> group = problem.add_residuals(bp.residuals.Prior(bp.Euclidean(1), [1.0], sigma=0.5), x)
+            >>> problem.solve(max_iterations=0).remainder().variables[0].round(3)
+            array([2.])
         """
         if self.limit is None and self.status != "stalled":
             return None

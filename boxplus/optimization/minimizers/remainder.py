@@ -49,7 +49,7 @@ class Remainder:
         cost: by how much the cost would still fall.
         total: distance in standard deviations, all variables together: it grows with their number.
         variables: for every block (n,) the distance of each in standard deviations of its own, with the noise that the errors
-            have; zero where fixed. The farthest are exact, the others scatter by a fifth.
+            have; zero where fixed. From one to three those that are farthest are exact, the others scatter by a fifth.
         residuals: for every group (N,) the same of what each residual sees.
     """
 

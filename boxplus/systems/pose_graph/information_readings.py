@@ -69,7 +69,7 @@ def _readings(information: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.flo
             f"{name}: give it per square {'radian' if unit < 1e3 else 'metre'}",
         )
     try:
-        yield np.linalg.inv(information), "they are covariances: give their inverses"
+        yield np.asarray(np.linalg.inv(information), dtype=np.float64), "they are covariances: give their inverses"
     except np.linalg.LinAlgError:
         return
 
