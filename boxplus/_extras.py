@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
 from typing import Any
 
 from boxplus.errors import InputError
@@ -41,7 +46,7 @@ def require(module: str, purpose: str, error: type[InputError] = InputError) -> 
         error: what is raised where it is missing.
 
     Raises:
-        InputError: it is not installed, or cannot be imported; the message names the extra.
+        InputError: it is not installed, or cannot be imported; the message has the line that installs it.
     """
     try:
         return importlib.import_module(module)
@@ -49,4 +54,25 @@ def require(module: str, purpose: str, error: type[InputError] = InputError) -> 
         package = module.partition(".")[0]
         name, extra = _LIBRARIES[package]
         found = "it is not installed" if not has(package) else f"it cannot be imported: {missing}"
-        raise error(f"{name}, {purpose}", found, f"pip install 'boxplus[{extra}]'") from missing
+        raise error(f"{name}, {purpose}", found, installation(extra)) from missing
+
+
+def installation(extra: str) -> str:
+    """The line for a shell that installs the libraries of an extra beside boxplus, however that came here.
+
+    boxplus is on no index of packages: what would install `boxplus[view]` from there does not work, and its libraries do.
+    """
+    wanted = _wanted(extra)
+    python = shlex.quote(sys.executable)
+    pip = f"{python} -m pip install" if has("pip") else f"uv pip install --python {python}"
+    return f"{pip} {' '.join(wanted)}" if wanted else f"{pip} {shlex.quote(f'{Path(__file__).resolve().parents[1]}[{extra}]')}"
+
+
+def _wanted(extra: str) -> list[str]:
+    """Requirements of an extra as boxplus was installed with; none where its folder is on the path and it was not."""
+    try:
+        listed = importlib.metadata.requires("boxplus") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    own = [line.partition(";") for line in listed if re.search(rf"""extra\s*==\s*['"]{extra}['"]""", line)]
+    return [shlex.quote(requirement.strip()) for requirement, _, _ in own]

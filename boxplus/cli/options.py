@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from boxplus._extras import has
+from boxplus._extras import has, installation
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -25,7 +25,7 @@ RESULTS, SETTINGS, PRINTING = "Results", "Settings", "On the terminal"
 def without_report(wanted: bool) -> bool:
     """As asked for, and where a report cannot be drawn: that is said before the run, which is worth as much without."""
     if not wanted and not has("matplotlib", "plotly"):
-        typer.echo("warning: no report is drawn, for want of matplotlib or plotly: pip install 'boxplus[report]'", err=True)
+        typer.echo(f"warning: no report is drawn, for want of matplotlib or plotly: {installation('report')}", err=True)
         return True
     return wanted
 

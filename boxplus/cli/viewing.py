@@ -16,7 +16,7 @@ ViewOption = Annotated[
         "--view",
         metavar="WHERE",
         help="Show it in 3D: window, FILE.rrd to open later with 'rerun FILE.rrd', or the address of a viewer on this machine, "
-        "rerun+http://127.0.0.1:9876/proxy (needs: pip install 'boxplus[view]').",
+        "rerun+http://127.0.0.1:9876/proxy (needs: pip install rerun-sdk).",
         rich_help_panel=PRINTING,
     ),
 ]

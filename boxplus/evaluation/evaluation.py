@@ -21,7 +21,8 @@ from boxplus.evaluation.ate import rotation_differences, translation_errors
 from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
-from boxplus.evaluation.incidents import incident_doubts
+from boxplus.evaluation.incidents import incident_doubts, jump_doubts
+from boxplus.evaluation.rounded_stamps import rounding_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
 from boxplus.evaluation.time_offset import TimeOffset
@@ -249,6 +250,7 @@ def evaluate(
     rotation = rotation_differences(aligned, truth)
     warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
+    warnings += jump_doubts(estimate, ground_truth)
     noticed = association.time_offset
     by_rate = None
     if noticed is not None and noticed.rate is not None and noticed.rate.shows:
@@ -266,8 +268,12 @@ def evaluate(
     warnings += [
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
-        *incident_doubts(aligned, truth, translation, estimate, ground_truth),
+        *incident_doubts(aligned, truth, translation),
     ]
+    if association.method != "index":
+        on_clock = replace(estimate, time_ns=estimate.times + round(offset_s * 1e9), lines=None)
+        moved = projected(transform.apply(on_clock), plane), projected(ground_truth, plane)
+        warnings += rounding_doubts(aligned, truth, (estimate, ground_truth), moved)
     relative = []
     for delta in deltas:
         try:

@@ -24,6 +24,7 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _STRETCH_S, _STRETCHES = 8.0, 5
 _FEWEST_SAMPLES = 100
+_AT_REST = 1.0  # standard deviations of the last step
 _REFUSED: frozenset[Cause] = frozenset({"gyro_unit", "gyro_sign", "not_together", "mirrored", "force_sign"})
 """With these there is no mounting to be found."""
 _ROTATION_DEG, _TRANSLATION_M, _OFFSET_S, _SCALE, _GYRO_BIAS = 0.6, 0.03, 5e-3, 0.03, 5e-3
@@ -172,6 +173,7 @@ def calibration_facts(found: LidarImuCalibration) -> LidarImuFacts:
 def _quantities(found: Calibration, given_s: float) -> list[Quantity]:
     std = found.std
     R, p = found.T_imu_lidar[:3, :3], found.T_imu_lidar[:3, 3]
+    moving = found.moving
     turn = _open_axes(found.covariance[THETA, THETA], np.deg2rad(_ROTATION_DEG))
     move = _open_axes(found.covariance[ARM, ARM], _TRANSLATION_M)
     rows = [
@@ -179,28 +181,33 @@ def _quantities(found: Calibration, given_s: float) -> list[Quantity]:
             "R_imu_lidar",
             "[" + "; ".join(", ".join(f"{value:.5f}" for value in row) for row in R) + "]",
             f"{_numbers(np.degrees(std[THETA]), 2)} deg about the IMU's axes",
-            f"open about {turn} (IMU axes): turn the platform quickly about axes across it" if turn else "",
+            f"open about {turn} (IMU axes): turn the platform quickly about axes across it" if turn else _unrest(moving[THETA]),
         ),
         Quantity(
             "p_imu_lidar",
             f"({_numbers(p, 4)}) m",
             f"{_numbers(std[ARM], 3)} m along the IMU's axes",
-            f"open along {move} (IMU axes): turn the platform to and fro, quickly, about axes across it" if move else "",
+            f"open along {move} (IMU axes): turn the platform to and fro, quickly, about axes across it"
+            if move
+            else _unrest(moving[ARM]),
         ),
         Quantity(
             "lidar_time_offset",
             f"{(given_s + found.offset_s) * 1e3:+.2f} ms",
             f"{std[OFFSET] * 1e3:.2f} ms",
-            "turn to and fro: a steady turn shows no time" if std[OFFSET] > _OFFSET_S else "",
+            "turn to and fro: a steady turn shows no time" if std[OFFSET] > _OFFSET_S else _unrest(moving[OFFSET]),
         ),
         Quantity(
-            "gyro_scale", f"{found.gyro_scale:.4f}", f"{std[SCALE]:.4f}", "turn farther and faster" if std[SCALE] > _SCALE else ""
+            "gyro_scale",
+            f"{found.gyro_scale:.4f}",
+            f"{std[SCALE]:.4f}",
+            "turn farther and faster" if std[SCALE] > _SCALE else _unrest(moving[SCALE]),
         ),
         Quantity(
             "length_ratio",
             f"{found.slope:.4f}",
             f"{std[SLOPE]:.4f}",
-            "accelerate: move to and fro by half a metre" if std[SLOPE] > _SCALE else "",
+            "accelerate: move to and fro by half a metre" if std[SLOPE] > _SCALE else _unrest(moving[SLOPE]),
         ),
         Quantity(
             "gyro_bias",
@@ -210,6 +217,17 @@ def _quantities(found: Calibration, given_s: float) -> list[Quantity]:
         ),
     ]
     return rows
+
+
+def _unrest(moving: NDArray[np.float64] | float) -> str:
+    """Advice where the search ended while a quantity still moved by more than its own standard deviation."""
+    most = float(np.max(moving))
+    if not most > _AT_REST:
+        return ""
+    return (
+        f"the search did not come to rest: in its last round this moved by {most:.2g} standard deviations; turn farther and "
+        "faster about all axes, in surroundings with walls"
+    )
 
 
 def _open_axes(covariance: NDArray[np.float64], limit: float) -> str:

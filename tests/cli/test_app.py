@@ -35,7 +35,6 @@ def test_every_command_has_help_of_its_own(name: str) -> None:
 
 def test_help_keeps_what_stands_in_brackets() -> None:
     result = CliRunner().invoke(app, ["lio", "--help"], env={"COLUMNS": "120"})
-    assert "boxplus[view]" in result.stdout
     assert "[m]" in result.stdout
 
 

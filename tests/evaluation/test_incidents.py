@@ -161,6 +161,27 @@ def test_rounded_stamps_are_told() -> None:
     assert "multiples" not in " ".join(evaluate(estimate, fast, method="interpolate").warnings)
 
 
+@pytest.mark.parametrize("seed", range(1, 8, 2))
+@pytest.mark.parametrize("of", ["estimate", "ground truth"])
+def test_stamps_of_whole_seconds_are_told_by_errors_along_the_way(seed: int, of: str) -> None:
+    """Nearly all of their steps are 1 s, as those of a clock are; only the errors say that they were rounded."""
+    rng = np.random.default_rng(seed)
+    dense = path(seed)
+    dense = replace(dense, p=10.0 * dense.p, time_ns=dense.times + 12_345_678)
+    stamps = np.sort(dense.time_ns[0] + (1.1e9 * np.arange(1, 54) + rng.uniform(0, 1e8, 53)).astype(np.int64))
+    p = np.stack([np.interp(stamps, dense.time_ns, axis) for axis in dense.p.T], 1) + 0.02 * rng.standard_normal((53, 3))
+    rows = np.searchsorted(dense.time_ns, stamps)
+    sparse = Trajectory(np.round(stamps * 1e-9).astype(np.int64) * 1_000_000_000, p, dense.q_wxyz[rows])
+    pair = (sparse, dense) if of == "estimate" else (dense, sparse)
+    said = " ".join(evaluate(*pair, max_difference_s=0.06).warnings)
+    assert f"all stamps of the {of} are multiples of 1 s, and " in said and "lies along the way" in said and "0.5 s × " in said
+    at = np.clip(np.searchsorted(dense.time_ns, sparse.times), 0, len(dense) - 1)
+    on_clock = np.stack([np.interp(sparse.times, dense.time_ns, axis) for axis in dense.p.T], 1)
+    gnss = replace(sparse, p=on_clock + 0.02 * rng.standard_normal((53, 3)), q_wxyz=dense.q_wxyz[at])
+    pair = (gnss, dense) if of == "estimate" else (dense, gnss)
+    assert "multiples" not in " ".join(evaluate(*pair, max_difference_s=0.06).warnings)
+
+
 @pytest.mark.parametrize("method", ["nearest", "interpolate"])
 def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(method: str) -> None:
     truth, sound = (replace(one, p=10.0 * one.p) for one in (path(), path(1, 0.003)))
@@ -173,3 +194,12 @@ def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(metho
 def test_sound_estimates_have_no_incidents(alignment: str) -> None:
     for seed in range(10, 20):
         assert told(path(seed, 0.03), alignment=alignment) == ""
+
+
+def test_stamps_that_jump_are_told_and_gaps_are_not() -> None:
+    truth, estimate = path(), path(1, 0.003)
+    late = estimate.times + np.where(np.arange(600) < 300, 0, 3600 * 10**9)
+    said = " ".join(evaluate(replace(estimate, time_ns=late), truth).warnings)
+    assert "the stamps of the estimate jump by 3600.1 s after pose 299 of 600" in said
+    rows = np.flatnonzero((np.arange(600) < 200) | (np.arange(600) > 350))  # lost for a while
+    assert "jump by" not in " ".join(evaluate(estimate.select(rows), truth).warnings)

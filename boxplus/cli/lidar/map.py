@@ -66,7 +66,7 @@ def export_command(
     voxel: Annotated[float | None, typer.Option(help="Keep one point per voxel of this edge [m].")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Write all tiles of a map into one file: PLY or PCD, LAS or LAZ (pip install 'boxplus[las]'), E57 ('boxplus[e57]')."""
+    """Write all tiles of a map into one file: PLY or PCD, LAS or LAZ (pip install laspy lazrs), E57 (pip install pye57)."""
     from boxplus.maps.tiles.store import TileStore, merge
 
     tiles = _tiles(folder)

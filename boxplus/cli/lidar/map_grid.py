@@ -66,7 +66,7 @@ def height(
     z: _Z = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Write the heights of the ground, or of what stands on it, as a GeoTIFF (pip install 'boxplus[geo]').
+    """Write the heights of the ground, or of what stands on it, as a GeoTIFF (needs: pip install rasterio).
 
     In the map's own frame; of a run of 'boxplus slam' with positions by satellite with its place on the Earth and heights
     above the ellipsoid of WGS84.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus._words import counted
 from boxplus.cli import uncollected
 from boxplus.cli.optimization.terminal import (
     LinearSolverChoice,
@@ -233,9 +234,9 @@ def _summary(
 
 def _start(result: BundleAdjustmentResult, loss: Loss | None) -> str:
     found = result.cheirality
-    anew = [f"{len(found.triangulated)} points triangulated anew"] if len(found.triangulated) else []
-    anew += [f"{len(found.turned_back)} cameras set anew"] if len(found.turned_back) else []
-    anew += [f"{found.left_out} observations left out"] if found.left_out else []
+    anew = [f"{counted(len(found.triangulated), 'point')} triangulated anew"] if len(found.triangulated) else []
+    anew += [f"{counted(len(found.turned_back), 'camera')} set anew"] if len(found.turned_back) else []
+    anew += [f"{counted(found.left_out, 'observation')} left out"] if found.left_out else []
     if loss is not None and loss.is_redescending:
         anew.append("then the minimum under Huber's loss")
     return ", ".join(["the file's cameras and points", *anew])

@@ -71,6 +71,14 @@ class CrossBlockChoice(StrEnum):
     dropped = "dropped"
 
 
+_CROSS_BLOCKS = {
+    "auto": "ordered as g2o has it, or transposed where only that is semi-definite (a warning says so)",
+    "upper": "ordered as g2o has it",
+    "transposed": "transposed",
+    "dropped": "left out",
+}
+
+
 def pgo(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Pose graph in g2o's or TORO's format, 2D or 3D.")],
     output: OutputOption = None,
@@ -219,7 +227,7 @@ def _convention(graph: PoseGraph, config: PoseGraphConfig, loss: Loss | None, re
     if not reading:
         return text
     taken = "the full rotation vector" if reading["rotation_error"] == "rotation_vector" else "g2o's half angles"
-    return f"{text}; rotation information of the file taken for {taken}, its cross block read as {reading['cross_block']}"
+    return f"{text}; rotation information of the file taken for {taken}, its cross block {_CROSS_BLOCKS[reading['cross_block']]}"
 
 
 def _fit(result: PoseGraphResult) -> str:

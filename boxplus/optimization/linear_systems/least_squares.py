@@ -16,7 +16,11 @@ from boxplus.optimization.linear_systems.linear_system import LinearSystem
 from boxplus.optimization.terms.group import Group, GroupCost
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.tangents import best_tangents
-from boxplus.optimization.terms.weighting import add_product_with_jacobian
+from boxplus.optimization.terms.weighting import (
+    add_own_curvature,
+    add_product_with_jacobian,
+    add_product_with_transposed_jacobian,
+)
 
 Values = Sequence[NDArray[np.float64]]
 
@@ -174,6 +178,29 @@ class LeastSquares:
                 add_product_with_jacobian(J, self.layout.starts(connection), delta, product)
             parts.append(product.reshape(-1))
         return np.concatenate(parts)
+
+    def transposed_product(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Jᵀz (dof,) of z (rows of all groups,); see `product`."""
+        product, begin = np.zeros(self.layout.dof), 0
+        for group in self.groups:
+            mine = z[begin : begin + group.r.size].reshape(group.r.shape)
+            for connection, J in zip(group.connections, group.jacobians, strict=True):
+                add_product_with_transposed_jacobian(J, self.layout.starts(connection), mine, product)
+            begin += group.r.size
+        return product
+
+    def own_curvatures(self) -> list[NDArray[np.float64]]:
+        """For every block the diagonal blocks of H (free variables, dof, dof); see `product`."""
+        own = []
+        for block, number in zip(self.layout.blocks, self.layout.number, strict=True):
+            of = np.where(number >= 0, np.cumsum(number >= 0) - 1, -1)
+            mine = np.zeros((int(np.count_nonzero(number >= 0)), block.manifold.dof, block.manifold.dof))
+            for group in self.groups:
+                for connection, J in zip(group.connections, group.jacobians, strict=True):
+                    if connection.block is block:
+                        add_own_curvature(J, of[self.layout.rows(connection)], mine)
+            own.append(mine)
+        return own
 
     def curvature(self, delta: NDArray[np.float64]) -> float:
         """δᵀHδ = ‖Jδ‖²; see `product`."""

@@ -13,7 +13,7 @@ from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.observability.components import Components
 from boxplus.optimization.observability.null_space import OwnDirections, SharedDirections
 from boxplus.optimization.observability.variable_names import variable_names
-from boxplus.optimization.observability.world_motions import DOF, kinds_of, motions_of, positions_of
+from boxplus.optimization.observability.world_motions import DOF, displacements_of, kinds_of, motions_of, positions_of
 from boxplus.optimization.terms.variables import Variables
 
 _IS_MOTION = 1e-8  # share of a motion's squared length that may lie outside the free directions
@@ -267,23 +267,30 @@ def _listed(phrases: list[str]) -> str:
 
 
 def _poses_text(problem: LeastSquares, shared: SharedDirections, direction: NDArray[np.float64]) -> str:
-    """How far poses turn where others shift, of a motion that is none of the whole; nothing where it does not do both."""
-    most: dict[str, tuple[float, str]] = {}
+    """How far, and which way, poses turn where others shift, where they do both; empty else."""
+    moved = []
     for part in _parts(problem, shared):
         tangents = direction[part.places].reshape(len(part.rows), -1)
-        names = problem.layout.tangents[part.block.number].tangent_names
-        for unit in ("[rad]", "[m]"):
-            moved = np.linalg.norm(tangents[:, [name.endswith(unit) for name in names]], axis=1)
-            row = int(np.argmax(moved))
-            if moved[row] > most.get(unit, (0.0, ""))[0]:
-                number = problem.layout.number[part.block.number][part.rows[row]]
-                most[unit] = float(moved[row]), variable_names(problem.layout, np.array([number]))
-    if len(most) < 2 or most["[rad]"][0] < _HARDLY * most["[m]"][0] or most["[m]"][0] < _HARDLY * most["[rad]"][0]:
+        number = part.block.number
+        found = displacements_of(problem.layout.tangents[number], problem.values[number][part.rows], tangents)
+        if found is not None:
+            moved.append((problem.layout.number[number][part.rows], *found, part.block.manifold.dof <= 3))
+    if not moved:
         return ""
-    (turn, who_turns), (shift, who_shifts) = most["[rad]"], most["[m]"]
+    numbers, turns, shifts = (np.concatenate([one[k] for one in moved]) for k in range(3))
+    turn, shift = np.linalg.norm(turns, axis=1), np.linalg.norm(shifts, axis=1)
+    most_turned, most_shifted = int(np.argmax(turn)), int(np.argmax(shift))
+    angle, length = turn[most_turned], shift[most_shifted]
+    if angle <= _HARDLY * length or length <= _HARDLY * angle:
+        return ""
+    axis = _signed(turns[most_turned])
+    along = shifts[most_shifted] / (length * (1.0 if axis @ turns[most_turned] > 0.0 else -1.0))
+    who_turns, who_shifts = (variable_names(problem.layout, numbers[[k]]) for k in (most_turned, most_shifted))
+    is_flat = all(flat for *_, flat in moved)
     return (
-        f"by turning and shifting together, each by its own: where {who_shifts}, which shifts most, shifts by 1 m, {who_turns}, "
-        f"which turns most, turns by {np.degrees(turn / shift):.3g} deg"
+        f"by turning and shifting together, each by its own: where {who_turns}, which turns most, turns by 1 deg"
+        f"{'' if is_flat else f' about {vector_text(axis)}'}, {who_shifts}, which shifts most, shifts by "
+        f"{np.radians(length / angle):.3g} m along {vector_text(along[:2] if is_flat else along)}"
     )
 
 

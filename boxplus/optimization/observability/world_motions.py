@@ -88,6 +88,36 @@ def motions_of(manifold: Manifold, kind: str, x: Points) -> Motions:
     return B
 
 
+def displacements_of(manifold: Manifold, x: Points, tangents: Motions) -> tuple[Points, Points] | None:
+    """How variables (n, size) turn and shift, (n, 3) each, along tangents (n, dof), whichever ⊞ these are of.
+
+    Rotation and translation of a pose are those in the frame that it maps to: with T_world_body, of the body in the world.
+
+    Returns:
+        None for what is no pose, rotation or point.
+    """
+    none = np.zeros((len(x), 3))
+    if isinstance(manifold, Product) and manifold not in POSES:
+        size, dof = 0, 0
+        for part in manifold.components:
+            if part in POSES:
+                return displacements_of(part, x[:, size : size + part.size], tangents[:, dof : dof + part.dof])
+            size, dof = size + part.size, dof + part.dof
+        return None
+    if isinstance(manifold, Euclidean):
+        if "point" not in kinds_of(manifold):
+            return None
+        return none, np.column_stack([tangents, none[:, manifold.n :]])
+    if kinds_of(manifold) != _POSE_KINDS:
+        return None
+    motion = np.zeros((len(x), 6))
+    free = [2, 3, 4] if manifold == SE2 else list(range(min(manifold.dof, 6)))
+    B = motions_of(manifold, "world_from_body", x)[:, :, free]
+    motion[:, free] = np.linalg.solve(B, tangents[:, :, None])[:, :, 0]
+    position = positions_of(manifold, "world_from_body", x)
+    return motion[:, :3], motion[:, 3:] + (none if position is None else np.cross(motion[:, :3], position))
+
+
 def positions_of(manifold: Manifold, kind: str, x: Points) -> Points | None:
     """Where variables are in the world, (n, 3); None where they have no place."""
     n = len(x)

@@ -227,3 +227,32 @@ def add_product_with_jacobian(
             for c in range(J.shape[2]):
                 total += J[n, i, c] * delta[at + c]
             product[n, i] += total
+
+
+@kernel
+def add_product_with_transposed_jacobian(
+    J: NDArray[np.float64], start: NDArray[np.int64], z: NDArray[np.float64], product: NDArray[np.float64]
+) -> None:
+    """product (dof,) += Jᵀ z, z (N, d); the tangent of row n starts at start[n] of it, or is fixed at −1."""
+    for n in range(J.shape[0]):
+        at = start[n]
+        if at < 0:
+            continue
+        for i in range(J.shape[1]):
+            for c in range(J.shape[2]):
+                product[at + c] += J[n, i, c] * z[n, i]
+
+
+@kernel
+def add_own_curvature(J: NDArray[np.float64], row: NDArray[np.int64], curvature: NDArray[np.float64]) -> None:
+    """curvature (m, k, k) += JᵀJ of J (N, d, k), that of row n to curvature[row[n]], or nowhere at −1."""
+    for n in range(J.shape[0]):
+        at = row[n]
+        if at < 0:
+            continue
+        for a in range(J.shape[2]):
+            for b in range(J.shape[2]):
+                total = 0.0
+                for i in range(J.shape[1]):
+                    total += J[n, i, a] * J[n, i, b]
+                curvature[at, a, b] += total

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings, require
+from boxplus._words import counted, either
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
@@ -23,6 +24,7 @@ from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
+from boxplus.systems.bundle_adjustment.ending import unconverged_findings
 from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.lens import lens_finding, lens_of_start
 from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
@@ -37,7 +39,7 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_notes,
     structure_notes,
 )
-from boxplus.systems.bundle_adjustment.readings import reading_doubt
+from boxplus.systems.bundle_adjustment.readings import reading_doubt, refuse_other_columns
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     add_reconstruction,
     adjusted_reconstruction,
@@ -132,6 +134,8 @@ def adjust_bundle(
             f"not a single observation of a point ({getattr(reconstruction, 'source', 'reconstruction')})",
             "triangulate first",
         )
+    if isinstance(reconstruction, BalProblem):
+        refuse_other_columns(reconstruction)
     refuse_focal_lengths(reconstruction)
     other_axes = reading_doubt(
         reconstruction, is_lens_held=not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
@@ -193,6 +197,8 @@ def adjust_bundle(
     origin = pixel_origin(reconstruction, config, loss, errors, solution, left, watch)
     if origin.note is not None:
         notes.append(origin.note)
+    unconverged, late = unconverged_findings(solution, points, depth.undetermined, ids)
+    notes += late
     said = [
         other_axes,
         bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution, watch) if gross else None,
@@ -211,7 +217,7 @@ def adjust_bundle(
         cheirality=cheirality,
         depth=depth,
         notes=(*notes, *watch.notes, *structure_notes(len(points), camera_of, point_of, solution)),
-        doubt=_doubt(cheirality, depth, solution, left, said),
+        doubt=_doubt(cheirality, depth, solution, left, unconverged, said),
         solution=solution,
         cameras=cameras,
         points=points,
@@ -253,7 +259,8 @@ def _continued(
     found = problem.solve(config.solver.model_copy(update={"max_iterations": left}), start=values, callback=watch)
     time_s = before.history[-1].time_s
     later = (replace(step, number=count + step.number, time_s=time_s + step.time_s) for step in found.history[1:])
-    return replace(found, cost_initial=before.cost_initial, history=(*before.history, *later))
+    history = (*before.history, replace(found.history[0], number=count, time_s=time_s), *later)
+    return replace(found, cost_initial=before.cost_initial, history=history, descent=len(before.history))
 
 
 def _weights(problem: Problem, solution: Solution, loss: Loss | None) -> NDArray[np.float64] | None:
@@ -267,20 +274,28 @@ def _redundancy(problem: Problem, points: Variables, point_of: NDArray[np.int64]
     return 2 * len(point_of) + 7 - others - 3 * len(np.unique(point_of))
 
 
-def _doubt(cheirality: Cheirality, depth: DepthUncertainty, solution: Solution, left: int, said: list[str | None]) -> str | None:
+def _doubt(
+    cheirality: Cheirality,
+    depth: DepthUncertainty,
+    solution: Solution,
+    left: int,
+    unconverged: str | None,
+    said: list[str | None],
+) -> str | None:
     """Why the result is not to be trusted, beside what was `said` of it."""
     reasons = [text for text in said if text]
     if left <= 0:
-        reasons.append(f"{-left} unknowns more than measurements: small errors are no evidence")
+        reasons.append(f"{counted(-left, 'unknown')} more than measurements: small errors are no evidence")
     if not depth.cameras_move_apart:  # no minimum, either, and more steps lead to none
         reasons.append(NOT_APART)
-    elif unconverged := solution.unconverged():
+    elif unconverged:
         reasons.append(unconverged)
     if cheirality.bad_share > _BAD_SHARE:
         count = cheirality.behind + cheirality.left_out
         reasons.append(
-            f"{count} of {cheirality.count} observations ({cheirality.bad_share:.1%}) are of points behind their cameras at the "
-            "end, or were left out for it"
+            f"{count} of {counted(cheirality.count, 'observation')} ({cheirality.bad_share:.1%}) "
+            f"{either(count, 'is of a point behind its camera', 'are of points behind their cameras')} at the end, or "
+            f"{either(count, 'was', 'were')} left out for it"
         )
     faded = max(solution.faded.values(), default=0.0)
     if faded > _MOST:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import counted, either
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
@@ -72,7 +73,10 @@ class Cheirality:
         what = "images" if isinstance(reconstruction, ColmapModel) else "cameras"
         said = []
         if self.behind_start:
-            said.append(f"{self.behind_start} of {self.count} observations are of points behind their cameras in the input")
+            said.append(
+                f"{self.behind_start} of {counted(self.count, 'observation')} "
+                f"{either(self.behind_start, 'is of a point', 'are of points')} behind their cameras in the input"
+            )
         if len(self.turned_back):
             said.append(
                 f"{what} that look away from their points, turned around, and were set anew from these: "
@@ -86,15 +90,20 @@ class Cheirality:
             )
         if len(self.triangulated):
             anew = names_text(self.triangulated, points)
-            said.append(f"{len(self.triangulated)} points behind cameras, or far off, were triangulated anew: {anew}")
+            said.append(
+                f"{counted(len(self.triangulated), 'point')} behind cameras, or far off, "
+                f"{either(len(self.triangulated), 'was', 'were')} triangulated anew: {anew}"
+            )
         if len(self.dropped):
             said.append(
-                f"{len(self.dropped)} points lie behind cameras and nowhere before them fit what was seen; they are left out: "
+                f"{counted(len(self.dropped), 'point')} {either(len(self.dropped), 'lies', 'lie')} behind cameras and nowhere "
+                f"before them {either(len(self.dropped), 'fits what was seen; it is', 'fit what was seen; they are')} left out: "
                 f"{names_text(self.dropped, points)}"
             )
         if self.behind:
             said.append(
-                f"{self.behind} observations are of points behind their cameras at the end, of points "
+                f"{counted(self.behind, 'observation')} {either(self.behind, 'is of a point', 'are of points')} behind their "
+                f"cameras at the end, of {either(len(self.behind_points), 'point', 'points')} "
                 f"{names_text(self.behind_points, points)}"
             )
         return said

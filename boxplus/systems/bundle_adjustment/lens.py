@@ -8,6 +8,7 @@ does; only where it does others follow, to where it falls.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
+from boxplus.systems.bundle_adjustment.lens_advice import NAMES, PARTS, lens_advice
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
@@ -33,8 +35,19 @@ _CHANGED = 0.01  # of the pixels' distance from the principal point, by which th
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
 _BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
 _ROUGH_PX, _OF_START, _STEPS = 2.0, 0.5, 10  # [px] median error of a start; share of it that another lens leaves; steps
-_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-_NOT_RADIAL = (0, 1, 2, 3, 6, 7)  # of them, all but radial distortion
+_RADIAL = frozenset({"k1", "k2"})
+_FEW = tuple(  # of all parts, asked whether they say as much as more of them
+    frozenset(parts)
+    for parts in (
+        ("f",),
+        ("k1",),
+        ("f", "k1"),
+        ("f", "cx, cy"),
+        ("f", "k1", "k2"),
+        ("f", "cx, cy", "k1"),
+        ("f", "cx, cy", "k1", "k2"),
+    )
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,38 +83,50 @@ def lens_finding(
     cost = solved.cost
     if isinstance(adjusted, BalProblem) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
         return None
-    told_by = "correct the second line of the file"
-    if isinstance(adjusted, ColmapModel):
-        told_by = "--refine-intrinsics, of a camera model that has them: OPENCV has all"
+    given = adjusted
     used, adjusted = _with_any_lens(adjusted, used)
     if not (solved.status == "converged" or solved.limit == "steps"):
         return None
-    found = None
+    ask = partial(_freed, adjusted, used, dropped, config, loss, solved, left, watch)
     # Distortion alone first: few images tell it well, and focal lengths and principal point, beside which it gets lost, hardly.
-    for held in (_NOT_RADIAL, ()):
-        other = _freed(adjusted, used, dropped, config, loss, solved, left, watch, held)
-        if watch.is_stopped:
-            return None
-        found = other if found is None or (other is not None and other.cost < found.cost) else found
+    found = min(filter(None, map(ask, (_RADIAL, frozenset(PARTS)))), key=lambda freed: freed.cost, default=None)
     if found is None:
         return None
+    for parts in _FEW:
+        fewer = ask(parts) if parts < found.parts else None
+        if fewer is not None and fewer.cost <= found.cost * (
+            1.0 + _by_chance(found.numbers - fewer.numbers, left - found.numbers)
+        ):
+            found = fewer
+            break
     changes, most = _changes(adjusted, found.lenses)
     if not changes:
         return None
     told = "; ".join(changes[:5]) + (" …" if len(changes) > 5 else "")
     return LensFinding(
         f"other intrinsics than those held explain the images better: {told}; the cost falls from {cost:.6g} to "
-        f"{found.cost:.6g} and below, and the scene is bent by what they are wrong ({told_by})",
+        f"{found.cost:.6g} and below, and the scene is bent by what they are wrong "
+        f"({lens_advice(given, found.parts, adjusted, found.lenses)})",
         most > _BENT and found.cost < _FALLS * cost,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _Freed:
-    """Lenses that explain the images better than chance, and the cost with them."""
+    """Lenses that explain the images better than chance, and the cost with them: `parts` of them, which are `numbers`, moved."""
 
     lenses: ColmapModel
     cost: float
+    parts: frozenset[str]
+    numbers: int
+
+
+def _by_chance(numbers: int, left: int) -> float:
+    """Share by which noise lowers a cost where `numbers` more may move and `left` measurements are left over then: an F-test.
+
+    The noise is that of the errors, not what sigma says. Of few measurements these know it badly, which counts.
+    """
+    return numbers / left * float(fdtri(numbers, left, 1.0 - _CHANCE))
 
 
 def _freed(
@@ -113,9 +138,10 @@ def _freed(
     solved: Solution,
     left: int,
     watch: Watch,
-    held: tuple[int, ...],
+    parts: frozenset[str],
 ) -> _Freed | None:
-    """What comes of it where all may move but the parameters `held` of every lens; None where that is no better than chance."""
+    """What comes of it where these parts of every lens may move; None where that is no better than chance, or was stopped."""
+    held = tuple(place for part, places in PARTS.items() if part not in parts for place in places)
     cost = solved.cost
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
     problem = Problem()
@@ -131,8 +157,7 @@ def _freed(
     numbers = sum(block.values.size - len(block) * len(held) for block in lenses)
     if left <= numbers:
         return None
-    # An F-test: the noise as the errors have it, not as sigma says. Of few measurements these know it badly, which counts.
-    share = numbers / (left - numbers) * float(fdtri(numbers, left - numbers, 1.0 - _CHANCE))
+    share = _by_chance(numbers, left - numbers)
     if solved.limit == "steps":  # more steps would lower the cost without another lens, too
         share = max(share, _MORE_STEPS)
 
@@ -151,7 +176,7 @@ def _freed(
         return None
     none = np.zeros(0)
     other = adjusted_reconstruction(adjusted, free, problem, solution, cameras, points, none, np.zeros(0, dtype=np.int64))
-    return _Freed(other, solution.cost) if isinstance(other, ColmapModel) else None
+    return _Freed(other, solution.cost, parts, numbers) if isinstance(other, ColmapModel) else None
 
 
 def lens_of_start(
@@ -212,7 +237,7 @@ def _with_any_lens(held: GbpProblem | ColmapModel, used: NDArray[np.bool_]) -> t
     if isinstance(held, GbpProblem):
         used, held = used[np.argsort(held.camera_of, kind="stable")], colmap_of(held)
     params = [colmap_layout(held, number) @ held.camera_params[number] for number in range(len(held.camera_ids))]
-    wide = tuple(np.pad(known, (0, len(_NAMES) - len(known))) for known in params)
+    wide = tuple(np.pad(known, (0, len(NAMES) - len(known))) for known in params)
     return used, replace(held, camera_models=("OPENCV",) * len(params), camera_params=wide)
 
 
@@ -234,7 +259,7 @@ def _changes(before: ColmapModel, after: ColmapModel) -> tuple[list[str], float]
             continue
         most = max(most, size / radius)
         differ = [k for k in range(len(old)) if abs(new[k] - old[k]) > 1e-3 * max(abs(old[k]), 1e-3)]
-        names = list(_NAMES)
+        names = list(NAMES)
         if new[0] == new[1] and old[0] == old[1]:  # one focal length
             names[0], differ = "f", [k for k in differ if k != 1]
         told = ", ".join(f"{names[k]} = {new[k]:.5g} instead of {old[k]:.5g}" for k in differ)

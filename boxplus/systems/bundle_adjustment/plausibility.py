@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_exceeded, chi_square_quantile, chi_square_sf
+from boxplus._words import counted, either
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solution import Solution
@@ -149,10 +150,11 @@ def outlier_notes(errors: NDArray[np.float64], loss: Loss | None) -> list[str]:
     gross = known > _GROSS * typical_error(known)
     if not squared[gross].sum() > _LOAD * squared.sum():
         return []
+    gross_count = int(np.count_nonzero(gross))
     return [
-        f"{np.count_nonzero(gross)} of {len(known)} observations are off by more than {_GROSS:g} times the typical error, with "
-        f"{squared[gross].sum() / squared.sum():.0%} of the cost; the largest is {known.max():.4g} px: wrong matches or a wrong "
-        "start, to which all else is bent; use a robust loss (--loss huber)"
+        f"{gross_count} of {len(known)} observations {either(gross_count, 'is', 'are')} off by more than {_GROSS:g} times the "
+        f"typical error, with {squared[gross].sum() / squared.sum():.0%} of the cost; the largest is {known.max():.4g} px: wrong "
+        "matches or a wrong start, to which all else is bent; use a robust loss (--loss huber)"
     ]
 
 
@@ -179,13 +181,14 @@ def point_notes(
     known = np.isfinite(errors)
     times = np.bincount(point_of[known])
     if weights is not None:
-        counted = np.bincount(point_of[known], weights[known] >= _COUNTS, len(times))
-        loose = np.flatnonzero((times >= 2) & (counted < 2)).astype(np.int64)
+        heavy = np.bincount(point_of[known], weights[known] >= _COUNTS, len(times))
+        loose = np.flatnonzero((times >= 2) & (heavy < 2)).astype(np.int64)
         if not len(loose):
             return []
         return [
-            f"{len(loose)} points rest on fewer than two observations that count under the robust loss, so that nothing confirms "
-            f"where they are: {names_text(loose, ids)}"
+            f"{counted(len(loose), 'point')} {either(len(loose), 'rests', 'rest')} on fewer than two observations that "
+            f"count under the robust loss, so that nothing confirms where {either(len(loose), 'it is', 'they are')}: "
+            f"{names_text(loose, ids)}"
         ]
     squared = np.bincount(point_of[known], errors[known] ** 2, len(times))
     able = np.flatnonzero(times >= 2)
@@ -202,7 +205,8 @@ def point_notes(
     worst = able[bad][np.argsort(-squared[able[bad]] / limit[spare[bad]], kind="stable")]
     share = squared[worst].sum() / squared.sum()
     return [
-        f"{len(worst)} points have observations that contradict each other, and carry {share:.0%} of the cost; the worst: "
+        f"{counted(len(worst), 'point')} {either(len(worst), 'has', 'have')} observations that contradict each other, and "
+        f"{either(len(worst), 'carries', 'carry')} {share:.0%} of the cost; the worst: "
         f"{names_text(worst.astype(np.int64), ids)}"
     ]
 
@@ -231,9 +235,15 @@ def structure_notes(
     times = np.bincount(point_of, minlength=point_count)
     once = int(np.count_nonzero(times == 1))
     if once:
-        notes.append(f"{once} points are seen only once: their depth is not determined and stays near the start")
+        notes.append(
+            f"{counted(once, 'point')} {either(once, 'is seen only once: its', 'are seen only once: their')} depth is not "
+            "determined and stays near the start"
+        )
     few = np.bincount(camera_of)
     few_cameras = int(np.count_nonzero((few > 0) & (few < 4)))
     if few_cameras:
-        notes.append(f"{few_cameras} cameras see fewer than 4 points: their pose is not determined and stays near the start")
+        notes.append(
+            f"{counted(few_cameras, 'camera')} {either(few_cameras, 'sees', 'see')} fewer than 4 points: "
+            f"{either(few_cameras, 'its', 'their')} pose is not determined and stays near the start"
+        )
     return tuple(notes)

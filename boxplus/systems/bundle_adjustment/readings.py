@@ -7,8 +7,9 @@ another unit it is nowhere near; so where another reading explains the pixels fa
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,19 @@ _LEAST = 20  # observations
 _MOST = 5000  # observations that are looked at
 _SIZES, _RESIZED = (0.25, 0.5, 2.0, 4.0), 0.1  # of images, and logarithm of any other size from which on it is told
 _UNITS = (1e3, 1e2, 1e-2, 1e-3)
+_ANOTHER_UNIT = 4.0  # times as long a focal length, that no start is off by
+_ROTATION, _TRANSLATION = ("rotation", (0, 1, 2)), ("translation", (3, 4, 5))
+_F, _K1, _K2 = ("f", (6,)), ("k1", (7,)), ("k2", (8,))
+_COLUMNS = (
+    (_ROTATION, _TRANSLATION, _K1, _K2, _F),
+    (_ROTATION, _TRANSLATION, _K1, _F, _K2),
+    (_ROTATION, _TRANSLATION, _K2, _K1, _F),
+    (_TRANSLATION, _ROTATION, _F, _K1, _K2),
+    (_F, _K1, _K2, _ROTATION, _TRANSLATION),
+    (_F, _K1, _K2, _TRANSLATION, _ROTATION),
+)
+"""Orders of the numbers of a camera of BAL, and where each stands in the format's own."""
+_COLUMN_ADVICE = "BAL has rotation [rad], translation, f [px], k1, k2, in this order"
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _INVERT = "give poses from world to camera, R → Rᵀ and t → −Rᵀ t"
 _BAL_AXES = "the cameras of BAL look along −z, x to the right and y upwards"
@@ -44,6 +58,27 @@ class _Reading:
     is_of_pixels: bool = False
 
 
+def refuse_other_columns(problem: BalProblem) -> None:
+    """Refuse cameras of BAL whose nine numbers stand in another order, before anything is made of them.
+
+    Raises:
+        InputError: the start explains the pixels far better so.
+    """
+    if _has_lenses(problem.cameras):
+        seen = _some(Sightings.of(problem))
+        better = None if seen is None else _better(seen, _of_other_columns(problem))
+    else:
+        cameras = np.column_stack([problem.cameras[:, :6], np.ones(len(problem.cameras)), np.zeros((len(problem.cameras), 2))])
+        seen = _some(Sightings.of(replace(problem, cameras=cameras)))
+        better = (
+            None
+            if seen is None
+            else _better(seen, _of_other_columns(problem), "nowhere, with focal lengths that are not positive,")
+        )
+    if better is not None:
+        _refuse(problem, *better)
+
+
 def reading_doubt(reconstruction: Reconstruction, *, is_lens_held: bool) -> str | None:
     """A sentence where the pixels have other axes or another size than they are read with.
 
@@ -51,31 +86,60 @@ def reading_doubt(reconstruction: Reconstruction, *, is_lens_held: bool) -> str 
         is_lens_held: whether focal lengths are not adjusted, so that another size of the image is not found by that.
 
     Raises:
-        InputError: poses that are inverted, or whose rotations are in degrees or in another order; points in another unit.
+        InputError: poses that are inverted, or whose rotations are in degrees or in another order; points in another unit; focal
+            lengths of BAL in another unit.
     """
-    seen = Sightings.of(reconstruction)
-    rows = slice(None, None, max(1, len(seen.pixels) // _MOST))
-    seen = replace(seen, camera_of=seen.camera_of[rows], point_of=seen.point_of[rows], pixels=seen.pixels[rows])
-    if len(seen.pixels) < _LEAST:
-        return None
-    off = _typical(seen)
-    spread = float(np.median(np.linalg.norm(seen.pixels - np.median(seen.pixels, axis=0), axis=1)))
-    if not off > _OFF * spread:
+    seen = _some(Sightings.of(reconstruction))
+    if seen is None:
         return None
     readings = _readings(reconstruction, seen)
     if is_lens_held:
         readings = itertools.chain(readings, _of_other_size(seen, _principal_points(reconstruction, seen)))
-    least, way = min(((_typical(way.sightings), way) for way in readings), key=lambda one: one[0])
-    if not (least < _FAR_BETTER * off and least < _NEAR * spread):
+    better = _better(seen, readings)
+    if better is None:
         return None
-    as_read = f"within {off:.3g} px" if np.isfinite(off) else "behind their cameras"
-    told = f"half of the points lie within {least:.3g} px of where they were seen {way.got}, and {as_read} as the file is read"
+    told, way = better
     if way.is_of_pixels:
         return f"{told}: {way.advice}"
+    return _refuse(reconstruction, told, way)
+
+
+def _refuse(reconstruction: Reconstruction, told: str, way: _Reading) -> NoReturn:
     raise InputError(
         "cameras and points that lie, as the format reads them, near to what was seen",
         f"{told} ({getattr(reconstruction, 'source', 'reconstruction')})",
         way.advice,
+    )
+
+
+def _some(seen: Sightings) -> Sightings | None:
+    """Not all of many; None of too few to tell."""
+    rows = slice(None, None, max(1, len(seen.pixels) // _MOST))
+    seen = replace(seen, camera_of=seen.camera_of[rows], point_of=seen.point_of[rows], pixels=seen.pixels[rows])
+    return seen if len(seen.pixels) >= _LEAST else None
+
+
+def _has_lenses(cameras: NDArray[np.float64]) -> bool:
+    return bool((cameras[:, 6] > 0.0).all())
+
+
+def _better(seen: Sightings, readings: Iterable[_Reading], nowhere: str = "") -> tuple[str, _Reading] | None:
+    """The reading that explains the pixels far better than `seen` does, with a sentence on by how much.
+
+    Args:
+        nowhere: where points lie as the file is read, where that is at no place.
+    """
+    off = np.inf if nowhere else _typical(seen)
+    spread = float(np.median(np.linalg.norm(seen.pixels - np.median(seen.pixels, axis=0), axis=1)))
+    if not off > _OFF * spread:
+        return None
+    least, way = min(((_typical(way.sightings), way) for way in readings), key=lambda one: one[0], default=(np.inf, None))
+    if way is None or not (least < _FAR_BETTER * off and least < _NEAR * spread):
+        return None
+    as_read = f"within {off:.3g} px" if np.isfinite(off) else nowhere or "behind their cameras"
+    return (
+        f"half of the points lie within {least:.3g} px of where they were seen {way.got}, and {as_read} as the file is read",
+        way,
     )
 
 
@@ -120,6 +184,16 @@ def _of_other_size(seen: Sightings, centre: NDArray[np.float64]) -> Iterator[_Re
         yield _Reading(resized, f"with a focal length {size:.4g} times as large", advice, True)
 
 
+def _of_other_columns(own: BalProblem) -> Iterator[_Reading]:
+    for order in _COLUMNS:
+        names = [name for name, _ in order]
+        places = np.argsort(np.concatenate([places for _, places in order]))
+        cameras = np.ascontiguousarray(own.cameras[:, places])
+        other = _some(Sightings.of(replace(own, cameras=cameras))) if _has_lenses(cameras) else None
+        if other is not None:
+            yield _Reading(other, f"if the numbers of a camera are {', '.join(names)}", _COLUMN_ADVICE)
+
+
 def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:
     as_it_is = replace(seen, R_camera_world=so3.exp(own.cameras[:, :3]), t=own.cameras[:, 3:6])
     inverted = _inverse(as_it_is)
@@ -133,6 +207,20 @@ def _of_bal(own: BalProblem, seen: Sightings) -> Iterator[_Reading]:
     # Rotations that are noise about none at all fit better in degrees, too: as well as none at all.
     if _typical(degrees) < 0.5 * _typical(nothing):
         yield _Reading(degrees, "if the rotations are in degrees", "give them in radians")
+    with np.errstate(all="ignore"):
+        projected = seen.projections(np.arange(len(seen.pixels)), seen.points[seen.point_of])
+        ratios = (seen.pixels * projected).sum(axis=1) / (projected**2).sum(axis=1)
+    of_camera = np.ones(len(own.cameras))
+    for camera in np.unique(seen.camera_of):
+        mine = ratios[(seen.camera_of == camera) & np.isfinite(ratios)]
+        of_camera[camera] = np.median(mine) if len(mine) else 1.0
+    size = float(np.median(of_camera[np.unique(seen.camera_of)]))
+    if size > _ANOTHER_UNIT:
+        cameras = own.cameras.copy()
+        cameras[:, 6] *= of_camera
+        other = _some(Sightings.of(replace(own, cameras=cameras))) if _has_lenses(cameras) else None
+        if other is not None:
+            yield _Reading(other, f"with focal lengths {size:.3g} times as large", _COLUMN_ADVICE)
     yield _Reading(replace(as_it_is, pixels=upwards), "by cameras that look along +z, y downwards", _BAL_AXES, True)
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import counted, either
 from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss, loss_at
@@ -88,14 +89,16 @@ def stray_notes(strayed: list[NDArray[np.int64]], astray: NDArray[np.int64], ids
     """Sentences on those that were found, round by round, and on those that stayed where they are."""
     if len(astray):
         return [
-            f"{len(astray)} points lie at a wrong depth: where their rays meet the images agree better, but no steps were left "
-            f"to adjust them (--max-iterations): {names_text(astray, ids)}"
+            f"{counted(len(astray), 'point')} {either(len(astray), 'lies', 'lie')} at a wrong depth: where the rays meet the "
+            f"images agree better, but no steps were left to adjust {either(len(astray), 'it', 'them')} (--max-iterations): "
+            f"{names_text(astray, ids)}"
         ]
     if not strayed:
         return []
     numbers = np.unique(np.concatenate(strayed))
     return [
-        f"{len(numbers)} points had converged to a minimum of their own, at a wrong depth; they were put where their rays meet, "
+        f"{counted(len(numbers), 'point')} had converged to {either(len(numbers), 'a minimum of its', 'minima of their')} own, "
+        f"at a wrong depth; {either(len(numbers), 'it was put where its', 'they were put where their')} rays meet, "
         f"and all was adjusted again: {names_text(numbers, ids)}"
     ]
 

@@ -75,18 +75,27 @@ def axis_focal(kind: LensKind, parameters: Floats, covariance: Floats) -> tuple[
 
 def judge(found: CameraCalibration) -> list[Finding]:
     """All there is to say, the worst first."""
-    findings: list[Finding] = []
+    findings = _converged(found)
     for camera in range(len(found.singles)):
-        findings += _converged(found, camera) + _lens_determined(found, camera) + _side(found, camera)
+        findings += _lens_determined(found, camera) + _side(found, camera)
         findings += _views(found, camera) + _pattern(found, camera)
     findings += _target(found) + _left_out(found) + _together(found) + _inertial(found)
     order = {"refused": 0, "doubt": 1, "remark": 2}
     return sorted(findings, key=lambda finding: order[finding.severity])
 
 
-def _converged(found: CameraCalibration, camera: int) -> list[Finding]:
-    told = found.of_camera(camera)[0].unconverged
-    return [] if told is None else [Finding("unconverged", "doubt", f"cam{camera}: {told}")]
+def _converged(found: CameraCalibration) -> list[Finding]:
+    """Once for each search: that of a rig is of all its cameras."""
+    cameras: dict[int, list[int]] = {}
+    for camera in range(len(found.singles)):
+        cameras.setdefault(id(found.of_camera(camera)[0]), []).append(camera)
+    result = []
+    for together in cameras.values():
+        told = found.of_camera(together[0])[0].unconverged
+        if told is not None:
+            names = ", ".join(f"cam{camera}" for camera in together)
+            result.append(Finding("unconverged", "doubt", f"{names}: {told}"))
+    return result
 
 
 def _lens_determined(found: CameraCalibration, camera: int) -> list[Finding]:

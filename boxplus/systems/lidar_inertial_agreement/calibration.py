@@ -30,6 +30,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
 _PIECE_S = 2.0
 _FEWEST_POSES = 6
 _ROUNDS, _PLAIN_ROUNDS = 14, 4
+_NOISE_ROUNDS = 8  # after which it is held: its ratio has steps, between which the fit would go to and fro for ever
 _SETTLED = 1e-6
 _SIGMA_ROTATION, _SIGMA_POSITION = 2e-3, 4e-3  # rad, m: to begin with
 _LEAST_ROTATION, _LEAST_POSITION = 3e-4, 1e-3
@@ -63,6 +64,7 @@ class Calibration:
         covariance: (9, 9) of [θ about the IMU's axes, p_imu_lidar, offset, log gyro_scale, slope].
         sigma_rotation, sigma_position: what the fit leaves of the LiDAR's attitudes [rad] and positions [m] along an axis.
         poses: of the LiDAR that were compared.
+        last_step: (9,) what the last round would still have moved, in the order of `covariance`; nothing where it came to rest.
     """
 
     T_imu_lidar: NDArray[np.float64]
@@ -75,6 +77,12 @@ class Calibration:
     sigma_rotation: float
     sigma_position: float
     poses: int
+    last_step: NDArray[np.float64]
+
+    @property
+    def moving(self) -> NDArray[np.float64]:
+        """(9,) the last step in standard deviations: what is beyond one had not come to rest where the rounds ended."""
+        return np.asarray(np.abs(self.last_step) / self.std)
 
     @property
     def std(self) -> NDArray[np.float64]:
@@ -100,6 +108,7 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
     noise = _Noise(_SIGMA_ROTATION, 0.1), _Noise(_SIGMA_POSITION, 0.4)
     size = _SHARED + sum(window.size for window in windows)
     covariance: NDArray[np.float64] = np.eye(size)
+    step = np.full(size, np.inf)
     for number in range(_ROUNDS):
         H, b = np.zeros((size, size)), np.zeros(size)
         H[range(_SHARED), range(_SHARED)] = 1.0 / _PRIOR_STD**2
@@ -133,7 +142,8 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
         for window in windows:
             window.move(step[first : first + window.size])
             first += window.size
-        noise = _noise_of(left[0], 0), _noise_of(left[1], 1)
+        if number < _NOISE_ROUNDS:
+            noise = _noise_of(left[0], 0), _noise_of(left[1], 1)
         if number > _PLAIN_ROUNDS and np.abs(step[:_SHARED]).max() < _SETTLED:
             break
     covariance = covariance * _CORRELATED**2
@@ -155,6 +165,7 @@ def calibrate(stretches: Sequence[tuple[Agreement, ImuSamples]]) -> Calibration 
         noise[0].white,
         noise[1].white,
         sum(window.poses for window in windows),
+        step[:_SHARED],
     )
 
 

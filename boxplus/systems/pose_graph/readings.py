@@ -18,7 +18,7 @@ def misreading(graph: PoseGraph) -> str | None:
     """A sentence where the poses of the file contradict its odometry as they were read, and agree with it read in another way.
 
     The ways are angles in degrees (2D), quaternions with w first (3D), edges that go from the second pose to the first, poses of
-    the world in the body, and positions in another unit than the edges.
+    the world in the body, a world that is mirrored, and positions in another unit than the edges.
     """
     if graph.poses is None:
         return None
@@ -48,6 +48,10 @@ def misreading(graph: PoseGraph) -> str | None:
         "edges are taken to lead from their second pose to their first": off(R, p, j, i),
         "poses are taken for those of the world in the body, and inverted": off(back, -np.einsum("nab,nb->na", back, p), i, j),
     }
+    axes = (np.array([-1.0, 1.0]), np.array([1.0, -1.0])) if graph.dimension == 2 else tuple(1.0 - 2.0 * np.eye(3))
+    for flip, name in zip(axes, "xyz"[: graph.dimension], strict=True):
+        mirrored = R * flip[:, None] * flip
+        ways[f"the {name} axis of the poses is taken for flipped (of positions and rotations)"] = off(mirrored, p * flip, i, j)
     if ratio > 0.0:
         told = f"{ratio:.4g} times too large" if ratio > 1.0 else f"{1.0 / ratio:.4g} times too small"
         ways[f"positions are taken for {told}, another unit than that of the edges"] = off(R, p / ratio, i, j)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.runs.lidar_inertial.summary import read_summary
@@ -116,7 +117,7 @@ def test_view_without_the_extra(bag: Path, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rerun", None)
     code, _, err = call("lio", bag, "-o", tmp_path / "out", "--view", "window")
     assert code == 2
-    text = "error: expected rerun-sdk, which shows a run in 3D – got it is not installed – pip install 'boxplus[view]'"
+    text = f"error: expected rerun-sdk, which shows a run in 3D – got it is not installed – {installation('view')}"
     assert err.strip() == text
     assert not (tmp_path / "out").exists()
 

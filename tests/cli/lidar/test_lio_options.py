@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.simulation import SpinningLidar, simulate
@@ -130,4 +131,4 @@ def test_a_fleet_names_the_recording_that_failed(folder: Path, tmp_path: Path) -
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="Ray is installed")
 def test_a_fleet_without_ray_names_the_extra(folder: Path, tmp_path: Path) -> None:
     result = call("fleet", "run", folder, "-o", tmp_path / "fleet")
-    assert result.exit_code == 2 and "pip install 'boxplus[fleet]'" in result.stderr
+    assert result.exit_code == 2 and installation("fleet") in result.stderr

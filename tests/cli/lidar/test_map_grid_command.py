@@ -12,6 +12,7 @@ import yaml
 from PIL import Image
 from typer.testing import CliRunner
 
+from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.writer import TileWriter
@@ -81,7 +82,7 @@ def test_heights_of_a_run_on_the_earth_are_above_its_ellipsoid(tmp_path: Path) -
 def test_a_missing_library_is_said_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rasterio", None)
     code, out = call("map", "height", tmp_path / "no run at all")
-    assert code == 2 and "pip install 'boxplus[geo]'" in out
+    assert code == 2 and installation("geo") in out
 
 
 def test_storeys_over_each_other_are_not_mixed(tmp_path: Path) -> None:

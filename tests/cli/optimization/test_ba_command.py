@@ -150,16 +150,16 @@ def test_common_intrinsics_are_recognised(tmp_path: Path) -> None:
 
 def test_limits_are_told(tmp_path: Path) -> None:
     write_bal(tmp_path / "scene.txt", bal_problem())
-    result = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "1")
+    result = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "0")
     assert result.exit_code == 3
-    assert "not to be trusted: no minimum was reached (iteration limit of 1 reached): the cost of" in " ".join(
+    assert "not to be trusted: no minimum was reached (iteration limit of 0 reached): the cost of" in " ".join(
         result.output.split()
     )
-    assert "stopped: iteration limit of 1 reached" in result.output
+    assert "stopped: iteration limit of 0 reached" in result.output
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
-    assert "not converged: iteration limit of 1 reached" in text
-    near = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "3", "--overwrite", "--no-report")
-    assert near.exit_code == 0 and "stopped: iteration limit of 3 reached" in near.output
+    assert "not converged: iteration limit of 0 reached" in text
+    near = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "1", "--overwrite", "--no-report")
+    assert near.exit_code == 0 and "stopped: iteration limit of 1 reached" in near.output
 
 
 @pytest.mark.parametrize(

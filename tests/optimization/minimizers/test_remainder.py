@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_what_is_told_is_how_far_the_minimum_is(seed: int) -> None:
         assert (told is not None) == (sigmas > 1.0), (steps, sigmas, told)
         if told is not None:
             assert solution.limit == "steps" and told in solution.summary()
-            claimed = float(re.search(r"together are (\S+) standard deviations", told)[1])
+            claimed = float(re.search(r"x\[0\] is (\S+) standard deviations of its own", told)[1])
             assert claimed < 1.5 * sigmas, (steps, claimed, sigmas)  # far away the errors are no noise, and it is more
 
 
@@ -73,5 +74,68 @@ def test_small_steps_of_a_slow_way_are_summed_up() -> None:
     for factor in (0.5, 0.8, 0.95):
         costs = 10.0 + 3.0 * factor ** np.arange(40)
         assert _trend(costs) == pytest.approx(costs[-1] - 10.0, rel=1e-6)
+    fast = 10.0 + np.array([4.0e6, 4.0e5, 3.0e4, 2.0e3, 50.0, 1.0, 1e-3, 1e-6, 1e-9])
+    assert _trend(fast) < 1e-5  # falls that shrink ever faster: the large ones of long ago say nothing
     assert _trend([10.0, 9.0, 8.5]) == 0.0  # too few to see a sequence
     assert _trend([10.0, 10.0, 10.0, 9.0, 7.0, 4.0, 0.0]) == 0.0  # nor is this one
+
+
+def many_places(count: int, off: float) -> tuple[bp.Problem, np.ndarray]:
+    """As many places, each measured six times, and starts that are off by `off` of the standard deviations of that."""
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-1.0, 1.0, (count, 2))
+    problem = bp.Problem()
+    x = problem.add_variables(bp.Euclidean(2), at, name="x")
+    measured = np.repeat(at, 6, axis=0) + 0.1 * rng.normal(size=(6 * count, 2))
+    problem.add_residuals(
+        bp.residuals.Prior(bp.Euclidean(2), measured, sigma=0.1), x[np.repeat(np.arange(count), 6)], name="seen"
+    )
+    best = measured.reshape(count, 6, 2).mean(axis=1)
+    direction = rng.normal(size=(count, 2))
+    return problem, best + off * 0.1 / np.sqrt(6.0) * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("count", "together"), [(50, 4.0), (20_000, 80.0)])
+def test_many_that_are_each_as_good_as_at_the_minimum_are_none(count: int, together: float) -> None:
+    """All together they are many standard deviations off, and the more the more there are: no reason to doubt any."""
+    problem, start = many_places(count, off=0.7)
+    solution = problem.solve(start=[start], max_iterations=0)
+    remainder = solution.remainder()
+    assert remainder is not None and remainder.total > together
+    assert remainder.variables[0].max() < 1.0 and solution.unconverged() is None
+    assert np.median(remainder.variables[0]) == pytest.approx(0.7, abs=0.05)
+
+
+def test_one_of_many_that_is_far_is_named_with_how_far() -> None:
+    problem, start = many_places(20_000, off=0.3)
+    start[1234] += [0.07, -0.05]
+    best = problem.solve(start=[start])
+    solution = problem.solve(start=[start], max_iterations=0)
+    off = start[1234] - best.values[0][1234]
+    sigmas = float(np.linalg.norm(off)) / (0.1 / np.sqrt(6.0))
+    assert f"x[1234] is {sigmas:.1f} standard deviations of its own or more away from there" in (solution.unconverged() or "")
+    assert solution.unconverged(apart_from=problem.blocks[0][1234]) is None
+
+
+def test_what_is_known_between_variables_is_asked_as_well() -> None:
+    """Of a long chain poses are hardly known, and the steps between them well: where one of these is off, it is told."""
+    problem, count = bp.Problem(), 400
+    x = problem.add_variables(bp.Euclidean(1), np.where(np.arange(count) < 200, 0.0, 2.5)[:, None], name="x")
+    problem.fix(x[0])
+    step = bp.residuals.UserResidual(
+        lambda a, b: (b - a) / 1.0, dim=1, manifolds=(bp.Euclidean(1),) * 2, count=count - 1, is_batch=True
+    )
+    problem.add_residuals(step, x[:-1], x[1:], name="steps")
+    solution = problem.solve(max_iterations=0)
+    assert solution.remainder().variables[0].max() < 1.0
+    assert "what steps[199] sees of x[199] and x[200] is 2.5 standard deviations of its own" in solution.unconverged()
+
+
+def test_the_joint_history_of_two_descents_is_not_read_as_one() -> None:
+    problem = ranges(0)
+    best = problem.solve()
+    again = problem.solve(start=best, max_iterations=0, gradient_tolerance=0.0)
+    slow = [replace(best.history[0], cost=best.cost + 5.0 * (0.9**k - 0.9**12), number=k) for k in range(12)]
+    joined = replace(again, history=(*slow, *again.history))
+    assert joined.unconverged() is not None  # read as one, the long way down seems to go on
+    assert replace(joined, descent=len(slow)).unconverged() is None

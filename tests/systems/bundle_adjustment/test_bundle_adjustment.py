@@ -96,7 +96,7 @@ def test_points_seen_once_and_pieces_are_told():
     result = adjust_bundle(
         replace(start, camera_of=start.camera_of[~once], point_of=start.point_of[~once], pixels=start.pixels[~once])
     )
-    assert any(note.startswith("1 points are seen only once") for note in result.notes)
+    assert any(note.startswith("1 point is seen only once: its depth") for note in result.notes)
     split = (start.camera_of < 3) == (start.point_of < 20)
     parts = replace(start, camera_of=start.camera_of[split], point_of=start.point_of[split], pixels=start.pixels[split])
     assert any("falls into 2 pieces that share no point" in note for note in adjust_bundle(parts).notes)

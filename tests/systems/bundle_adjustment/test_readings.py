@@ -16,7 +16,8 @@ from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.readings import reading_doubt
-from tests.systems.bundle_adjustment.scenes import FORMATS, reconstruction, turning
+from tests.small_problems import scene
+from tests.systems.bundle_adjustment.scenes import FOCAL, FORMATS, perturbed, reconstruction, turning
 
 
 def inverted(start: Reconstruction) -> Reconstruction:
@@ -112,3 +113,52 @@ def test_rotations_that_are_noise_about_none_are_not_taken_for_degrees():
     camera_of, point_of = (index.reshape(-1) for index in np.indices((20, 100)))
     pixels = -500.0 * points[point_of, :2] / points[point_of, 2:]
     assert reading_doubt(BalProblem(cameras, points, camera_of, point_of, pixels), is_lens_held=False) is None
+
+
+COLUMNS = {  # where the numbers of a camera stand in the format
+    "rotation, translation, k1, f, k2": [0, 1, 2, 3, 4, 5, 7, 6, 8],
+    "rotation, translation, k1, k2, f": [0, 1, 2, 3, 4, 5, 7, 8, 6],
+    "rotation, translation, k2, k1, f": [0, 1, 2, 3, 4, 5, 8, 7, 6],
+    "translation, rotation, f, k1, k2": [3, 4, 5, 0, 1, 2, 6, 7, 8],
+    "f, k1, k2, rotation, translation": [6, 7, 8, 0, 1, 2, 3, 4, 5],
+    "f, k1, k2, translation, rotation": [6, 7, 8, 3, 4, 5, 0, 1, 2],
+}
+
+
+def with_distortion(seed: int) -> BalProblem:
+    """Seen through a lens with k1 = −0.2 and k2 = 0.05."""
+    rng = np.random.default_rng([seed, 3])
+    start = perturbed(rng, *scene(seed, 8, 150), "bal", 0.004, 0.02)
+    squared = ((start.pixels / FOCAL) ** 2).sum(axis=1, keepdims=True)
+    cameras = start.cameras.copy()
+    cameras[:, 7:] = [-0.2, 0.05]
+    return replace(start, cameras=cameras, pixels=start.pixels * (1.0 - 0.2 * squared + 0.05 * squared**2))
+
+
+@pytest.mark.parametrize("order", COLUMNS)
+def test_the_numbers_of_a_camera_in_another_order_are_refused_by_name(order):
+    for seed in range(1, 8, 2):
+        start = with_distortion(seed)
+        with pytest.raises(InputError, match=f"if the numbers of a camera are {order}.*BAL has rotation"):
+            adjust_bundle(replace(start, cameras=start.cameras[:, COLUMNS[order]]))
+        assert adjust_bundle(start).doubt is None
+
+
+@pytest.mark.parametrize("unit", ["image widths", "degrees"])
+def test_focal_lengths_in_another_unit_are_refused_and_rough_ones_adjusted(unit):
+    for seed in range(1, 8, 2):
+        start = with_distortion(seed)
+        cameras = start.cameras.copy()
+        cameras[:, 6] = FOCAL / 640.0 if unit == "image widths" else np.degrees(2.0 * np.arctan(320.0 / FOCAL))
+        with pytest.raises(InputError, match=r"with focal lengths \S+ times as large.*f \[px\]"):
+            adjust_bundle(replace(start, cameras=cameras))
+        cameras[:, 6] = 0.7 * FOCAL
+        assert adjust_bundle(replace(start, cameras=cameras)).doubt is None
+
+
+def test_focal_lengths_that_are_not_positive_are_refused_as_such_where_no_order_explains_them():
+    start = reconstruction(1, "bal")
+    cameras = start.cameras.copy()
+    cameras[3, 6] *= -1.0
+    with pytest.raises(InputError, match="expected positive focal lengths"):
+        adjust_bundle(replace(start, cameras=cameras))

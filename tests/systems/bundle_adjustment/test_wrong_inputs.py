@@ -78,7 +78,7 @@ def test_repeated_observations_are_counted():
 def test_a_camera_with_one_point_and_one_with_none_are_told():
     start = reconstruction(65)
     few = chosen(start, np.flatnonzero((start.camera_of != 0) | (np.cumsum(start.camera_of == 0) <= 1)))
-    assert note_of(few, "fewer than 4 points").startswith("1 cameras see fewer than 4 points")
+    assert note_of(few, "fewer than 4 points").startswith("1 camera sees fewer than 4 points: its pose")
     assert "cameras[0]" in note_of(chosen(start, np.flatnonzero(start.camera_of != 0)), "no residual touches")
     # The one observation is explained by the camera it is alone in, and nothing else moves for it.
     without = adjust_bundle(chosen(start, np.flatnonzero(start.camera_of != 0)))

@@ -48,6 +48,16 @@ def test_a_sound_session_has_no_findings_and_the_mounting_of_the_truth(stereo: T
     assert all(half < 2.0 for half in found.halves)
 
 
+def test_what_holds_of_a_whole_rig_is_said_once_with_its_cameras(stereo: TargetCorners) -> None:
+    found, _ = calibrate(stereo)
+    rig = replace(found.rig, unconverged="no minimum was reached")
+    (told,) = [one for one in judge(replace(found, rig=rig)) if one.code == "unconverged"]
+    assert told.text == "cam0, cam1: no minimum was reached"
+    alone = [replace(single, unconverged="no minimum was reached") for single in found.singles]
+    single = judge(replace(found, rig=None, singles=type(found.singles)(alone)))
+    assert [one.text for one in single if one.code == "unconverged"] == [f"cam{k}: no minimum was reached" for k in (0, 1)]
+
+
 @pytest.mark.slow
 def test_covariance_of_the_rig_is_that_of_the_errors() -> None:
     nees = []

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
+from boxplus.runs.calibration import _quantities
 from boxplus.simulation import faults
+from boxplus.systems.lidar_inertial_agreement import calibration
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, calibrate
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
@@ -71,3 +73,17 @@ def test_nothing_to_calibrate_from() -> None:
     scans, imu = data(handheld(0))
     assert calibrate([]) is None
     assert calibrate([(compare_sensors(scans[:4], imu, CONFIG), usable(imu))]) is None
+
+
+def test_a_search_that_did_not_come_to_rest_says_what_was_still_moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = handheld(3)
+    scans, imu = data(simulation, faults.clock_offset(0.03))
+    stretches = [(compare_sensors(scans, imu, CONFIG, refine=True), usable(imu))]
+    settled = calibrate(stretches)
+    assert settled is not None and settled.moving.max() < 0.02
+    assert not [row.advice for row in _quantities(settled, 0.0) if "come to rest" in row.advice]
+    monkeypatch.setattr(calibration, "_ROUNDS", 1)
+    started = calibrate(stretches)
+    assert started is not None and started.moving[ARM].max() > 1.0
+    (row,) = [row for row in _quantities(started, 0.0) if row.name == "p_imu_lidar"]
+    assert not row.determined and "the search did not come to rest" in row.advice

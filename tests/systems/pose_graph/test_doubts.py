@@ -172,8 +172,12 @@ def test_a_motion_that_mixes_turns_and_shifts_is_told_in_words_with_the_poses_it
     information[:, :split] = information[:, :, :split] = 0.0
     result = optimize_pose_graph(replace(graph, information=information, ids=graph.ids + 1000))
     (told,) = [note for note in result.notes if "by turning and shifting together" in note][:1]
+    axis = r"\(-?[\d.]+, -?[\d.]+, -?[\d.]+\)"
+    about, along = ("", r"\(-?[\d.]+, -?[\d.]+\)") if dimension == 2 else (f" about {axis}", axis)
     assert re.search(
-        r"where poses\[\d+\], which shifts most, shifts by 1 m, poses\[\d+\], which turns most, turns by \S+ deg", told
+        rf"where poses\[\d+\], which turns most, turns by 1 deg{about}, poses\[\d+\], which shifts most, "
+        rf"shifts by [\d.e-]+ m along {along}; residuals",
+        told,
     )
     assert "(poses are counted from 0 in the order of the file: poses[0] has the id 1000)" in told
 

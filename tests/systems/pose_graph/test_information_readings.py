@@ -1,0 +1,63 @@
+"""Information that was given in another unit, or as covariances, and poses of a mirrored world: named, and pessimism is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.simulation.pose_graphs import simulate_pose_graph
+from boxplus.systems.pose_graph.pose_graph import optimize_pose_graph
+
+SEEDS = (1, 3, 5)
+
+
+def graph_of(dimension: int, seed: int) -> PoseGraph:
+    return simulate_pose_graph(dimension=dimension, poses=200, loops=100, seed=seed).graph
+
+
+def scaled(graph: PoseGraph, rotation: float, translation: float) -> PoseGraph:
+    """With standard deviations in units that are so many times smaller."""
+    dim = graph.information.shape[1]
+    scale = np.where(np.arange(dim) < (3 if dim == 6 else 1), 1.0 / rotation, 1.0 / translation)
+    return replace(graph, information=graph.information * np.outer(scale, scale))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_information_in_another_unit_or_inverted_is_named(dimension: int, seed: int) -> None:
+    graph = graph_of(dimension, seed)
+    assert optimize_pose_graph(graph).doubt is None
+    for wrong, told in (
+        (scaled(graph, np.degrees(1.0), 1.0), "if the information of rotations is per square degree: give it per square radian"),
+        (scaled(graph, 1.0, 1e3), "if the information of translations is per square millimetre: give it per square metre"),
+        (replace(graph, information=np.linalg.inv(graph.information)), "if they are covariances: give their inverses"),
+    ):
+        assert told in (optimize_pose_graph(wrong).doubt or "")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("rotation", "translation"), [(3.0, 3.0), (10.0, 10.0), (3.0, 1.0), (1.0, 5.0), (10.0, 1.0), (1.0, 100.0)]
+)
+def test_information_that_is_too_small_is_no_other_unit(dimension: int, rotation: float, translation: float) -> None:
+    for seed in SEEDS:
+        assert optimize_pose_graph(scaled(graph_of(dimension, seed), rotation, translation)).doubt is None
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_poses_of_a_mirrored_world_are_named(dimension: int, axis: int) -> None:
+    """Edges of a mirrored world fit each other as well as the true ones: only the poses of the file know."""
+    graph = graph_of(dimension, 1)
+    poses = graph.poses.copy()
+    if dimension == 2:
+        poses[:, 1 + axis] *= -1.0
+        poses[:, 0] *= -1.0
+    else:
+        poses[:, 4 + axis] *= -1.0
+        poses[:, [k for k in (1, 2, 3) if k != 1 + axis]] *= -1.0
+    told = optimize_pose_graph(replace(graph, poses=poses)).doubt or ""
+    assert f"if the {'xy'[axis]} axis of the poses is taken for flipped" in told
