@@ -183,7 +183,7 @@ def _summary(
         found_after_s=None if beside.found_ns is None or beside.first_ns is None else (beside.found_ns - beside.first_ns) * 1e-9,
         searches=beside.searches,
         losses=beside.losses,
-        doubt=beside.localizer.stays.doubt,
+        doubt=beside.localizer.doubt,
         best_candidates=texts,
         T_map_world=beside.T_map_world,
         search_s=beside.search_s,
