@@ -232,6 +232,20 @@ def test_scans_that_are_not_all_there_are_no_smaller_map(
         update_map(merged[0], [cut])
 
 
+@pytest.mark.parametrize("at_line", [True, False])
+def test_a_trajectory_that_was_cut_is_refused(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], tmp_path: Path, at_line: bool
+) -> None:
+    """Once half of the session's poses were missing from the joint map's folder, and nobody said so."""
+    cut = tmp_path / "monday"
+    shutil.copytree(runs[0][0], cut)
+    lines = (cut / "trajectory.csv").read_text().splitlines(keepends=True)
+    text = "".join(lines[: len(lines) // 2])
+    (cut / "trajectory.csv").write_text(text if at_line else text[:-20])
+    with pytest.raises(InputError, match=r"the trajectory of a whole run in .*trajectory.csv – got .*cut"):
+        update_map(merged[0], [cut])
+
+
 def doubted(alignment: SessionAlignment) -> SessionAlignment:
     return replace(alignment, meetings=[replace(m, doubt="are at two places, perhaps") for m in alignment.meetings])
 
