@@ -156,7 +156,7 @@ def _summary(
     started: datetime, recording: Recording, odometry: RunSummary, saved: SavedMap, beside: _Beside
 ) -> LocalizationSummary:
     search = beside.localizer.last_search
-    warnings = []
+    warnings = [printable(f"the map is damaged: {text}") for text in saved.damage]
     texts: list[str] = []
     if beside.T_map_world is None:
         # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
@@ -174,7 +174,7 @@ def _summary(
         recording=printable(str(recording.info.path.resolve())),
         map=printable(str(saved.path.resolve())),
         map_kind=saved.kind,
-        map_report=[printable(text) for text in saved.report],
+        map_report=[printable(text) for text in [*saved.report, *saved.damage]],
         map_origin=saved.origin.tolist(),
         places=len(saved.local_maps),
         contradiction=odometry.contradiction,
