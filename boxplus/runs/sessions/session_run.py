@@ -135,8 +135,8 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
 def _refuse_cut_trajectory(own: SlamFolder, end_ns: int) -> None:
     """It goes as far as the local maps do: of a shorter one half a session would be in the joint map's folder."""
     trajectory = read_trajectory(own.trajectory)
-    if trajectory.warnings or trajectory.time_ns[-1] < end_ns:
-        short = f"one that ends {(end_ns - int(trajectory.time_ns[-1])) * 1e-9:.1f} s before"
+    if trajectory.warnings or trajectory.times[-1] < end_ns:
+        short = f"one that ends {(end_ns - int(trajectory.times[-1])) * 1e-9:.1f} s before"
         raise InputError(
             f"the trajectory of a whole run in {own.trajectory}",
             "; ".join(trajectory.warnings) or f"{short}: it was cut",
