@@ -53,6 +53,12 @@ def _jumps_early(p: Floats, seconds: Floats) -> Floats:
     return p + np.where(seconds < 0.3 * seconds[-1], 0.0, 1.0)[:, None] * [2.4, 1.8, 0.0]
 
 
+def _jumps_in_multipath(p: Floats, seconds: Floats) -> Floats:
+    since = seconds - 0.5 * seconds[-1]
+    burst = (since >= 0.0) & (since < 8.0)
+    return p + (since >= 0.0)[:, None] * [4.0, 3.0, 0.0] + burst[:, None] * [-7.0, 10.0, 0.0]
+
+
 def _stuck(begin: float, duration_s: float) -> Callable[[Floats, Floats], Floats]:
     """The same position from a share of the recording on, for a time."""
 
@@ -81,6 +87,7 @@ CASES = {
     "RTK, hills, in feet": Case(RTK, "said", spoil=_in_feet, climbs=True),
     "RTK, lever arm reversed": Case(RTK, "said", lever=-1.0),
     "datum jumps 3 m early": Case({}, "said", spoil=_jumps_early),
+    "datum jumps 5 m in multipath": Case({}, "said", spoil=_jumps_in_multipath),
     "stuck for 20 s": Case({}, "said", spoil=_stuck(0.4, 20.0)),
     "stuck at the end": Case({}, "said", spoil=_stuck(0.7, np.inf)),
     "stuck throughout": Case({}, "refusal", spoil=_stuck(0.0, np.inf)),

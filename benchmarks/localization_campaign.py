@@ -15,7 +15,7 @@ found, or with its drive, of 10 to 13 s. It is false where any pose that is give
 `--map mirrored`, `scaled` (by a tenth, or `--scale`) and `upside-down` look in what is no map of any place. In all of these
 nothing should be found: there, any pose that is given out is false. `--map cloud` gives the points without the drive. `--kidnap`
 carries the sensor, once it was found, to another start of the same day without its odometry noticing; poses off by as much are
-counted for how long they are given out. Settings were chosen on even seeds.
+counted for how long they are given out. Doubted is what `localize` ends with code 3 for. Settings were chosen on even seeds.
 """
 
 from __future__ import annotations
@@ -203,6 +203,7 @@ class Start:
     track_ms: float
     text: str
     is_nowhere: bool = False
+    is_doubted: bool = False
 
     @property
     def is_false(self) -> bool:
@@ -259,6 +260,7 @@ class Day:
             1e3 * float(np.median(took[False])) if took[False] else np.nan,
             "; ".join([*verdicts, self.localizer.lost_because or ""]),
             is_nowhere,
+            self.localizer.doubt is not None,
         )
 
 
@@ -304,7 +306,9 @@ def summarize(name: str, results: list[Start]) -> None:
     print(
         f"{name:12s} {len(results)} starts, {len(found)} found within {WITHIN_S:g} s "
         f"(median {np.median(times or [np.nan]):.1f} s), "
-        f"{len(false)} false, rms in the map {np.mean(right or [np.nan]):.3f} m (worst {max(right or [np.nan]):.3f} m), "
+        f"{len(false)} false ({sum(r.is_doubted for r in false)} of them doubted), "
+        f"{sum(r.is_doubted for r in results if not r.is_false)} others doubted, "
+        f"rms in the map {np.mean(right or [np.nan]):.3f} m (worst {max(right or [np.nan]):.3f} m), "
         f"search {np.nanmean([r.search_ms for r in results]):.0f} ms",
         flush=True,
     )

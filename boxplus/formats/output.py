@@ -71,6 +71,12 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         raise
 
 
+def earlier_folder(path: str | Path) -> Path:
+    """Where a folder is while another one takes its place, and stays when the process is killed just then."""
+    target = as_path(path, "a folder")
+    return target.with_name(target.name + EARLIER_SUFFIX)
+
+
 def put_back(path: str | Path) -> None:
     """Put back the folder that a process left beside `path` which was killed between the two renames of `replaced_folder`.
 
@@ -78,7 +84,7 @@ def put_back(path: str | Path) -> None:
         OutputError: it cannot be renamed.
     """
     target = as_path(path, "a folder")
-    earlier = target.with_name(target.name + EARLIER_SUFFIX)
+    earlier = earlier_folder(target)
     try:
         if earlier.exists() and not target.exists():
             os.rename(earlier, target)
@@ -97,7 +103,7 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
         OutputError: a folder cannot be created, removed or renamed.
     """
     target = as_path(path, "a file")
-    made, earlier = (target.with_name(target.name + ending) for ending in (TEMPORARY_SUFFIX, EARLIER_SUFFIX))
+    made, earlier = target.with_name(target.name + TEMPORARY_SUFFIX), earlier_folder(target)
     put_back(target)
     try:
         for leftover in (made, earlier):

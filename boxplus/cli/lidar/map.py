@@ -11,6 +11,7 @@ from boxplus.cli.help import Command
 from boxplus.cli.lidar.map_grid import grid, height
 from boxplus.cli.options import RESULTS, ConfigOption, JsonOption, OverwriteOption, QuietOption, SettingsOption
 from boxplus.errors import InputError
+from boxplus.formats.output import earlier_folder
 
 if TYPE_CHECKING:
     from boxplus.cli.terminal import Terminal
@@ -25,10 +26,22 @@ map_app = typer.Typer(
 )
 
 _Folder = Annotated[Path, typer.Argument(help="The map folder a run wrote, or the output folder of the run.", metavar="FOLDER")]
+_AcceptDoubts = Annotated[
+    bool,
+    typer.Option(
+        "--accept-doubts",
+        help="Replace an earlier joint map, and end with code 0, also where something speaks against the new one.",
+    ),
+]
 
 
 def _tiles(folder: Path) -> Path:
     """The map folder: the one given, or the one inside the output folder of a run."""
+    if not folder.exists() and earlier_folder(folder).is_dir():
+        raise InputError(
+            "a map folder", f"nothing at {folder}, and the map that was there whole in {earlier_folder(folder)}",
+            "'boxplus map update' puts it back, or rename it",
+        )  # fmt: skip
     inner = folder / "map"
     return inner if (folder / "run.json").is_file() and inner.is_dir() else folder
 
@@ -95,13 +108,15 @@ def merge_command(
     ] = False,
     config: ConfigOption = None,
     settings: SettingsOption = None,
+    accept_doubts: _AcceptDoubts = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Join runs whose start poses nobody knows into one map, and say which of them did not meet.
 
-    Exit code 3: no two of the runs met, and there is no joint map.
+    Exit code 3: no two of the runs met, and there is no joint map; or something speaks against it (two places of a kind, a run
+    that is not to be trusted itself). Such a one replaces no earlier joint map.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.terminal import Terminal
@@ -112,43 +127,48 @@ def merge_command(
     terminal = Terminal(quiet=quiet, as_json=as_json)
     with reported(_given(runs), output, as_json=as_json) as outcome:
         chosen = load_settings(MergeConfig, config, settings or ())
-        result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite)
-        _show(terminal, result.summary)
-        met = bool(result.summary.joined)
+        result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite, accept_doubts=accept_doubts)
+        summary = result.summary
+        _show(terminal, summary)
+        met = bool(summary.joined)
         if met:
-            terminal.say(f"{_counts(result.summary)} → {output}")
+            terminal.say(f"{_counts(summary)} → {output}")
         else:
             terminal.doubt(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
-        outcome.end(result.summary, untrusted=not met)
+        outcome.end(summary, untrusted=not met or bool(summary.doubts and not accept_doubts))
 
 
 @map_app.command("update", cls=Command)
 def update_command(
     merged: Annotated[Path, typer.Argument(help="Output folder of 'boxplus map merge'.", metavar="MAP")],
     runs: Annotated[list[Path], typer.Argument(help="Output folders of 'boxplus slam', later ones.", metavar="RUN…")],
+    accept_doubts: _AcceptDoubts = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Go on with a joint map: join further runs with it, in its frame and with its settings.
 
-    Exit code 3: the map stays as it was, as none of the runs met it, or one of its own would no longer fit.
+    Exit code 3: the map stays as it was, as none of the runs met it, one of its own would no longer fit, or something speaks
+    against a new run in it.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.terminal import Terminal
-    from boxplus.runs.sessions.update_run import update_map, why_left_alone
+    from boxplus.runs.sessions.update_run import update_map
 
     terminal = Terminal(quiet=quiet, as_json=as_json)
     with reported(_given(runs), merged, as_json=as_json) as outcome:
-        result, alignment = update_map(merged, runs)
-        if result is None:
-            for text in why_left_alone(alignment, len(runs)):
+        result = update_map(merged, runs, accept_doubts=accept_doubts)
+        if result.merged is None:
+            for text in result.left_because:
                 terminal.say(text)
-            terminal.doubt(f"the map cannot go on with any of the runs: {merged} stays as it was")
+            _show_doubts(terminal, result.doubts)
+            why = "--accept-doubts replaces it all the same" if result.doubts else "the map cannot go on with any of the runs"
+            terminal.doubt(f"{merged} stays as it was: {why}")
             outcome.end(None, untrusted=True)
             return
-        _show(terminal, result.summary)
-        terminal.say(f"{_counts(result.summary)} → {merged}")
-        outcome.end(result.summary)
+        _show(terminal, result.merged.summary)
+        terminal.say(f"{_counts(result.merged.summary)} → {merged}")
+        outcome.end(result.merged.summary)
 
 
 def _given(runs: list[Path]) -> str:
@@ -165,6 +185,12 @@ def _show(terminal: Terminal, summary: MergeSummary) -> None:
             terminal.say(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
     for text in summary.warnings:
         terminal.warn(text)
+    _show_doubts(terminal, summary.doubts)
+
+
+def _show_doubts(terminal: Terminal, doubts: list[str]) -> None:
+    for text in doubts:
+        terminal.doubt(f"{text}; look at the map before you trust it")
 
 
 def _counts(summary: MergeSummary) -> str:

@@ -207,9 +207,9 @@ class _Fleet:
             folders = [self._store.path / run_of(name) for name in names]
             merged = merge_runs(
                 folders, self._store.path / MERGED, self._merging,
-                remove_dynamic=True, overwrite=True, align=lambda _: alignment,
+                remove_dynamic=True, overwrite=True, accept_doubts=True, align=lambda _: alignment,
             )  # fmt: skip
-            self._note(map_points=merged.summary.map_points, warnings=merged.summary.warnings)
+            self._note(map_points=merged.summary.map_points, warnings=merged.summary.warnings, map_doubts=merged.summary.doubts)
             return
         began, world = time.perf_counter(), alignment.worlds[0]
         summary = merge_facts(alignment, [self._store / run_of(name) for name in names], [None] * len(names))
@@ -227,7 +227,7 @@ class _Fleet:
             seconds = time.perf_counter() - began
             summary = summary.model_copy(update={"map_points": points, "seconds": seconds})
             self._store.write(f"{into}/{SUMMARY}", summary.model_dump_json(indent=2).encode())
-        self._note(map_points=points, warnings=summary.warnings)
+        self._note(map_points=points, warnings=summary.warnings, map_doubts=summary.doubts)
 
     def _write_tiles(self, into: str, alignment: SessionAlignment) -> int:
         """Returns how many points there are."""

@@ -42,6 +42,7 @@ class FleetStatus(Part):
     )
     map_points: int = Field(0, description="in the joint map; 0 where there is none")
     warnings: list[str] = Field(default=[], description="of the joint map")
+    map_doubts: list[str] = Field(default=[], description="why the joint map is not to be trusted")
     seconds: float = 0.0
 
     @property
@@ -61,6 +62,7 @@ class FleetStatus(Part):
         found += [f"{own.name} is left out of the joint map: {own.doubt}" for own in self.recordings if own.doubt is not None]
         found += [f"a pair could not be looked at: {text}" for text in self.pairs_failed]
         found += [f"the recordings contradict each other: {text}" for text in self.contradictions]
+        found += [f"the joint map is in doubt: {text}" for text in self.map_doubts]
         sound = [own for own in self.recordings if own.state == "finished" and own.doubt is None]
         if self.stage == "finished" and len(sound) > 1 and not self.joined:
             found.append("no two of the recordings met: there is no joint map")

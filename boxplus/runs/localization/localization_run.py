@@ -156,7 +156,7 @@ def _summary(
     started: datetime, recording: Recording, odometry: RunSummary, saved: SavedMap, beside: _Beside
 ) -> LocalizationSummary:
     search = beside.localizer.last_search
-    warnings = []
+    warnings = [printable(f"the map is damaged: {text}") for text in saved.damage]
     texts: list[str] = []
     if beside.T_map_world is None:
         # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
@@ -174,7 +174,7 @@ def _summary(
         recording=printable(str(recording.info.path.resolve())),
         map=printable(str(saved.path.resolve())),
         map_kind=saved.kind,
-        map_report=[printable(text) for text in saved.report],
+        map_report=[printable(text) for text in [*saved.report, *saved.damage]],
         map_origin=saved.origin.tolist(),
         places=len(saved.local_maps),
         contradiction=odometry.contradiction,
@@ -183,7 +183,7 @@ def _summary(
         found_after_s=None if beside.found_ns is None or beside.first_ns is None else (beside.found_ns - beside.first_ns) * 1e-9,
         searches=beside.searches,
         losses=beside.losses,
-        doubt=beside.localizer.stays.doubt,
+        doubt=beside.localizer.doubt,
         best_candidates=texts,
         T_map_world=beside.T_map_world,
         search_s=beside.search_s,

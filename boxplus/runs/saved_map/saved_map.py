@@ -12,6 +12,7 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
 from boxplus.formats.clouds.las import read_survey
+from boxplus.formats.output import earlier_folder
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
@@ -41,7 +42,8 @@ class SavedMap:
         voxel: one point per voxel of this edge is given [m].
         origin: (3,) what is counted from, in the coordinates of the file it is from [m]; zero for most, a multiple of 1 km where
             a LAS or LAZ file has coordinates of the Earth.
-        report: sentences on what is torn, left out, or had to be computed. It grows where a tile turns out damaged later.
+        report: sentences on what it was opened as, and what had to be computed.
+        damage: on what is torn and left out, as it was found so far: a tile may turn out damaged when it is read.
     """
 
     path: Path
@@ -52,6 +54,7 @@ class SavedMap:
     report: list[str]
     _points: TiledPoints
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    damage: list[str] = field(default_factory=list)
 
     def points_near(self, centre: ArrayLike, radius: float) -> NDArray[np.float32]:
         """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
@@ -76,18 +79,20 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     config = as_settings(LocalMapConfig, config)
     base = Path(path)
     if not base.exists():
-        raise InputError(_WHAT, f"nothing at {base}", "check the path")
-    report: list[str] = []
+        earlier = earlier_folder(base)
+        whole = f"; the map that was there is whole in {earlier}: 'boxplus map update' puts it back, or rename it"
+        raise InputError(_WHAT, f"nothing at {base}", "check the path" + (whole if earlier.is_dir() else ""))
+    report, damage = list[str](), list[str]()
     kind, trajectory, origin = "point cloud", None, np.zeros(3)
     if base.is_file():
         points, origin = _of_file(base, config.voxel)
         if origin.any():
             report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
-        tiles, kind, trajectory = _what_is_in(base, report)
-        points = _of_tiles(tiles, config.voxel, report)
+        tiles, kind, trajectory = _what_is_in(base, report, damage)
+        points = _of_tiles(tiles, config.voxel, damage)
     if not points.tiles:
-        raise InputError("a map with points", f"none in {base}", "; ".join(report) or "give the map of a run that went through")
+        raise InputError("a map with points", f"none in {base}", "; ".join(damage) or "give the map of a run that went through")
     if trajectory is not None:
         local_maps = along(trajectory, points.near, config)
         report.append(f"{len(local_maps)} local maps were computed from the map along its trajectory")
@@ -99,47 +104,47 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         )
     if not local_maps:
         raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
-    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin)
+    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage)
 
 
-def _what_is_in(base: Path, report: list[str]) -> tuple[Path, str, Trajectory | None]:
+def _what_is_in(base: Path, report: list[str], damage: list[str]) -> tuple[Path, str, Trajectory | None]:
     """The folder with the tiles, what wrote it, and the trajectory they were made on."""
     if (base / MANIFEST).is_file():
         run = base.parent
         if (run / SUMMARY).is_file() and RunFolder(run).tiles == base and RunFolder(run).trajectory.is_file():
             report.append(f"the map belongs to the run in {run}, whose trajectory is used")
-            return base, program_of(run / SUMMARY) or "map folder", _trajectory(run, report)
+            return base, program_of(run / SUMMARY) or "map folder", _trajectory(run, damage)
         return base, "map folder", None
     folder = RunFolder(base)
     if not (folder.tiles / MANIFEST).is_file():
         raise InputError(_WHAT, f"a folder without map tiles, {base}", "run without --no-map")
     kind = (program_of(base / SUMMARY) if (base / SUMMARY).is_file() else None) or "map folder"
-    return folder.tiles, kind, _trajectory(base, report) if folder.trajectory.is_file() else None
+    return folder.tiles, kind, _trajectory(base, damage) if folder.trajectory.is_file() else None
 
 
-def _trajectory(run: Path, report: list[str]) -> Trajectory:
+def _trajectory(run: Path, damage: list[str]) -> Trajectory:
     trajectory = read_trajectory(RunFolder(run).trajectory)
-    report.extend(trajectory.warnings)
+    damage.extend(trajectory.warnings)
     trajectory.times  # noqa: B018 - refuses one without times
     return trajectory
 
 
-def _of_tiles(folder: Path, voxel: float, report: list[str]) -> TiledPoints:
+def _of_tiles(folder: Path, voxel: float, damage: list[str]) -> TiledPoints:
     store = TileStore.open(folder)
-    report.extend(store.report)
+    damage.extend(store.report)
 
     size = store.manifest.tile_size_m
 
     def read(index: TileIndex) -> NDArray[np.float32]:
-        damaged: list[str] = []
-        points = store.read_tile(index, damaged=damaged).points
-        report.extend(f"a tile is damaged, and what could not be read is left out: {text}" for text in damaged)
+        torn: list[str] = []
+        points = store.read_tile(index, damaged=torn).points
+        damage.extend(f"a tile is damaged, and what could not be read is left out: {text}" for text in torn)
         # Overwritten bytes read as numbers too; those of a tile lie in it.
         low = np.array(index) * size
         inside = ((points >= low - _ROUNDING) & (points <= low + size + _ROUNDING)).all(axis=1)
         if not inside.all():
             name = tile_folder(folder, index).name
-            report.append(f"tile {name} is damaged: {np.count_nonzero(~inside)} of its points lie outside of it and are left out")
+            damage.append(f"tile {name} is damaged: {np.count_nonzero(~inside)} of its points lie outside of it and are left out")
             points = points[inside]
         return np.ascontiguousarray(points[first_per_voxel(points, voxel)])
 

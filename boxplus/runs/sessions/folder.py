@@ -74,6 +74,11 @@ class ClaimedMerge:
 
     path: Path
 
+    @property
+    def has_joint_map(self) -> bool:
+        """Whether an earlier merge left a joint map there."""
+        return MergeFolder(self.path).tiles.is_dir()
+
     @contextmanager
     def replaced(self) -> Iterator[MergeFolder]:
         """A folder to write into, which takes the place of the claimed one when the block ends well; until then that stays whole.

@@ -36,6 +36,7 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
     is_joined = len(world.members) > 1
     row_of = {number: row for row, number in enumerate(world.members)} if is_joined else {}
     sessions, warnings = [], []
+    doubted = doubts_of_joining(alignment, doubts)
     for number, (session, run, doubt) in enumerate(zip(alignment.sessions, runs, doubts, strict=True)):
         row = row_of.get(number)
         facts = SessionFacts(
@@ -51,22 +52,12 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
             rigid = se3.compose(np.broadcast_to(T, session.T_session_map.shape), session.T_session_map)
             bend = np.linalg.norm(world.T_world_map[row][:, 4:] - rigid[:, 4:], axis=1).max()
             sigma = np.sqrt(np.diag(world.covariance[row]))
-            ratio, deviation = world.scale[row].tolist()
-            if abs(ratio - 1.0) > max(_SCALE_SIGMAS * deviation, _LEAST_SCALE):
-                warnings.append(
-                    f"{session.name} has another scale: it fits the others best with its lengths times {ratio:.4f} "
-                    f"(± {deviation:.4f}); the ranges of one of the LiDARs are wrong, and the joint map is bent between them"
-                )
             facts = facts.model_copy(
                 update={"T_world_session": T.tolist(), "sigma": sigma.tolist(), "largest_bend_m": float(bend)}
             )
         sessions.append(facts)
-        if doubt is not None:
-            warnings.append(f"{session.name} is not to be trusted itself: {doubt}")
-    for m in alignment.meetings:
-        if m.doubt is not None and m.refusal is None and m.place_session in row_of and m.query_session in row_of:
-            names = " and ".join(alignment.sessions[k].name for k in (m.query_session, m.place_session))
-            warnings.append(f"{names} {m.doubt}; look at the map before you trust it")
+        if doubt is not None and row is None:
+            warnings.append(_untrusted(session.name, doubt))
     for other in alignment.worlds[1:]:
         if is_joined and len(other.members) > 1:
             them = " and ".join(alignment.sessions[k].name for k in other.members)
@@ -77,8 +68,38 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
         sessions=sessions,
         encounters_looked_at=sum(len(meeting.encounters) for meeting in alignment.meetings),
         encounters_accepted=sum(len(meeting.accepted) for meeting in alignment.meetings),
+        doubts=doubted,
         warnings=warnings,
     )
+
+
+def doubts_of_joining(alignment: SessionAlignment, doubts: Sequence[str | None], held: int = 0) -> list[str]:
+    """Why the joint map of sessions is not to be trusted, in sentences; none where nothing speaks against it, or there is none.
+
+    Args:
+        doubts: of each session's own run. held: so many of the first are in a joint map already: not asked about again.
+    """
+    world = alignment.worlds[0]
+    if len(world.members) == 1:
+        return []
+    found = list[str]()
+    joins = alignment.doubtful_joins(held)
+    for number, (ratio, deviation) in zip(world.members, world.scale.tolist(), strict=True):
+        if number < held:
+            continue
+        name, doubt = alignment.sessions[number].name, doubts[number]
+        if doubt is not None:
+            found.append(_untrusted(name, doubt))
+        if abs(ratio - 1.0) > max(_SCALE_SIGMAS * deviation, _LEAST_SCALE):
+            found.append(
+                f"{name} has another scale: it fits the others best with its lengths times {ratio:.4f} (± {deviation:.4f}); the "
+                "ranges of one of the LiDARs are wrong, and the joint map is bent between them"
+            )
+    return found + list(dict.fromkeys(text for texts in joins.values() for text in texts))
+
+
+def _untrusted(name: str, doubt: str) -> str:
+    return f"{name} is not to be trusted itself: {doubt}"
 
 
 def write_session_trajectory(folder: Path, run: SessionRun, T_world_map: Floats) -> None:

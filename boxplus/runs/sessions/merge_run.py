@@ -21,7 +21,7 @@ from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_merge_folder
-from boxplus.runs.sessions.joined import merge_facts, write_session_trajectory
+from boxplus.runs.sessions.joined import doubts_of_joining, merge_facts, write_session_trajectory
 from boxplus.runs.sessions.repeated import refuse_repeated
 from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
 from boxplus.runs.sessions.summary import MergeSummary
@@ -51,6 +51,7 @@ def merge_runs(
     *,
     remove_dynamic: bool = False,
     overwrite: bool = False,
+    accept_doubts: bool = False,
     progress: Callable[[Meeting], None] | None = None,
     align: Align | None = None,
 ) -> MergeResult:
@@ -63,12 +64,13 @@ def merge_runs(
         config: settings; each has a default.
         remove_dynamic: leave out of the map what rays of other stretches of way went through, and report what changed.
         overwrite: replace an earlier merge.
+        accept_doubts: also where something speaks against the new joint map, or there is none.
         progress: called with every pair of sessions.
         align: says where the sessions are; `align_sessions` over all pairs where it is left out.
 
     Raises:
-        InputError: fewer than two runs, one that is none, or two of one recording; a folder that holds something else; OpenCV is
-            not installed.
+        InputError: fewer than two runs, one that is none, or two of one recording; a folder that holds something else; a new map
+            with a doubt in the place of an earlier one; OpenCV is not installed.
         OutputError: the disk is full or the folder cannot be written; what was there before stays whole.
     """
     began = time.perf_counter()
@@ -82,11 +84,25 @@ def merge_runs(
     claimed = nullcontext(output) if isinstance(output, ClaimedMerge) else claim_merge_folder(output, overwrite=overwrite)
     with claimed as place:
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
+        if place.has_joint_map and not accept_doubts:
+            _refuse_a_worse_map(place.path, alignment, [run.doubt for run in runs])
         with place.replaced() as own:
             summary = _write(own, runs, alignment, config, remove_dynamic)
             summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
             summary.write(own.summary)
     return MergeResult(summary, alignment)
+
+
+def _refuse_a_worse_map(path: Path, alignment: SessionAlignment, doubts: Sequence[str | None]) -> None:
+    """To overwrite says that the earlier map may go, not that what takes its place may be wrong."""
+    against = doubts_of_joining(alignment, doubts)
+    if len(alignment.worlds[0].members) == 1:
+        against = ["no two of the runs met"]
+    if against:
+        raise InputError(
+            f"a joint map that nothing speaks against, to replace the one in {path}", "; ".join(against),
+            "choose another folder with --output and look at that map, or add --accept-doubts",
+        )  # fmt: skip
 
 
 def _write(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.runs.lidar_inertial.summary import read_summary
@@ -100,8 +101,8 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
         needs_scans: for the joint map; without them its local maps alone are looked at.
 
     Raises:
-        InputError: not a run of 'boxplus slam', one that did not come to its end, one whose scans are not all there; a local map
-            that is damaged.
+        InputError: not a run of 'boxplus slam', one that did not come to its end, one whose scans or poses are not all there; a
+            local map that is damaged.
     """
     own = SlamFolder(Path(folder))
     program = program_of(own.summary) if own.summary.is_file() else None
@@ -120,6 +121,8 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     drift = max(outcome.drift_scale, 1.0)
     stored_maps = [stored[number] for number in range(len(placed.time_ns))]
     maps = [replace(local_map, covariance=drift * local_map.covariance) for local_map in stored_maps]
+    if needs_scans:
+        _refuse_cut_trajectory(own, max(local_map.end_ns for local_map in stored_maps))
     loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
     odometry = read_summary(own.odometry.summary)
     extrinsic = odometry.extrinsic
@@ -127,6 +130,18 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     session = Session.of(name, maps, placed.T_map, loops)
     identity = RecordingIdentity.of(odometry, maps)
     return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3], identity)
+
+
+def _refuse_cut_trajectory(own: SlamFolder, end_ns: int) -> None:
+    """It goes as far as the local maps do: of a shorter one half a session would be in the joint map's folder."""
+    trajectory = read_trajectory(own.trajectory)
+    if trajectory.warnings or trajectory.times[-1] < end_ns:
+        short = f"one that ends {(end_ns - int(trajectory.times[-1])) * 1e-9:.1f} s before"
+        raise InputError(
+            f"the trajectory of a whole run in {own.trajectory}",
+            "; ".join(trajectory.warnings) or f"{short}: it was cut",
+            _ADVICE,
+        )
 
 
 def session_names(folders: Sequence[Path]) -> list[str]:

@@ -40,6 +40,7 @@ class MergeSummary(Part):
     removed_points: int | None = Field(None, description="seen through and kept apart; null where nobody looked")
     changes: int | None = Field(None, description="places that changed between sessions; null where nobody looked")
     seconds: float = 0.0
+    doubts: list[str] = Field(default=[], description="why the joint map is not to be trusted; none: nothing speaks against it")
     warnings: list[str] = Field(default=[])
 
     @property

@@ -99,10 +99,13 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
         step = _sharpest(seconds, found, int(at[largest]), sigma)
         is_explained = gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before
-        if not step.is_burst and (is_explained or (share < _LESS and gated <= before and step.is_told)):
+        # A burst at the step hides what another datum leaves of it.
+        is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
+        if not step.is_burst and (is_explained or is_left):
             # Of the map that lies bent between both the errors step by less: it goes along.
             metres = float(np.linalg.norm(split.datum_step[:2]))
-            jump = Jump(float(seconds[at[largest]]), metres if is_explained else max(metres, step.metres), not is_short)
+            alone = step.metres_beside if step.is_beside else step.metres
+            jump = Jump(float(seconds[at[largest]]), metres if is_explained else max(metres, alone), not is_short)
             if jump.lasts:
                 return jump
             short = jump

@@ -7,7 +7,8 @@ stays for τ, with the covariance
 
 Generalised least squares says by how much a step there lowers the cost, and by how much a burst does, of any duration, that
 begins or ends there. Either explains what the other does in part: of a datum that jumps, a burst explains little more than the
-step; of multipath, a third more and beyond.
+step; of multipath, a third more and beyond. A datum that jumps while multipath lasts is both: the burst explains most, and beside
+it the step is still there.
 """
 
 from __future__ import annotations
@@ -33,18 +34,26 @@ class Step:
     """What a step in errors is.
 
     Attributes:
-        gain: by which it lowers the cost. burst_gain: by which the best burst does that begins or ends there.
-        metres: length of the step.
+        gain: by which it lowers the cost. burst_gain: by which the best burst does that begins or ends there. beside: by which
+            the step does where that burst has been taken off.
+        metres: length of the step. metres_beside: and beside that burst.
     """
 
     gain: float
     burst_gain: float
+    beside: float
     metres: float
+    metres_beside: float
 
     @property
     def is_burst(self) -> bool:
         """Whether it comes and goes."""
-        return self.burst_gain > _BURST * self.gain
+        return self.burst_gain > _BURST * self.gain and self.beside < _LEAST
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether it is there beside a burst, which explains most of it."""
+        return self.burst_gain > _BURST * self.gain and self.beside >= _LEAST
 
     @property
     def is_told(self) -> bool:
@@ -77,4 +86,12 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: float) -> Step:
     energy = np.maximum((columns**2).sum(axis=0), 1e-12)
     length = columns.T @ r / energy[:, None]
     gain = (length**2).sum(axis=1) * energy
-    return Step(float(gain[0]), float(gain[1:].max(initial=0.0)), float(np.linalg.norm(length[0])))
+    if len(gain) == 1:
+        metres = float(np.linalg.norm(length[0]))
+        return Step(float(gain[0]), 0.0, float(gain[0]), metres, metres)
+    best = 1 + int(np.argmax(gain[1:]))
+    burst = columns[:, best] / math.sqrt(energy[best])
+    own = columns[:, 0] - burst * (burst @ columns[:, 0])
+    left = own @ r / math.sqrt(max(float(own @ own), 1e-12))
+    beside = float(np.linalg.norm(left)) / math.sqrt(max(float(own @ own), 1e-12))
+    return Step(float(gain[0]), float(gain[best]), float(left @ left), float(np.linalg.norm(length[0])), beside)

@@ -26,6 +26,7 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.systems.localization.candidate import Candidate, Query, contradiction, distinct, examine_all, lead, rivalry
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
+from boxplus.systems.localization.map_lengths import MapLengths
 from boxplus.systems.localization.place_map import PlaceMap
 from boxplus.systems.localization.stays import Stays
 from boxplus.systems.localization.tracking import Matched, Tracker
@@ -93,7 +94,8 @@ class Localizer:
     Attributes:
         last_search: the newest query.
         losses: how often the place was lost; lost_because: why last, None before it was.
-        stays: whether the places agree with each other; `stays.doubt` says why poses that were given out are not to be trusted.
+        stays: whether the places agree with each other.
+        lengths: whether the map has the lengths that are seen.
 
     Example: docs/localization.md.
     """
@@ -104,6 +106,8 @@ class Localizer:
         self.lost_because: str | None = None
         self.losses = 0
         self.stays = Stays()
+        self.lengths = MapLengths()
+        self._way = 0.0  # since lengths were seen
         self._map = place_map
         self._images = PlaceImages(place_map.local_maps)
         self._tracker: Tracker | None = None
@@ -118,6 +122,11 @@ class Localizer:
         self._contradicted_by: str | None = None
         self._is_odometry_lost = False  # since a scan fitted last
         self._begin_search()
+
+    @property
+    def doubt(self) -> str | None:
+        """Why poses that were given out are not to be trusted; None where nothing speaks against them."""
+        return "; ".join(text for text in (self.stays.doubt, self.lengths.doubt) if text) or None
 
     def push(
         self, time_ns: int, T_odo_body: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike = (0.0, 0.0, 1.0), *, lost: bool = False
@@ -149,6 +158,7 @@ class Localizer:
             self.stays.jump()
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
+        self._way += float(np.linalg.norm(step[4:]))
         up = as_floats(up_odo, "up_odo")
         if self._tracker is None:
             return self._search(int(time_ns), T_odo, points[:0] if lost else points, up)
@@ -238,6 +248,9 @@ class Localizer:
             self._tried_ns = time_ns
             matched = tracker.correct(points, _level(T_odo, up))
             self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
+            if matched.lengths is not None:
+                self.lengths.see(matched.lengths, self._way)
+                self._way = 0.0
             # One that fails ends it at once: a sensor that was carried away is not where the odometry has it.
             self._held_ns = time_ns if matched.measured else _NEVER
             # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.

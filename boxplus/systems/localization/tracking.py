@@ -20,6 +20,7 @@ from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.place_map import PlaceMap
 from boxplus.systems.localization.standing import seen_through, standing
+from boxplus.systems.slam.lengths import Lengths, compare_lengths
 from boxplus.systems.slam.registration import Surface, refine
 
 Floats = NDArray[np.float64]
@@ -45,6 +46,7 @@ class Matched:
         innovation: distance of the registration from the prediction, and its limit, in standard deviations; NaN where there was
             none.
         measured: how many directions it determined; 0 where it was not taken.
+        lengths: the map's against those of the scan; None where it was not taken, or tells nothing of them.
     """
 
     share: float
@@ -53,6 +55,7 @@ class Matched:
     innovation: float
     limit: float
     measured: int
+    lengths: Lengths | None = None
 
 
 class Tracker:
@@ -115,7 +118,8 @@ class Tracker:
         P = np.linalg.inv(np.linalg.inv(self.covariance) + found.information)
         self.covariance = 0.5 * (P + P.T)
         self.T_map_body = se3.compose(self.T_map_body, se3.exp(self.covariance @ found.information @ xi))
-        return Matched(share, True, False, innovation, limit, 6 - len(found.weak))
+        lengths = compare_lengths(points, around, T, config.registration, distance=_DISTANCE)
+        return Matched(share, True, False, innovation, limit, 6 - len(found.weak), lengths)
 
     def _sees_through(self, p_body: Points, around: Surface) -> bool:
         """Whether a scan passes through what stands in the map, in more directions than changes may account for."""

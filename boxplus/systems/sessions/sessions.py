@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -72,6 +72,31 @@ class SessionAlignment:
             for m in self.meetings
             if m.refusal is not None and session in (m.place_session, m.query_session)
         ]
+
+    def doubtful_joins(self, held: int = 1) -> dict[int, list[str]]:
+        """Sessions of the largest world that only meetings with a doubt join with the rest of it, and these in sentences.
+
+        What sound meetings bear out, through whichever sessions, is no longer in doubt.
+
+        Args:
+            held: so many sessions, the first that were given, are known to be in one world.
+        """
+        members, names = self.worlds[0].members, [own.name for own in self.sessions]
+        joined = [m for m in self.meetings if m.refusal is None and {m.place_session, m.query_session} <= set(members)]
+        sound = [(m.place_session, m.query_session) for m in joined if m.doubt is None]
+        known = [number for number in members if number < held]
+        pairs = [*sound, *pairwise(known)]
+        _, group = connected_components(len(names), *np.array(pairs, dtype=np.int64).reshape(-1, 2).T)
+        own = group[members[0]] if known else max((group[k] for k in members), key=lambda g: np.count_nonzero(group == g))
+        return {
+            number: [
+                f"{names[m.query_session]} and {names[m.place_session]} {m.doubt}"
+                for m in joined
+                if m.doubt is not None and number in (m.place_session, m.query_session)
+            ]
+            for number in members
+            if group[number] != own
+        }
 
 
 def align_sessions(

@@ -33,11 +33,11 @@ _CHUNK = 1024
 _STAGES = ((2.0, 4, 1500), (1.2, 6, 3000), (0.8, 15, 8000))  # largest distance of a plane's points [m], steps, points
 _STEP = 2e-4  # m, at the points: shorter ones are the end
 _SHORT = 2e-3  # m, the same where a scan is followed
-_FEWEST = 60  # points on planes
+FEWEST_ON_PLANES = 60  # points
 _SCALE = 1.4826  # from the median of |e| to a standard deviation
-_LEAST_SCALE = 0.01  # m, of the residuals
+LEAST_RESIDUAL_SCALE = 0.01  # m, of the residuals
 _BLUNT = 0.25  # of a stage's distance: least scale of the residuals where the start is a coarse guess
-_NOISE = 2.0  # times the information that noise of the normals alone gives
+NOISE = 2.0  # times the information that noise of the normals alone gives
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,10 +130,10 @@ def _staged(
     for distance, steps, count in stages:
         points = _spread(source.points, count)
         for _ in range(steps):
-            found = _Matched.of(points, target, T, distance, config, max(blunt * distance, _LEAST_SCALE))
+            found = _Matched.of(points, target, T, distance, config, max(blunt * distance, LEAST_RESIDUAL_SCALE))
             if found is None:
                 return None
-            step, length = found.step(config.weak_information)
+            step, length = found.step(config)
             T = se3.compose(T, se3.exp(step))
             if length < _STEP:
                 break
@@ -164,7 +164,7 @@ def refine(
         found = _Matched.of(points, target, T, distance, config)
         if found is None:
             return None
-        step, length = found.step(config.weak_information)
+        step, length = found.step(config)
         T = se3.compose(T, se3.exp(step))
         if length < _SHORT:
             break
@@ -207,7 +207,7 @@ def mean_distance(
 
 def plane_normals(points: NDArray[np.float32], surface: Surface, config: LocalMapRegistrationConfig) -> Floats:
     """(N, 3) unit normals of the planes through a surface's points next to each of these; NaN where there is none."""
-    planes, valid = _planes(points, surface, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _STAGES[-1][0], config)
+    planes, valid = planes_beside(points, surface, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), _STAGES[-1][0], config)
     return np.where(valid[:, None], planes[:, :3], np.nan)
 
 
@@ -226,7 +226,7 @@ def facing_planes(
         axis: (3,) unit, in the target's frame; cosine: between it and a normal, at least.
         distance: of a plane's points, at most [m].
     """
-    planes, valid = _planes(points, target, T_target_source, distance, config)
+    planes, valid = planes_beside(points, target, T_target_source, distance, config)
     with np.errstate(invalid="ignore"):
         return planes[:, 3], valid & (np.abs(planes[:, :3] @ axis) >= cosine)
 
@@ -242,7 +242,7 @@ class _Matched:
     to_origin: Floats
     lever: float
     scale: float
-    of_noise: float
+    planes: Floats
 
     @classmethod
     def of(
@@ -252,10 +252,10 @@ class _Matched:
         T: Floats,
         distance: float,
         config: LocalMapRegistrationConfig,
-        least_scale: float = _LEAST_SCALE,
+        least_scale: float = LEAST_RESIDUAL_SCALE,
     ) -> _Matched | None:
-        planes, valid = _planes(points, target, T, distance, config)
-        if np.count_nonzero(valid) < _FEWEST:
+        planes, valid = planes_beside(points, target, T, distance, config)
+        if np.count_nonzero(valid) < FEWEST_ON_PLANES:
             return None
         p, plane = points[valid].astype(np.float64), planes[valid]
         middle = p.mean(axis=0)
@@ -264,30 +264,29 @@ class _Matched:
         C = plane[:, :3] @ quaternion.to_matrix(T[:4])
         J = np.hstack([np.cross(arm, C) / lever, C])
         e = plane[:, 3]
-        scale = max(_SCALE * float(np.median(np.abs(e))), least_scale)
-        weight = 1.0 / (1.0 + (e / (2.0 * scale)) ** 2) ** 2
+        scale = residual_scale(e, least_scale)
+        weight = residual_weights(e, scale)
         # w about the middle moves the origin: v = v' + middle × w … on the right, T Exp(ξ) with ξ = A ξ'.
         A = np.eye(6)
         A[:3, :3] /= lever
         x, y, z = middle
         A[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / lever
-        return cls(e, J, weight, p @ quaternion.to_matrix(T[:4]).T, A, lever, scale, float(weight @ plane[:, 4]))
+        return cls(e, J, weight, p @ quaternion.to_matrix(T[:4]).T, A, lever, scale, plane)
 
-    def _modes(self, weak_information: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    def _modes(self, config: LocalMapRegistrationConfig) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         H = self.J.T @ (self.J * self.weight[:, None])
         values, vectors = np.linalg.eigh(H)
-        # Normals that noise tilts seem to measure what they do not: in sum, that much of any direction.
-        return values, vectors, np.asarray(values > max(weak_information * self.weight.sum(), _NOISE * self.of_noise))
+        return values, vectors, has_information(values, self.weight, self.planes, config)
 
-    def step(self, weak_information: float) -> tuple[Floats, float]:
+    def step(self, config: LocalMapRegistrationConfig) -> tuple[Floats, float]:
         """The Gauss-Newton step [w, v] within the measured directions, and its length at the points [m]."""
-        values, vectors, good = self._modes(weak_information)
+        values, vectors, good = self._modes(config)
         g = vectors[:, good].T @ (self.J.T @ (self.weight * self.e))
         step = -vectors[:, good] @ (g / values[good])
         return self.to_origin @ step, float(np.linalg.norm(step))
 
     def covariance(self, config: LocalMapRegistrationConfig, deformation: Floats) -> tuple[Floats, Floats, Floats]:
-        values, vectors, good = self._modes(config.weak_information)
+        values, vectors, good = self._modes(config)
         _, cell = np.unique(np.floor(self.where / config.cluster).astype(np.int64), axis=0, return_inverse=True)
         gradients = np.zeros((int(cell.max()) + 1, 6))
         np.add.at(gradients, cell.ravel(), self.J * (self.weight * self.e)[:, None])
@@ -307,12 +306,30 @@ class _Matched:
         return 0.5 * (covariance + covariance.T), 0.5 * (information + information.T), weak
 
 
+def residual_scale(e: Floats, least: float = LEAST_RESIDUAL_SCALE) -> float:
+    """Robust standard deviation of distances (N,) to planes [m], `least` at least."""
+    return max(_SCALE * float(np.median(np.abs(e))), least)
+
+
+def residual_weights(e: Floats, scale: float) -> Floats:
+    """(N,) weights of distances (N,) to planes, of Geman and McClure."""
+    return np.asarray(1.0 / (1.0 + (e / (2.0 * scale)) ** 2) ** 2)
+
+
+def has_information(values: Floats, weight: Floats, planes: Floats, config: LocalMapRegistrationConfig) -> NDArray[np.bool_]:
+    """Which eigenvalues of a normal matrix tell a direction; planes (N, 5) as of `planes_beside`, with their weights (N,).
+
+    Normals that noise tilts seem to measure what they do not: in sum, that much of any direction.
+    """
+    return np.asarray(values > max(config.weak_information * weight.sum(), NOISE * float(weight @ planes[:, 4])))
+
+
 def _spread(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     """About `count` of the points, one in so many."""
     return np.ascontiguousarray(points[:: max(len(points) // count, 1)])
 
 
-def _planes(
+def planes_beside(
     points: NDArray[np.float32], target: Surface, T: Floats, distance: float, config: LocalMapRegistrationConfig
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """(N, 5) planes of a target next to points, as `_match_planes` has them, and where there is one."""

@@ -72,6 +72,13 @@ def test_export_of_an_interrupted_run_warns(folder: Path) -> None:
     writer.close()
 
 
+def test_a_map_that_a_killed_process_left_beside_is_named(folder: Path) -> None:
+    earlier = folder.with_name("map.boxplus-earlier")
+    folder.rename(earlier)
+    result = CliRunner().invoke(map_app, ["info", str(folder)])
+    assert isinstance(result.exception, InputError) and f"whole in {earlier}" in str(result.exception)
+
+
 def test_no_map(tmp_path: Path) -> None:
     result = CliRunner().invoke(map_app, ["info", str(tmp_path)])
     assert isinstance(result.exception, InputError)

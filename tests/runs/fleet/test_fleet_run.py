@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -133,6 +134,12 @@ def test_recordings_that_met_are_joined_and_failed_ones_named(
     )
     with pytest.raises(InputError, match="a folder, to remove what was seen through – got memory"):
         run_fleet(recordings, OBJECTS, InProcess(), remove_dynamic=True)
+    # A join that only a meeting with a doubt bears out is said to be one.
+    shutil.copytree(tmp_path / "a" / "runs", tmp_path / "d" / "runs")
+    monkeypatch.setattr(fleet_run, "meet_runs", lambda *_: replace(meeting, doubt="are at two places of a kind, perhaps"))
+    doubted = run_fleet(recordings, tmp_path / "d", InProcess(), None, merging)
+    assert "the joint map is in doubt: monday and friday are at two places of a kind, perhaps" in doubted.doubts
+    monkeypatch.setattr(fleet_run, "meet_runs", tasks.meet_runs)
     # A pair whose task is lost is said to be, and is not joined.
     lost = run_fleet(recordings, tmp_path / "b", Backwards(lost=0), None, merging)
     assert lost.joined == [] and lost.pairs_failed == ["friday and monday: lost 4 times: the worker died"]

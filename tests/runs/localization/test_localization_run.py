@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,13 +86,19 @@ def draw(folder: Path, result: LocalizationResult) -> str:
 def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_path: Path) -> None:
     simulation = drive(((15.0, 2.0), (-14.0, 2.0)), seed=2)
     bag = write_recording(simulation, tmp_path / "tuesday", "ros1")
-    words = ["localize", str(bag), "--map", str(mapped), "-o", str(tmp_path / "out"), "--json"]
+    torn = tmp_path / "torn"
+    shutil.copytree(mapped, torn)
+    segment = min((torn / "map" / "tiles").glob("*/*.ply"), key=lambda file: file.stat().st_size)
+    segment.write_bytes(segment.read_bytes()[:-4])
+    words = ["localize", str(bag), "--map", str(torn), "-o", str(tmp_path / "out"), "--json"]
     called = CliRunner().invoke(app, [*words, *(f"--set={text}" for text in SETTINGS)])
     assert called.exit_code == 0, called.stderr
     own, found = LocalizationFolder(tmp_path / "out"), json.loads(called.stdout)
     assert found["outcome"] == "finished" and found["run"] == json.loads(own.summary.read_text())
     summary = LocalizationSummary.model_validate(found["run"])
     assert "found after" in called.stderr and str(own.trajectory.with_suffix(".tum")) in called.stderr
+    assert any(text.startswith("the map is damaged: ") and segment.name in text for text in summary.warnings)
+    assert "the map is damaged" in " ".join(called.stderr.split())
     assert summary.program == "boxplus localize" and summary.map_kind == "boxplus lio"
     assert summary.found_after_s is not None and summary.found_after_s <= 7.0 and not summary.losses
     trajectory, log = read_trajectory(own.trajectory), read_row_log(own.log, LOG_COLUMNS)

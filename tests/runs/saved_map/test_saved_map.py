@@ -130,14 +130,18 @@ def test_a_damaged_tile_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
     overwritten.write_bytes(bytes(content))
     saved = open_saved_map(tmp_path / "run", CONFIG)
     saved.points_near([6.0, 8.0, 1.0], 30.0)
-    assert any(str(cut) in text and "damaged" in text for text in saved.report)
-    assert any(overwritten.parent.name in text and "lie outside" in text for text in saved.report)
+    assert any(str(cut) in text and "damaged" in text for text in saved.damage)
+    assert any(overwritten.parent.name in text and "lie outside" in text for text in saved.damage)
     assert np.isfinite(saved.points_near([6.0, 8.0, 1.0], 30.0)).all()
     assert len(saved.local_maps) == 2 and all(len(m.points) > 500 for m in saved.local_maps)
 
 
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing at"):
+        open_saved_map(tmp_path / "nowhere")
+    earlier = tmp_path / "nowhere.boxplus-earlier"
+    earlier.mkdir()
+    with pytest.raises(InputError, match=f"is whole in {earlier}: 'boxplus map update' puts it back"):
         open_saved_map(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="without map tiles"):

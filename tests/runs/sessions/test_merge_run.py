@@ -32,7 +32,7 @@ from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.simulation.drifting_drive import DriftConfig, DriftingDrive
 from boxplus.simulation.worlds.world import World, box
 from boxplus.simulation.worlds.worlds import city
-from boxplus.systems.sessions.sessions import align_sessions
+from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions
 from tests.runs.sessions.runs import written_run
 
 DRIFT = DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
@@ -42,6 +42,7 @@ QUICK = [
     "seen_through.voxel=0.3",
 ]
 VAN = (30.0, 3.5, 1.3)
+SOUND_SCALE = np.tile([[1.0, 0.01]], (3, 1))
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +210,7 @@ def test_an_update_goes_on_although_more_runs_met_elsewhere(
 ) -> None:
     out, result = merged
     joined, alone = result.alignment.worlds
-    own, others = replace(joined, members=(0, 1, 2)), replace(alone, members=(3, 4, 5, 6))
+    own, others = replace(joined, members=(0, 1, 2), scale=SOUND_SCALE), replace(alone, members=(3, 4, 5, 6))
     found = replace(result.alignment, worlds=[others, own])
     taken = []
     monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: found)
@@ -232,12 +233,92 @@ def test_scans_that_are_not_all_there_are_no_smaller_map(
         update_map(merged[0], [cut])
 
 
-def test_what_may_be_two_places_of_a_kind_is_joined_with_a_warning(merged: tuple[Path, MergeResult]) -> None:
+@pytest.mark.parametrize("at_line", [True, False])
+def test_a_trajectory_that_was_cut_is_refused(
+    runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], tmp_path: Path, at_line: bool
+) -> None:
+    """Once half of the session's poses were missing from the joint map's folder, and nobody said so."""
+    cut = tmp_path / "monday"
+    shutil.copytree(runs[0][0], cut)
+    lines = (cut / "trajectory.csv").read_text().splitlines(keepends=True)
+    text = "".join(lines[: len(lines) // 2])
+    (cut / "trajectory.csv").write_text(text if at_line else text[:-20])
+    with pytest.raises(InputError, match=r"the trajectory of a whole run in .*trajectory.csv – got .*cut"):
+        update_map(merged[0], [cut])
+
+
+def doubted(alignment: SessionAlignment) -> SessionAlignment:
+    return replace(alignment, meetings=[replace(m, doubt="are at two places, perhaps") for m in alignment.meetings])
+
+
+DOUBT = "friday and monday are at two places, perhaps"
+
+
+def test_what_may_be_two_places_of_a_kind_is_joined_with_a_doubt(merged: tuple[Path, MergeResult]) -> None:
     alignment = merged[1].alignment
-    meetings = [replace(m, doubt="are at two places, perhaps") for m in alignment.meetings]
-    told = merge_facts(replace(alignment, meetings=meetings), ["a", "b", "c"], [None] * 3).warnings
-    assert told == ["friday and monday are at two places, perhaps; look at the map before you trust it"]
-    assert merge_facts(alignment, ["a", "b", "c"], [None] * 3).warnings == []
+    assert merge_facts(doubted(alignment), ["a", "b", "c"], [None] * 3).doubts == [DOUBT]
+    assert merge_facts(alignment, ["a", "b", "c"], [None] * 3).doubts == []
+    contradicted = merge_facts(alignment, ["a", "b", "c"], [None, "its sensors contradict each other", "so do these"])
+    assert contradicted.doubts == ["friday is not to be trusted itself: its sensors contradict each other"]
+    assert contradicted.warnings == ["elsewhere is not to be trusted itself: so do these"]
+
+
+def test_a_doubtful_join_ends_with_code_3_and_replaces_no_map_unasked(
+    runs: tuple[list[Path], list[DriftingDrive]],
+    merged: tuple[Path, MergeResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two warehouses built alike: once `map merge` ended with code 0, and `--overwrite` put it in the place of a good map."""
+    found = doubted(merged[1].alignment)
+    monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: found)
+    given, new, old = [str(path) for path in runs[0]], tmp_path / "new", tmp_path / "old"
+    shown = CliRunner().invoke(map_app, ["merge", *given, "-o", str(new)])
+    assert shown.exit_code == 3 and "two places, perhaps" in shown.output and (new / "map.ply").is_file()
+    shutil.copytree(merged[0], old)
+    before = {path: path.stat().st_mtime_ns for path in old.rglob("*")}
+    again = ["merge", *given, "-o", str(old), "--overwrite"]
+    shown = CliRunner().invoke(map_app, again)
+    assert isinstance(shown.exception, InputError) and "--accept-doubts" in str(shown.exception) and DOUBT in str(shown.exception)
+    assert {path: path.stat().st_mtime_ns for path in old.rglob("*")} == before
+    alone = replace(found, worlds=[replace(found.worlds[0], members=(0,)), *found.worlds[1:]])
+    monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: alone)
+    with pytest.raises(InputError, match=r"to replace the one in .* – got no two of the runs met – choose another folder"):
+        merge_runs(runs[0], old, overwrite=True)
+    monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: found)
+    shown = CliRunner().invoke(map_app, [*again, "--accept-doubts"])
+    assert shown.exit_code == 0 and "two places, perhaps" in shown.output
+    assert {path: path.stat().st_mtime_ns for path in old.rglob("*")} != before
+
+
+def test_an_update_in_doubt_leaves_the_map_alone(
+    runs: tuple[list[Path], list[DriftingDrive]],
+    merged: tuple[Path, MergeResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of the new runs alone: what the map was made of in spite of a doubt, it stays made of."""
+    out, result = merged
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    joined = result.alignment.worlds[0]
+    maps = [*joined.T_world_map, result.alignment.sessions[2].T_session_map]
+    world = JointWorld((0, 1, 2), np.tile(joined.T_world_session[:1], (3, 1)), np.zeros((3, 6, 6)), maps, [],
+                       SOUND_SCALE)  # fmt: skip
+    met = replace(result.alignment.meetings[0], place_session=1, query_session=2)
+    found = replace(result.alignment, worlds=[world], meetings=[result.alignment.meetings[0], met])
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: doubted(found))
+    update = ["update", str(out), str(runs[0][2])]
+    shown = CliRunner().invoke(map_app, update)
+    said = " ".join(shown.output.split())
+    assert shown.exit_code == 3 and "elsewhere and friday are at two places, perhaps" in said and DOUBT not in said
+    assert "stays as it was: --accept-doubts" in said
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    taken = []
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.merge_runs", lambda *_, **given: taken.append(given) or result)
+    assert CliRunner().invoke(map_app, [*update, "--accept-doubts"]).exit_code == 0 and len(taken) == 1
+    one = replace(found, meetings=[replace(found.meetings[0], doubt="are at two places, perhaps"), met])
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: one)
+    assert CliRunner().invoke(map_app, update).exit_code == 0 and len(taken) == 2
 
 
 @pytest.mark.slow
@@ -254,7 +335,7 @@ def test_an_update_goes_on_with_a_map(
     drive = written_run(sunday, city(2, 2, seed=5), [[5.0, 0.0], [60.0, 0.0], [60.0, 10.0]], DRIFT, 9)
     shutil.copytree(merged[0], out)
     first = read_trajectory(out / "sessions" / "monday.tum").p
-    result, _ = update_map(out, [sunday])
+    result = update_map(out, [sunday]).merged
     assert result is not None and [session.name for session in result.summary.joined] == ["monday", "friday", "sunday"]
     assert np.linalg.norm(read_trajectory(out / "sessions" / "monday.tum").p - first, axis=1).max() < 0.3
     found = read_trajectory(out / "sessions" / "sunday.tum").p

@@ -47,3 +47,14 @@ def test_noise_is_no_step_nor_is_a_map_that_bends() -> None:
 def test_near_to_the_begin_there_is_as_much_as_there_is() -> None:
     errors = noise(1) + 4.0 * np.outer(SECONDS >= 8.0, [1.0, 0.0])
     assert step_at(SECONDS, errors, 8, 0.7).metres == pytest.approx(4.0, abs=1.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_told_beside_a_burst_that_hides_it(seed: int) -> None:
+    """A datum that jumps while multipath lasts: once the burst was all there was of it."""
+    jump = 5.0 * np.outer(SECONDS >= 40.0, [0.8, 0.6])
+    for begin in (32.0, 40.0):
+        burst = 12.0 * np.outer((begin <= SECONDS) & (begin + 8.0 > SECONDS), [-0.6, 0.8])
+        both, alone = (step_at(SECONDS, noise(seed) + errors, 40, 0.7) for errors in (jump + burst, burst))
+        assert both.is_beside and not both.is_burst and both.metres_beside == pytest.approx(5.0, abs=2.0)
+        assert alone.is_burst and not alone.is_beside

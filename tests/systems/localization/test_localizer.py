@@ -52,7 +52,21 @@ def test_a_start_elsewhere_is_found_and_followed(world: World, place_map: KnownM
     lost = [localizer.push(end + k * 400_000_000, T, drive.scans[-1], lost=True) for k in range(1, 8)]
     assert all(one.matched is None for one in lost)
     assert lost[-1].status == "searching" and lost[-1].T_map_body is None
-    assert localizer.losses == 1 and localizer.stays.doubt is None  # nothing speaks against where it was until then
+    assert localizer.losses == 1 and localizer.doubt is None  # nothing speaks against where it was until then
+
+
+@pytest.mark.parametrize("ratio", [1.01, 0.99])
+def test_a_map_of_other_lengths_is_named(world: World, place_map: KnownMap, ratio: float) -> None:
+    """A hundredth too long it fits, and once poses in it were given without a word."""
+    places = [
+        replace(m, points=ratio * m.points, T_odo_map=m.T_odo_map * ([1.0] * 4 + [ratio] * 3)) for m in place_map.local_maps
+    ]
+    drive = drive_of(world, [[14, 1.5], [0, 1.5]], seed=5)
+    localizer = Localizer(KnownMap(places, np.float32(ratio) * place_map.points), FEW)
+    found = push_all(localizer, drive, own_world(drive))
+    assert found[-1].T_map_body is not None
+    assert localizer.doubt is not None and localizer.doubt.startswith(f"lengths in the map are {ratio:.3f}")
+    assert localizer.lengths.ratio[0] == pytest.approx(ratio, abs=0.001)
 
 
 def test_a_sensor_that_is_carried_away_is_noticed_and_found_again(world: World, place_map: KnownMap) -> None:

@@ -188,6 +188,6 @@ def test_a_session_of_another_scale_is_named(scale: float) -> None:
     assert graph.is_kept.all() and fits == pytest.approx(1.0 / scale, abs=2e-4) and 1e-4 < sigma < 5e-3
     np.testing.assert_array_equal(graph.scale[0], [1.0, 0.0])
     world = JointWorld((0, 1), graph.T_world_session, graph.covariance, graph.T_world_map, encounters, graph.scale)
-    warnings = merge_facts(SessionAlignment(sessions, [world], []), ["a", "b"], [None, None]).warnings
-    assert len(warnings) == (scale != 1.0)
-    assert all("b has another scale" in text and f"times {fits:.4f}" in text for text in warnings)
+    doubts = merge_facts(SessionAlignment(sessions, [world], []), ["a", "b"], [None, None]).doubts
+    assert len(doubts) == (scale != 1.0)
+    assert all("b has another scale" in text and f"times {fits:.4f}" in text for text in doubts)

@@ -64,3 +64,11 @@ def test_an_alignment_from_which_everything_comes_back_is_no_other_one() -> None
 def test_what_stands_too_little_is_not_compared() -> None:
     ground = np.stack(np.meshgrid(np.arange(-17.0, 17.1, 0.5), np.arange(-2.0, 2.1, 0.5), [0.0]), axis=-1).reshape(-1, 3)
     assert lead_of(session("a", ground, 1), session("b", ground, 2), HERE, [NEXT_BAY], CONFIG) is None
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.2])
+def test_points_that_scatter_as_much_within_a_session_say_nothing_against_two(noise: float) -> None:
+    """Once two drives through one forest were two places of a kind, as a LiDAR of few noisy rings finds no trunk where it was."""
+    same = lead_of(session("a", aisle(1), 1, noise), session("b", aisle(1), 2, noise), HERE, [], CONFIG)
+    assert same is not None
+    assert (same.share < CONFIG.least_lead) == same.is_scattered == (noise > 0.1)

@@ -34,12 +34,12 @@ def room(half_width: tuple[float, float]) -> NDArray[np.float64]:
     return np.concatenate([floor, *sides, wall((-14, -14), (-low, low)), wall((14, 14), (-high, high))])
 
 
-def session(name: str, points: NDArray[np.float64], seed: int) -> Places:
+def session(name: str, points: NDArray[np.float64], seed: int, noise: float = 0.01) -> Places:
     """Walked along x, everything seen from everywhere, to 1 cm."""
     random, maps = np.random.default_rng(seed), []
     for k, x in enumerate(np.linspace(-8.0, 8.0, 5)):
         T = HERE + np.array([0.0, 0.0, 0.0, 0.0, x, 0.0, 1.2])
-        seen = se3.act(se3.inverse(T), points + random.normal(0.0, 0.01, points.shape)).astype(np.float32)
+        seen = se3.act(se3.inverse(T), points + random.normal(0.0, noise, points.shape)).astype(np.float32)
         maps.append(LocalMap(k, k, k, k, T, 1e-6 * np.eye(6), 4.0 * k, seen, 1))
     return Places(Session.of(name, maps), CONFIG.slam)
 
