@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import os
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -62,10 +64,10 @@ def installation(extra: str) -> str:
 
     boxplus is on no index of packages: what would install `boxplus[view]` from there does not work, and its libraries do.
     """
-    wanted = _wanted(extra)
-    python = shlex.quote(sys.executable)
-    pip = f"{python} -m pip install" if has("pip") else f"uv pip install --python {python}"
-    return f"{pip} {' '.join(wanted)}" if wanted else f"{pip} {shlex.quote(f'{Path(__file__).resolve().parents[1]}[{extra}]')}"
+    wanted = _wanted(extra) or [f"{Path(__file__).resolve().parents[1]}[{extra}]"]
+    pip = [sys.executable, "-m", "pip", "install"] if has("pip") else ["uv", "pip", "install", "--python", sys.executable]
+    words = [*pip, *wanted]
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def _wanted(extra: str) -> list[str]:
@@ -75,4 +77,4 @@ def _wanted(extra: str) -> list[str]:
     except importlib.metadata.PackageNotFoundError:
         return []
     own = [line.partition(";") for line in listed if re.search(rf"""extra\s*==\s*['"]{extra}['"]""", line)]
-    return [shlex.quote(requirement.strip()) for requirement, _, _ in own]
+    return [requirement.strip() for requirement, _, _ in own]

@@ -49,6 +49,11 @@ def test_what_is_advised_installs_the_libraries_and_asks_no_index_for_boxplus(mo
     assert line.endswith("-m pip install 'laspy>=2.5.4' 'lazrs>=0.6'") and line.startswith(sys.executable)
     monkeypatch.setattr(_extras, "has", lambda *names: False)
     assert _extras.installation("view") == f"uv pip install --python {sys.executable} 'rerun-sdk>=0.23'"
+    monkeypatch.setattr(_extras.sys, "executable", r"C:\my tools\python.exe")
+    monkeypatch.setattr(_extras.os, "name", "nt")  # whose shell knows no single quotes
+    line = _extras.installation("view")
+    monkeypatch.undo()
+    assert line == r'uv pip install --python "C:\my tools\python.exe" rerun-sdk>=0.23'
 
 
 def test_a_clone_that_was_not_installed_is_named_with_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:

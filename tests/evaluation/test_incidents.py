@@ -182,6 +182,28 @@ def test_stamps_of_whole_seconds_are_told_by_errors_along_the_way(seed: int, of:
     assert "multiples" not in " ".join(evaluate(*pair, max_difference_s=0.06).warnings)
 
 
+@pytest.mark.parametrize("seed", range(1, 8, 2))
+@pytest.mark.parametrize("clock", ["ten times a second", "whole seconds of a receiver"])
+def test_drift_along_a_straight_road_is_none_of_the_stamps(seed: int, clock: str) -> None:
+    """It errs along the way by as much as rounding might, pose after pose alike."""
+    rng, speed = np.random.default_rng(seed), 10.0
+    t = np.arange(0.0, 120.0, 0.1)
+    bend = 0.3 * np.sin(2.0 * np.pi * t / 50.0 + rng.uniform(0.0, 6.0))
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    road = np.column_stack([speed * t, 2.0 * np.sin(t / 40.0), np.zeros(len(t))])
+    drifted = road + np.column_stack([(1.0 if clock.startswith("ten") else 8.0) * bend, np.zeros((len(t), 2))])
+    stamps = 1_700_000_000_000_000_000 + np.round(1e9 * t).astype(np.int64)
+    between = Trajectory(stamps + 12_345_678, road + 0.012345678 * speed * np.array([1.0, 0.0, 0.0]), q)
+    if clock.startswith("ten"):
+        said = evaluate(Trajectory(stamps, drifted, q), between, method="interpolate", alignment="none").warnings
+    else:
+        keep = (np.arange(len(t)) % 10 == 0) & (np.arange(len(t)) != 500)  # one fix is missing
+        receiver = Trajectory(stamps, road, q).select(np.flatnonzero(keep))
+        odometry = replace(between, p=between.p + drifted - road)
+        said = evaluate(odometry, receiver, method="interpolate", alignment="none", max_gap_s=2.5).warnings
+    assert "lies along the way" not in " ".join(said)
+
+
 @pytest.mark.parametrize("method", ["nearest", "interpolate"])
 def test_keyframes_on_the_clock_of_the_ground_truth_have_no_rounded_stamps(method: str) -> None:
     truth, sound = (replace(one, p=10.0 * one.p) for one in (path(), path(1, 0.003)))
@@ -203,3 +225,6 @@ def test_stamps_that_jump_are_told_and_gaps_are_not() -> None:
     assert "the stamps of the estimate jump by 3600.1 s after pose 299 of 600" in said
     rows = np.flatnonzero((np.arange(600) < 200) | (np.arange(600) > 350))  # lost for a while
     assert "jump by" not in " ".join(evaluate(estimate.select(rows), truth).warnings)
+    parked = [replace(one, time_ns=late) for one in (estimate, truth)]  # two drives, hours apart, in both files
+    assert "jump by" not in " ".join(evaluate(*parked).warnings)
+    assert "the stamps of the ground truth jump by" in " ".join(evaluate(truth, replace(estimate, time_ns=late)).warnings)

@@ -321,3 +321,12 @@ def test_the_same_variable_twice_in_a_residual():
     problem.add_residuals(Prior(SE3, SE3.boxplus(SE3.identity(), np.full(6, 0.1))[None]), x[0])
     solution = problem.solve()
     np.testing.assert_allclose(SE3.boxminus(solution[x], SE3.identity()), 0.1, atol=1e-8)
+
+
+def test_a_group_without_residuals_says_nothing() -> None:
+    problem = Problem()
+    x = problem.add_variables(Euclidean(3), np.zeros((2, 3)), name="x")
+    problem.add_residuals(Prior(Euclidean(3), np.ones((2, 3)), sigma=1.0), x)
+    problem.add_residuals(Prior(Euclidean(3), np.zeros((0, 3)), sigma=1.0), x[[]])
+    solution = problem.solve()
+    assert np.allclose(solution.values[0], 1.0) and solution.covariance(x[0]) == pytest.approx(np.eye(3)[None])

@@ -101,8 +101,8 @@ class Group:
         self.set_loss(loss)
         self.left_out: NDArray[np.bool_] | None = None
         self._root: NDArray[np.float64] | None = None
-        self._chunk = residual.count if residual.count <= 2 * _CHUNK else _CHUNK
-        self._sums = np.zeros((-(-residual.count // self._chunk) if residual.count else 0, 4))
+        self._chunk = max(residual.count, 1) if residual.count <= 2 * _CHUNK else _CHUNK
+        self._sums = np.zeros((-(-residual.count // self._chunk), 4))
 
     def __getitem__(self, rows: ArrayLike | slice) -> ResidualRows:
         """Residuals by their rows, or by a mask (N,).

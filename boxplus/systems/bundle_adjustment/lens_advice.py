@@ -40,9 +40,13 @@ def lens_advice(given: Reconstruction, parts: Set[str], before: ColmapModel, aft
             return "correct the second line of the file"
         return "the second line of the file knows no distortion: take it out of the pixels, or write the scene as a COLMAP model"
     options = "--refine-intrinsics" + (" --refine-principal-point" if "cx, cy" in parts else "")
-    has = frozenset.intersection(*(_MODELS[model] for model in given.camera_models))
-    if lens <= has:
+    lacking = {model: sorted(lens - _MODELS[model]) for model in given.camera_models if not lens <= _MODELS[model]}
+    if not lacking:
         return options
+    if len(set(given.camera_models)) > 1:  # which of them needs it, the images tell once they may have it
+        told = " and ".join(f"{model}, which has no {' and no '.join(names)}" for model, names in sorted(lacking.items()))
+        return f"{options}, with richer camera models in place of {told}"
+    has = _MODELS[given.camera_models[0]]
     kept = set(has)  # what the camera model says already is not to get lost
     if all(params[0] == params[1] for params in before.camera_params):
         kept.discard("fx, fy")

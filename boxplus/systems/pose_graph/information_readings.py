@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import BoxplusError
 from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.problem import pose_graph_problem, residual_of
 
@@ -25,12 +26,16 @@ _STEPS = 20
 
 
 def information_doubt(
-    graph: PoseGraph, poses: NDArray[np.float64], held: NDArray[np.int64], options: SolverOptions
+    graph: PoseGraph,
+    poses: NDArray[np.float64],
+    held: NDArray[np.int64],
+    options: SolverOptions,
+    callback: Callback | None = None,
 ) -> str | None:
     """A sentence where the edges' information fits the errors at `poses` far better in another unit, or inverted.
 
     Args:
-        held: the poses that are held.
+        held: the poses that are held. callback: may stop the search for poses of another reading, which then is not told.
     """
     dof = graph.information.shape[1] * (len(graph.edges) - len(graph.ids) + len(held))
     as_read = _fits(graph, poses, dof) if dof >= _LEAST else None
@@ -40,11 +45,13 @@ def information_doubt(
         other = replace(graph, information=information)
         if not all(_LIKELY[0] < fit < _LIKELY[1] for fit in _fits(other, poses, dof)):
             continue
-        problem, _ = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
         try:
-            found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses])
+            problem, _ = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
+            found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=callback)
         except BoxplusError:
             continue
+        if found.status == "stopped" and found.limit != "steps":
+            return None
         fits = _fits(other, found.values[0], dof)
         if all(_AS_PROMISED[0] < fit < _AS_PROMISED[1] for fit in fits):
             return (

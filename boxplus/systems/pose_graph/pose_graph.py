@@ -250,7 +250,7 @@ def optimize_pose_graph(
             if reliability is not None:
                 found = suspicions(reliability, solution, poses, consecutive_edges(graph)[kept])
     if config.examine and verdict is None and loss is None and config.objective == "logarithm" and solution.status == "converged":
-        meant = information_doubt(graph, poses_end, held, options)
+        meant = information_doubt(graph, poses_end, held, options, callback)
         if meant is not None:
             reasons.append(meant)
     for one in found:

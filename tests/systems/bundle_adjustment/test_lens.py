@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
@@ -16,6 +17,7 @@ from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.lens import lens_of_start
+from boxplus.systems.bundle_adjustment.lens_advice import lens_advice
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.small_problems import in_camera
 from tests.systems.bundle_adjustment.scenes import FOCAL, note_of, perturbed, reconstruction, turning
@@ -153,3 +155,27 @@ def test_a_stop_during_the_second_look_at_the_lens_keeps_what_the_first_found():
     result = adjust_bundle(_distorted(1, -0.2), callback=stop)
     assert sum(looks) == 2 and "k1 = -0." in _told(result)
     assert any("stopped while the result was examined (another lens?)" in note for note in result.notes)
+
+
+def test_of_several_camera_models_only_those_that_lack_something_are_to_be_replaced():
+    """What the others say already stays."""
+    one = _of_another_lens()
+    params = {"OPENCV": np.array([500.0, 600.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0]), "PINHOLE": np.array([500.0, 600.0, 0.0, 0.0])}
+    params["RADIAL"] = np.array([500.0, 0.0, 0.0, 0.1, 0.0])
+
+    def of(*models: str) -> ColmapModel:
+        given = tuple(params[model] for model in models)
+        return replace(
+            one,
+            camera_ids=np.array([1, 2]),
+            camera_models=models,
+            camera_params=given,
+            camera_sizes=np.repeat(one.camera_sizes, 2, axis=0),
+        )
+
+    start = of("OPENCV", "PINHOLE")
+    assert lens_advice(start, {"k1"}, start, start) == (
+        "--refine-intrinsics, with richer camera models in place of PINHOLE, which has no k1"
+    )
+    start = of("OPENCV", "RADIAL")
+    assert lens_advice(start, {"k1", "cx, cy"}, start, start) == "--refine-intrinsics --refine-principal-point"
