@@ -21,6 +21,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
+from boxplus.systems.lidar_inertial_odometry.steady_bias import SteadyBias
 
 _KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything
@@ -73,6 +74,7 @@ class Consistency:
         self._unmatched = 0
         self._previous_start_ns: int | None = None
         self._first_biases: NDArray[np.float64] | None = None
+        self._steady = SteadyBias(config.gyro_bias_walk)
         self._told: set[str] = set()
 
     @property
@@ -124,6 +126,7 @@ class Consistency:
         warnings += self._innovate(frame, x_prior, cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
+        warnings += self._steadiness(frame.scan.end_ns, posterior)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -224,6 +227,18 @@ class Consistency:
             "T_imu_lidar is wrong, which biases take up as long as the platform turns steadily, or the sensor is bad"
         )
         if changed and self._innovation_text is None:
+            self._innovation_text = text
+        return [text]
+
+    def _steadiness(self, end_ns: int, posterior: Posterior) -> list[str]:
+        """Whether the gyroscope's bias is where it was known to be."""
+        if not posterior.valid or "steady" in self._told:
+            return []
+        variance = np.diagonal(posterior.cov)[T_BW : T_BW + 3]
+        text = self._steady.update(end_ns, posterior.x[BW : BW + 3], variance)
+        if text is None or not self._once("steady"):
+            return []
+        if self._innovation_text is None:
             self._innovation_text = text
         return [text]
 

@@ -1,0 +1,59 @@
+"""Whether the gyroscope's bias stays where it was known to be.
+
+What a filter knows of a constant shrinks: of the difference between two of its estimates b₀ and b₁ the covariance is P₀ − P₁, and
+what the constant walks in between. A bias that moves by many times as much was never known so well. So it is where a start took
+turns for a bias that the LiDAR alone did not see rightly, among trunks with few rings, say: the map of the first seconds is
+tilted then, and later scans only fit what lies there, surer of themselves from scan to scan.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_APART_S = 0.5  # between estimates that are kept, at first
+_MOST = 64  # of them; then every other one goes
+_SIGMAS = 5.0  # 2 at most in sound runs, simulated and real
+_LEAST = 0.003  # rad/s, of a change that is worth a word
+_ROUGHLY = 0.1  # of a standard deviation, by which it is itself not known
+
+
+class SteadyBias:
+    """Follows the bias of one run.
+
+    Args:
+        walk: of the bias [rad/s²/√Hz].
+    """
+
+    def __init__(self, walk: float) -> None:
+        self._walk, self._apart_s = walk, _APART_S
+        self._time_s, self._bias, self._variance = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+
+    def update(self, time_ns: int, bias: NDArray[np.float64], variance: NDArray[np.float64]) -> str | None:
+        """Take the estimate after a scan in; a sentence where it has left an earlier one.
+
+        Args:
+            bias: (3,) [rad/s]; variance: (3,) of it.
+        """
+        now = time_ns * 1e-9
+        since = (now - self._time_s)[:, None]
+        moved = np.abs(bias - self._bias)
+        allowed = np.sqrt(np.maximum(self._variance * (1.0 + _ROUGHLY**2) - variance, 0.0) + self._walk**2 * since)
+        off = np.where(moved > _LEAST, moved / np.maximum(allowed, 1e-12), 0.0)
+        if not len(off) or now - self._time_s[-1] >= self._apart_s:
+            self._keep(now, bias, variance)
+        if off.max(initial=0.0) < _SIGMAS:
+            return None
+        row, axis = np.unravel_index(np.argmax(off), off.shape)
+        return (
+            f"the gyroscope's bias about {'xyz'[axis]} has moved by {np.degrees(moved[row, axis]):.2f} deg/s within "
+            f"{since[row, 0]:.1f} s, by {off[row, axis]:.0f} standard deviations of what was known of it: the estimate was surer "
+            "than it was right, at its start above all; poses may be off, and the map tilted, by far more than their covariance says"
+        )
+
+    def _keep(self, now: float, bias: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+        if len(self._time_s) == _MOST:
+            self._time_s, self._bias, self._variance = self._time_s[::2], self._bias[::2], self._variance[::2]
+            self._apart_s *= 2.0
+        self._time_s = np.append(self._time_s, now)
+        self._bias, self._variance = np.vstack([self._bias, bias]), np.vstack([self._variance, variance])
