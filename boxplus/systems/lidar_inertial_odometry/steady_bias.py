@@ -48,7 +48,7 @@ class SteadyBias:
         return (
             f"the gyroscope's bias about {'xyz'[axis]} has moved by {np.degrees(moved[row, axis]):.2f} deg/s within "
             f"{since[row, 0]:.1f} s, by {off[row, axis]:.0f} standard deviations of what was known of it: the estimate was surer "
-            "than it was right, at its start above all; poses may be off, and the map tilted, by far more than their covariance says"
+            "than right, at its start above all; poses may be off, and the map tilted, by far more than their covariance says"
         )
 
     def _keep(self, now: float, bias: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
