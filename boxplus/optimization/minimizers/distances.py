@@ -152,9 +152,7 @@ class Distances:
         return float(_distance(covariance[None], part.u[None, number], _SEES_NOTHING if part.is_rows else 0.0)[0])
 
 
-def _part(
-    is_rows: bool, first: int, u: NDArray[np.float64], unknown: NDArray[np.float64], is_asked: NDArray[np.bool_]
-) -> _Part:
+def _part(is_rows: bool, first: int, u: NDArray[np.float64], unknown: NDArray[np.float64], is_asked: NDArray[np.bool_]) -> _Part:
     return _Part(is_rows, first, u, unknown, is_asked, np.zeros_like(unknown), np.zeros(len(u)), np.zeros(len(u), dtype=np.bool_))
 
 

@@ -25,7 +25,7 @@ from boxplus.optimization.minimizers.strategy import step_scale
 from boxplus.optimization.terms.variables import VariableRows
 from boxplus.sparse.cholesky import NotPositiveDefinite
 
-# Shares of diag(H): directions that nothing measures have no way to go. Each next one where rounding hides what the last one adds.
+# Shares of diag(H): directions that nothing measures have no way to go. The next one is for where rounding hides the last one.
 _DAMPING = (1e-8, 1e-6, 1e-4)
 _HELD = 1e-2  # share of diag(H), where variables are left out: depths of far points stay, and their directions follow
 _SHORTEST, _WINDOW = 2, 5  # steps, whose fall of the cost is compared with that of as many before
