@@ -4,7 +4,7 @@ With the columns A of a variable or of a row of a residual it is √(uᵀ (Aᵀ 
 that is most; C is the covariance of the variables. No covariance is computed for that: (H + D)⁻¹ Jᵀz of a normal z has the
 covariance (H + D)⁻¹ H (H + D)⁻¹, which is H⁻¹ where the damping D is far below H, and some of these show that of all variables at
 once, each but for the scatter of a χ² (Papandreou and Yuille, NIPS 2010). Where D is not, as along directions that nothing
-measures, samples hardly move: a variable's own curvature tells which of its directions these are, and has them count as not known.
+measures, samples hardly move: a variable's own curvature tells which of its directions these are; they count as unknown.
 
 Samples are drawn until few are left of which it is open on which side of one they lie, and those that seem farthest off are
 looked at exactly, with a solve for each of their degrees of freedom.

@@ -1,6 +1,6 @@
 """How far from its minimum a solve ended that a limit stopped, or that found no step down.
 
-Where the cost follows the model of Gauss-Newton, the next step δ tells: it falls by ½ gᵀH⁻¹g, and √(gᵀH⁻¹g) is the distance to the
+Where the cost follows the model of Gauss-Newton, the next step δ tells: it falls by ½ gᵀH⁻¹g, and √(gᵀH⁻¹g) is the way to the
 minimum in standard deviations of the variables, all together. Where it does not, as in a curved valley, δ is still as far as the
 model says the minimum is; steps that are damped until the cost follows them are short, and say nothing about what comes after.
 Where residuals are large the steps shrink by the same factor again and again, and are each a small part of the way: then the fall
