@@ -13,7 +13,7 @@ from boxplus._arguments import require
 from boxplus.errors import InputError
 from boxplus.optimization.covariance import Covariances
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
-from boxplus.optimization.minimizers.remainder import Remainder, find_remainder, leave_out, unconverged_sentence
+from boxplus.optimization.minimizers.remainder import Remainder, find_remainder, unconverged_sentence
 from boxplus.optimization.observability.null_space import find_null_space
 from boxplus.optimization.observability.singularity import describe_null_space
 from boxplus.optimization.terms.misfit import misfit_notes
@@ -93,7 +93,7 @@ class Solution:
     timing_s: dict[str, float]
     _problem: LeastSquares = field(repr=False)
     descent: int = 0
-    _remainder: tuple[Remainder | None] | None = field(init=False, repr=False, default=None)
+    _remainder: tuple[object, Remainder | None] | None = field(init=False, repr=False, default=None)
     _covariances: Covariances = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -215,10 +215,15 @@ class Solution:
         self._problem.start(self.values)
         return describe_null_space(self._problem, find_null_space(self._problem))
 
-    def remainder(self) -> Remainder | None:
+    def remainder(self, *, apart_from: VariableRows | None = None) -> Remainder | None:
         """How far from the minimum a limit, or steps that led no further down, left every variable and what the residuals see.
 
-        Costs a linearisation, a factorisation and some forty to a hundred and fifty solves with it, the first time.
+        Costs a linearisation, a factorisation (two with `apart_from`), and some fifty to two hundred solves with it; what was
+        asked last is kept.
+
+        Args:
+            apart_from: variables that are not asked, nor what residuals see of them. They stay where they are along what their
+                own residuals hardly measure, such as the depth of points far away: nothing else is to move for it.
 
         Returns:
             None where it converged, was stopped by the callback, or all variables together are within a standard deviation.
@@ -235,11 +240,14 @@ class Solution:
         """
         if self.limit is None and self.status != "stalled":
             return None
-        if self._remainder is None:
+        self._problem.require_current()
+        rows = None if apart_from is None else self._own(apart_from)
+        asked = None if rows is None else (rows.block.number, rows.ids.tobytes())
+        if self._remainder is None or self._remainder[0] != asked:
             self._problem.start(self.values)
-            found = find_remainder(self._problem, [step.cost for step in self.history[self.descent :]])
-            object.__setattr__(self, "_remainder", (found,))
-        return self._remainder[0] if self._remainder is not None else None
+            found = find_remainder(self._problem, [step.cost for step in self.history[self.descent :]], rows)
+            object.__setattr__(self, "_remainder", (asked, found))
+        return self._remainder[1] if self._remainder is not None else None
 
     def unconverged(
         self, advice: str = "allow more steps, or start elsewhere", *, apart_from: VariableRows | None = None
@@ -251,7 +259,7 @@ class Solution:
 
         Args:
             advice: what to do about it.
-            apart_from: variables that are not asked, nor what residuals see of them.
+            apart_from: see `remainder`.
 
         Raises:
             InputError: variables or residuals were removed since.
@@ -265,11 +273,9 @@ class Solution:
             >>> problem.solve().unconverged() is None
             True
         """
-        remainder = self.remainder()
+        remainder = self.remainder(apart_from=apart_from)
         if remainder is None:
             return None
-        if apart_from is not None:
-            remainder = leave_out(self._problem, remainder, self._own(apart_from))
         told = unconverged_sentence(self._problem, self.reason, self.cost, remainder)
         return None if told is None else f"{told}: {advice}"
 

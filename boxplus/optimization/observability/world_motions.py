@@ -27,7 +27,7 @@ DOF = 7
 """Numbers of a motion: rotation, translation, scale."""
 
 _STEP = 1e-6  # of the difference quotient for lines
-_POSE_KINDS = ("world_from_body", "body_from_world")
+POSE_KINDS = ("world_from_body", "body_from_world")
 
 Motions = NDArray[np.float64]
 Points = NDArray[np.float64]
@@ -36,9 +36,9 @@ Points = NDArray[np.float64]
 def kinds_of(manifold: Manifold) -> tuple[str, ...]:
     """What a variable on this manifold may stand for."""
     if manifold in POSES or manifold in (SE2, SO3, UnitQuaternion, UnitQuaternionLeft):
-        return _POSE_KINDS
+        return POSE_KINDS
     if isinstance(manifold, Product):
-        return tuple(dict.fromkeys(kind for part in manifold.components for kind in kinds_of(part) if kind in _POSE_KINDS)) or (
+        return tuple(dict.fromkeys(kind for part in manifold.components for kind in kinds_of(part) if kind in POSE_KINDS)) or (
             "constant",
         )
     if isinstance(manifold, Euclidean):
@@ -108,7 +108,7 @@ def displacements_of(manifold: Manifold, x: Points, tangents: Motions) -> tuple[
         if "point" not in kinds_of(manifold):
             return None
         return none, np.column_stack([tangents, none[:, manifold.n :]])
-    if kinds_of(manifold) != _POSE_KINDS:
+    if kinds_of(manifold) != POSE_KINDS:
         return None
     motion = np.zeros((len(x), 6))
     free = [2, 3, 4] if manifold == SE2 else list(range(min(manifold.dof, 6)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._words import counted, either
-from boxplus.optimization.minimizers.remainder import AWAY
+from boxplus.optimization.minimizers.distances import AWAY
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.bundle_adjustment.sightings import names_text
@@ -30,12 +30,14 @@ def unconverged_findings(
     remainder = solution.remainder()
     if remainder is None:
         return None, []
-    is_away = remainder.variables[points.number] > AWAY
     is_vague = np.zeros(len(points), dtype=np.bool_)
     is_vague[vague] = True
-    late, creeping = np.flatnonzero(is_away & ~is_vague), np.flatnonzero(is_away & is_vague)
+    creeping = np.flatnonzero((remainder.variables[points.number] > AWAY) & is_vague)
+    remainder = solution.remainder(apart_from=points[is_vague])
+    is_late = np.zeros(len(points), dtype=np.bool_) if remainder is None else remainder.variables[points.number] > AWAY
+    late = np.flatnonzero(is_late)
     few = len(late) <= _FEW * len(points)
-    doubt = solution.unconverged(apart_from=points[is_vague | is_away if few else is_vague])
+    doubt = solution.unconverged(apart_from=points[is_vague | is_late if few else is_vague])
     notes = []
     if len(creeping):
         notes.append(

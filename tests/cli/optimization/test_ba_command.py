@@ -158,8 +158,19 @@ def test_limits_are_told(tmp_path: Path) -> None:
     assert "stopped: iteration limit of 0 reached" in result.output
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8").split("<body>")[1]
     assert "not converged: iteration limit of 0 reached" in text
-    near = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "1", "--overwrite", "--no-report")
-    assert near.exit_code == 0 and "stopped: iteration limit of 1 reached" in near.output
+    near = call(tmp_path / "scene.txt", "-o", tmp_path / "out", "--max-iterations", "2", "--overwrite", "--no-report")
+    assert near.exit_code == 0 and "stopped: iteration limit of 2 reached" in near.output
+
+
+def test_a_limit_after_steps_that_led_down_but_not_to_the_end_is_doubted(tmp_path: Path) -> None:
+    write_bal(tmp_path / "scene.txt", bal_problem(off=4.0))
+    for steps, code in ((1, 3), (3, 0)):
+        limit = ("--max-iterations", str(steps), "--overwrite", "--no-report")
+        result = call(tmp_path / "scene.txt", "-o", tmp_path / "out", *limit)
+        assert result.exit_code == code and f"stopped: iteration limit of {steps} reached" in result.output
+        told = " ".join(result.output.split())
+        assert ("not to be trusted: no minimum was reached (iteration limit of 1 reached)" in told) == (code == 3)
+        assert ("standard deviations of its own away from there" in told) == (code == 3)
 
 
 @pytest.mark.parametrize(
