@@ -59,6 +59,19 @@ def _jumps_in_multipath(p: Floats, seconds: Floats) -> Floats:
     return p + (since >= 0.0)[:, None] * [4.0, 3.0, 0.0] + burst[:, None] * [-7.0, 10.0, 0.0]
 
 
+def _bursts(*levels: tuple[float, tuple[float, float, float]]) -> Callable[[Floats, Floats], Floats]:
+    """Multipath in the middle of the recording, one after the other: how long it lasts [s], and where it puts fixes."""
+
+    def spoil(p: Floats, seconds: Floats) -> Floats:
+        begin, moved = 0.5 * seconds[-1], p.copy()
+        for duration_s, metres in levels:
+            moved[(seconds >= begin) & (seconds < begin + duration_s)] += metres
+            begin += duration_s
+        return moved
+
+    return spoil
+
+
 def _stuck(begin: float, duration_s: float) -> Callable[[Floats, Floats], Floats]:
     """The same position from a share of the recording on, for a time."""
 
@@ -94,6 +107,13 @@ CASES = {
     "multipath": Case({"multipath": 3, "multipath_s": 6.0}, "map"),
     "much multipath": Case({"multipath": 10, "multipath_s": 10.0}, "said"),
     "small multipath": Case({"multipath": 3, "multipath_s": 6.0, "multipath_m": 4.0}, "map"),
+    "two bursts": Case({}, "map", spoil=_bursts((6.0, (-7.0, 4.0, 0.0)), (6.0, (-6.0, -2.0, 0.0)))),
+    "two longer bursts": Case({}, "map", spoil=_bursts((8.0, (-8.0, 1.0, 0.0)), (7.0, (-6.0, -2.0, 0.0)))),
+    "two long bursts": Case({}, "map", spoil=_bursts((10.0, (6.0, 8.0, 0.0)), (12.0, (-5.0, 6.0, 0.0)))),
+    "bursts with a pause": Case({}, "map", spoil=_bursts((5.0, (8.0, 0.0, 0.0)), (2.0, (0.0, 0.0, 0.0)), (8.0, (0.0, 8.0, 0.0)))),
+    "1 Hz, two bursts": Case({"rate_hz": 1.0}, "map", spoil=_bursts((6.0, (-7.0, 4.0, 0.0)), (6.0, (-6.0, -2.0, 0.0)))),
+    "a burst of 25 s": Case({}, "map", spoil=_bursts((25.0, (12.0, 0.0, 0.0)))),
+    "1 Hz, a burst of 25 s": Case({"rate_hz": 1.0}, "map", spoil=_bursts((25.0, (12.0, 0.0, 0.0)))),
     "tunnels": Case({"tunnels": 2}, "map"),
     "0.3 s late": Case({"delay_s": 0.3}, "said"),
     "18 s late": Case({"delay_s": 18.0}, "refusal"),

@@ -30,7 +30,8 @@ class Outcome(BaseModel):
         output: folder or file of the results.
         outcome: how it came out.
         exit_code: of a command that was given this alone; None where it was not begun.
-        error: why there is no result or no report, or why it could not be compared with the ground truth.
+        error: why there is no result or no report, why it did not take the place of an earlier one, or why it could not be
+            compared with the ground truth.
         evaluation: the comparison with the ground truth, as in `evaluation.json`.
         run: what `run.json` holds.
     """
@@ -54,6 +55,11 @@ class Outcome(BaseModel):
             self.outcome = "interrupted"
         else:
             self.outcome, self.exit_code = "finished", self.exit_code or 0
+
+    def hold_back(self, error: str) -> None:
+        """What came out is not to be trusted, and did not take the place of what was there."""
+        self.outcome, self.exit_code = "not to be trusted", EXIT_UNTRUSTED
+        self._also(error)
 
     def fall_short(self, run: BaseModel, error: str) -> None:
         """It came to an end without what was asked for."""

@@ -73,7 +73,7 @@ def run_command(
     --config and --set are settings of 'boxplus slam'. What is finished in the output folder is kept: the same command goes on
     with a fleet that was stopped. Needs pip install ray fsspec. Exit codes: 0 done, 1 the results could not be written,
     2 bad input, 3 not all of it is to be trusted (a recording failed or is not to be trusted itself, recordings contradict each
-    other, no two of them met), 130 interrupted.
+    other or are joined in doubt only, no two of them met), 130 interrupted.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal

@@ -115,19 +115,25 @@ def merge_command(
 ) -> None:
     """Join runs whose start poses nobody knows into one map, and say which of them did not meet.
 
-    Exit code 3: no two of the runs met, and there is no joint map; or something speaks against it (two places of a kind, a run
-    that is not to be trusted itself). Such a one replaces no earlier joint map.
+    Exit code 3: no two of the runs met, and there is no joint map; or something speaks against it (two places of a kind, another
+    scale, a run that is not to be trusted itself). Such a one replaces no earlier joint map.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.terminal import Terminal
     from boxplus.runs.sessions.config import MergeConfig
-    from boxplus.runs.sessions.merge_run import merge_runs
+    from boxplus.runs.sessions.merge_run import WorseMapError, merge_runs
     from boxplus.runs.settings_file import load_settings
 
     terminal = Terminal(quiet=quiet, as_json=as_json)
     with reported(_given(runs), output, as_json=as_json) as outcome:
         chosen = load_settings(MergeConfig, config, settings or ())
-        result = merge_runs(runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite, accept_doubts=accept_doubts)
+        try:
+            result = merge_runs(
+                runs, output, chosen, remove_dynamic=remove_dynamic, overwrite=overwrite, accept_doubts=accept_doubts
+            )
+        except WorseMapError as error:
+            outcome.hold_back(str(error))
+            return
         summary = result.summary
         _show(terminal, summary)
         met = bool(summary.joined)
@@ -135,7 +141,7 @@ def merge_command(
             terminal.say(f"{_counts(summary)} → {output}")
         else:
             terminal.doubt(f"no two of the runs met: there is no joint map; what was looked at is in {output / 'encounters.csv'}")
-        outcome.end(summary, untrusted=not met or bool(summary.doubts and not accept_doubts))
+        outcome.end(summary, untrusted=not met or bool(summary.unaccepted))
 
 
 @map_app.command("update", cls=Command)
@@ -149,7 +155,7 @@ def update_command(
     """Go on with a joint map: join further runs with it, in its frame and with its settings.
 
     Exit code 3: the map stays as it was, as none of the runs met it, one of its own would no longer fit, or something speaks
-    against a new run in it.
+    against a new run in it (see 'map merge'); or it went on, and has a doubt of before that nobody accepted.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.terminal import Terminal
@@ -159,16 +165,13 @@ def update_command(
     with reported(_given(runs), merged, as_json=as_json) as outcome:
         result = update_map(merged, runs, accept_doubts=accept_doubts)
         if result.merged is None:
-            for text in result.left_because:
-                terminal.say(text)
-            _show_doubts(terminal, result.doubts)
-            why = "--accept-doubts replaces it all the same" if result.doubts else "the map cannot go on with any of the runs"
-            terminal.doubt(f"{merged} stays as it was: {why}")
-            outcome.end(None, untrusted=True)
+            advice = "--accept-doubts replaces it all the same" if result.doubts else "the map cannot go on with any of the runs"
+            because = "\n".join(result.doubts or result.left_because)
+            outcome.hold_back(f"{merged} stays as it was: {advice}\n{because}")
             return
         _show(terminal, result.merged.summary)
         terminal.say(f"{_counts(result.merged.summary)} → {merged}")
-        outcome.end(result.merged.summary)
+        outcome.end(result.merged.summary, untrusted=bool(result.merged.summary.unaccepted))
 
 
 def _given(runs: list[Path]) -> str:

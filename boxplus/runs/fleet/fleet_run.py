@@ -22,6 +22,7 @@ from boxplus.runs.fleet.status import FleetStatus, RecordingStatus
 from boxplus.runs.fleet.store import MERGED, SharedFolder, Store, open_store
 from boxplus.runs.fleet.tasks import RunOutline, meet_runs, outline_run, run_of, run_recording
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
+from boxplus.runs.sessions.folder import claim_merge_folder
 from boxplus.runs.sessions.joined import merge_facts
 from boxplus.runs.sessions.merge_run import merge_runs
 from boxplus.runs.sessions.repeated import repeated
@@ -30,7 +31,7 @@ from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.storage.output_folder import SUMMARY
 from boxplus.systems.sessions.candidates import Looks, Pair
 from boxplus.systems.sessions.encounter import Meeting
-from boxplus.systems.sessions.sessions import SessionAlignment, place_sessions, worlds_of
+from boxplus.systems.sessions.sessions import IN_DOUBT, SessionAlignment, place_surely, worlds_of
 from boxplus.systems.slam.slam import Slam
 
 Report = Callable[[FleetStatus, RecordingStatus | None], None]
@@ -109,7 +110,7 @@ class _Fleet:
             self._note(stage="map", pairs_looked_at=len(meetings))
             sessions = [outline.session for outline in outlines.values()]
             if len(sessions) > 1:
-                alignment = place_sessions(sessions, meetings, self._merging.sessions)
+                alignment = place_surely(sessions, meetings, self._merging.sessions)
                 self._write_map(alignment, remove_dynamic)
                 self._note_alignment(meetings, alignment)
         elif self._store.read(f"{MERGED}/{SUMMARY}") is not None:
@@ -205,10 +206,8 @@ class _Fleet:
         names = [session.name for session in alignment.sessions]
         if remove_dynamic and isinstance(self._store, SharedFolder):
             folders = [self._store.path / run_of(name) for name in names]
-            merged = merge_runs(
-                folders, self._store.path / MERGED, self._merging,
-                remove_dynamic=True, overwrite=True, accept_doubts=True, align=lambda _: alignment,
-            )  # fmt: skip
+            with claim_merge_folder(self._store.path / MERGED, overwrite=True) as claimed:
+                merged = merge_runs(folders, claimed, self._merging, remove_dynamic=True, align=lambda _: alignment)
             self._note(map_points=merged.summary.map_points, warnings=merged.summary.warnings, map_doubts=merged.summary.doubts)
             return
         began, world = time.perf_counter(), alignment.worlds[0]
@@ -270,8 +269,11 @@ class _Fleet:
         """Who is where, and which pairs met by themselves but not in the light of the others."""
         names = [session.name for session in alignment.sessions]
         facts = {own.name: own for own in merge_facts(alignment, names, [None] * len(names)).sessions}
-        against = [
-            f"{names[after.query_session]} and {names[after.place_session]}: {after.refusal}"
+        lost = [
+            (
+                f"{names[after.query_session]} and {names[after.place_session]}: {after.refusal}",
+                after.refusal.startswith(IN_DOUBT),
+            )
             for before, after in zip(meetings, alignment.meetings, strict=True)
             if before.refusal is None and after.refusal is not None
         ]
@@ -279,4 +281,6 @@ class _Fleet:
             if (found := facts.get(own.name)) is not None:
                 known = {"joined": found.joined, "apart_because": found.apart_because}
                 self._rows[number] = own.model_copy(update=known)
-        self._note(contradictions=against, pairs_joined=sum(meeting.refusal is None for meeting in alignment.meetings))
+        against, in_doubt = ([text for text, is_in_doubt in lost if is_in_doubt == which] for which in (False, True))
+        joined = sum(meeting.refusal is None for meeting in alignment.meetings)
+        self._note(contradictions=against, pairs_in_doubt=in_doubt, pairs_joined=joined)

@@ -40,6 +40,9 @@ class FleetStatus(Part):
     contradictions: list[str] = Field(
         default=[], description="pairs that met by themselves, and that the others contradict: one of them is wrong"
     )
+    pairs_in_doubt: list[str] = Field(
+        default=[], description="pairs that met with a doubt, and that nothing else joins: they are not in one map"
+    )
     map_points: int = Field(0, description="in the joint map; 0 where there is none")
     warnings: list[str] = Field(default=[], description="of the joint map")
     map_doubts: list[str] = Field(default=[], description="why the joint map is not to be trusted")
@@ -62,6 +65,7 @@ class FleetStatus(Part):
         found += [f"{own.name} is left out of the joint map: {own.doubt}" for own in self.recordings if own.doubt is not None]
         found += [f"a pair could not be looked at: {text}" for text in self.pairs_failed]
         found += [f"the recordings contradict each other: {text}" for text in self.contradictions]
+        found += [f"left out of the joint map: {text}" for text in self.pairs_in_doubt]
         found += [f"the joint map is in doubt: {text}" for text in self.map_doubts]
         sound = [own for own in self.recordings if own.state == "finished" and own.doubt is None]
         if self.stage == "finished" and len(sound) > 1 and not self.joined:

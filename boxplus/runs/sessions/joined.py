@@ -16,13 +16,14 @@ from boxplus.runs.run_loop import versions
 from boxplus.runs.sessions.session_run import SessionRun
 from boxplus.runs.sessions.summary import MergeSummary, SessionFacts
 from boxplus.runs.slam.corrected import append_moved, turned_covariances
+from boxplus.systems.localization.map_lengths import OTHER_LENGTHS
 from boxplus.systems.sessions.sessions import SessionAlignment
 from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]
 
 _SCALE_SIGMAS = 3.5
-_LEAST_SCALE = 0.002  # of a length: LiDARs are no better than that
+_LEAST_SCALE = 0.002  # of a length: LiDARs are no better than that, and a map bent by less than `OTHER_LENGTHS` is of use
 
 
 def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequence[str | None]) -> MergeSummary:
@@ -58,6 +59,7 @@ def merge_facts(alignment: SessionAlignment, runs: Sequence[str], doubts: Sequen
         sessions.append(facts)
         if doubt is not None and row is None:
             warnings.append(_untrusted(session.name, doubt))
+    warnings += [text for text, is_small in _other_scales(alignment).values() if is_small]
     for other in alignment.worlds[1:]:
         if is_joined and len(other.members) > 1:
             them = " and ".join(alignment.sessions[k].name for k in other.members)
@@ -83,19 +85,30 @@ def doubts_of_joining(alignment: SessionAlignment, doubts: Sequence[str | None],
     if len(world.members) == 1:
         return []
     found = list[str]()
-    joins = alignment.doubtful_joins(held)
-    for number, (ratio, deviation) in zip(world.members, world.scale.tolist(), strict=True):
+    joins, scales = alignment.doubtful_joins(held), _other_scales(alignment)
+    for number in world.members:
         if number < held:
             continue
         name, doubt = alignment.sessions[number].name, doubts[number]
         if doubt is not None:
             found.append(_untrusted(name, doubt))
-        if abs(ratio - 1.0) > max(_SCALE_SIGMAS * deviation, _LEAST_SCALE):
-            found.append(
-                f"{name} has another scale: it fits the others best with its lengths times {ratio:.4f} (± {deviation:.4f}); the "
-                "ranges of one of the LiDARs are wrong, and the joint map is bent between them"
-            )
+        if number in scales and not scales[number][1]:
+            found.append(scales[number][0])
     return found + list(dict.fromkeys(text for texts in joins.values() for text in texts))
+
+
+def _other_scales(alignment: SessionAlignment) -> dict[int, tuple[str, bool]]:
+    """Sessions of the joint world with another scale than the others, in sentences, and whether it is too small for a doubt."""
+    world, found = alignment.worlds[0], dict[int, tuple[str, bool]]()
+    for number, (ratio, deviation) in zip(world.members, world.scale.tolist(), strict=True):
+        if abs(ratio - 1.0) > max(_SCALE_SIGMAS * deviation, _LEAST_SCALE):
+            name = alignment.sessions[number].name
+            text = (
+                f"{name} has another scale: it fits the others best with its lengths times {ratio:.4f} "
+                f"(± {deviation:.4f}); the ranges of one of the LiDARs are wrong, and the joint map is bent between them"
+            )
+            found[number] = text, abs(ratio - 1.0) <= OTHER_LENGTHS
+    return found
 
 
 def _untrusted(name: str, doubt: str) -> str:

@@ -36,6 +36,10 @@ Align = Callable[[Sequence[Session]], SessionAlignment]
 _THINNED = 2_000_000  # points collected before they are thinned
 
 
+class WorseMapError(InputError):
+    """A joint map that something speaks against was to replace an earlier one."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeResult:
     """What a merge leaves in memory: `summary` as in `run.json`, and `alignment` of all sessions."""
@@ -52,6 +56,7 @@ def merge_runs(
     remove_dynamic: bool = False,
     overwrite: bool = False,
     accept_doubts: bool = False,
+    accepted: Sequence[str] = (),
     progress: Callable[[Meeting], None] | None = None,
     align: Align | None = None,
 ) -> MergeResult:
@@ -60,17 +65,19 @@ def merge_runs(
     Args:
         folders: output folders of finished runs of 'boxplus slam', in order of time; the first that is joined gives the frame.
         output: created; docs/output_folder.md says what it holds. An earlier merge there stays whole until the new one is.
-            Or what `claim_merge_folder` yields.
+            Or what `claim_merge_folder` yields: whoever holds it has asked whether the new one may take its place.
         config: settings; each has a default.
         remove_dynamic: leave out of the map what rays of other stretches of way went through, and report what changed.
         overwrite: replace an earlier merge.
         accept_doubts: also where something speaks against the new joint map, or there is none.
+        accepted: doubts that were accepted before.
         progress: called with every pair of sessions.
         align: says where the sessions are; `align_sessions` over all pairs where it is left out.
 
     Raises:
-        InputError: fewer than two runs, one that is none, or two of one recording; a folder that holds something else; a new map
-            with a doubt in the place of an earlier one; OpenCV is not installed.
+        InputError: fewer than two runs, one that is none, or two of one recording; a folder that holds something else; OpenCV is
+            not installed.
+        WorseMapError: a new map with a doubt in the place of an earlier one.
         OutputError: the disk is full or the folder cannot be written; what was there before stays whole.
     """
     began = time.perf_counter()
@@ -84,11 +91,12 @@ def merge_runs(
     claimed = nullcontext(output) if isinstance(output, ClaimedMerge) else claim_merge_folder(output, overwrite=overwrite)
     with claimed as place:
         alignment = align(sessions) if align is not None else align_sessions(sessions, config.sessions, progress=progress)
-        if place.has_joint_map and not accept_doubts:
+        if place is not output and place.has_joint_map and not accept_doubts:
             _refuse_a_worse_map(place.path, alignment, [run.doubt for run in runs])
         with place.replaced() as own:
             summary = _write(own, runs, alignment, config, remove_dynamic)
             summary = summary.model_copy(update={"seconds": time.perf_counter() - began})
+            summary = summary.accept(summary.doubts if accept_doubts else accepted)
             summary.write(own.summary)
     return MergeResult(summary, alignment)
 
@@ -99,7 +107,7 @@ def _refuse_a_worse_map(path: Path, alignment: SessionAlignment, doubts: Sequenc
     if len(alignment.worlds[0].members) == 1:
         against = ["no two of the runs met"]
     if against:
-        raise InputError(
+        raise WorseMapError(
             f"a joint map that nothing speaks against, to replace the one in {path}", "; ".join(against),
             "choose another folder with --output and look at that map, or add --accept-doubts",
         )  # fmt: skip

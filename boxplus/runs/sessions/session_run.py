@@ -136,7 +136,7 @@ def _refuse_cut_trajectory(own: SlamFolder, end_ns: int) -> None:
     """It goes as far as the local maps do: of a shorter one half a session would be in the joint map's folder."""
     trajectory = read_trajectory(own.trajectory)
     if trajectory.warnings or trajectory.times[-1] < end_ns:
-        short = f"one that ends {(end_ns - int(trajectory.times[-1])) * 1e-9:.1f} s before"
+        short = f"one that ends {(end_ns - int(trajectory.times[-1])) * 1e-9:.1f} s before its last local map"
         raise InputError(
             f"the trajectory of a whole run in {own.trajectory}",
             "; ".join(trajectory.warnings) or f"{short}: it was cut",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
@@ -41,12 +42,24 @@ class MergeSummary(Part):
     changes: int | None = Field(None, description="places that changed between sessions; null where nobody looked")
     seconds: float = 0.0
     doubts: list[str] = Field(default=[], description="why the joint map is not to be trusted; none: nothing speaks against it")
+    accepted: list[str] = Field(default=[], description="of the doubts, those that somebody accepted")
     warnings: list[str] = Field(default=[])
 
     @property
     def joined(self) -> list[SessionFacts]:
         """The sessions in the joint map."""
         return [session for session in self.sessions if session.joined]
+
+    @property
+    def unaccepted(self) -> list[str]:
+        """The doubts that nobody accepted, by what stands before the colon: figures after it may be others after an update."""
+        accepted = {text.partition(": ")[0] for text in self.accepted}
+        return [text for text in self.doubts if text.partition(": ")[0] not in accepted]
+
+    def accept(self, doubts: Sequence[str]) -> MergeSummary:
+        """The same with those of its doubts accepted that are among these."""
+        open_ones = self.model_copy(update={"accepted": list(doubts)}).unaccepted
+        return self.model_copy(update={"accepted": [text for text in self.doubts if text not in open_ones]})
 
     def write(self, path: Path) -> None:
         """Replace the file in one step.

@@ -95,8 +95,9 @@ def _updated(
     if doubts and not accept_doubts:
         return UpdateResult(None, alignment, [], doubts)
     result = merge_runs(
-        paths, claimed, config, remove_dynamic=before.remove_dynamic, accept_doubts=True, align=lambda _: alignment
-    )
+        paths, claimed, config, remove_dynamic=before.remove_dynamic,
+        accept_doubts=accept_doubts, accepted=before.accepted, align=lambda _: alignment,
+    )  # fmt: skip
     return UpdateResult(result, alignment, [], doubts)
 
 

@@ -8,13 +8,14 @@ stays for τ, with the covariance
 Generalised least squares says by how much a step there lowers the cost, and by how much a burst does, of any duration, that
 begins or ends there. Either explains what the other does in part: of a datum that jumps, a burst explains little more than the
 step; of multipath, a third more and beyond. A datum that jumps while multipath lasts is both: the burst explains most, and beside
-it the step is still there.
+it the step is still there. So it is beside the first of two bursts in a row; but there another burst explains what is left by a
+third better than the step does.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,9 @@ from scipy.linalg import solve_triangular
 Floats = NDArray[np.float64]
 
 _REACH = 30.0  # s, on either side
-_LONGEST = 25.0  # s, of a burst: of a longer one hardly anything is seen beyond it
+_LONGEST = 25.0  # s, from the first to the last fix of a burst: of a longer one hardly anything is seen beyond it
+_SHORTEST = 1.0  # s
+_DISTINCT = 1e-3  # of a column, what the first burst has to leave of it
 _STAYS = 30.0  # s, of the noise that stays
 _LEAST = 20.0  # by which a step lowers the cost where there is one; two numbers, looked for all over a recording
 _BURST = 1.3  # times as much by a burst: then it is one
@@ -35,25 +38,31 @@ class Step:
 
     Attributes:
         gain: by which it lowers the cost. burst_gain: by which the best burst does that begins or ends there. beside: by which
-            the step does where that burst has been taken off.
+            the step does where that burst has been taken off. other: by which the best of all bursts does there; 0 where the
+            step is none beside the first.
         metres: length of the step. metres_beside: and beside that burst.
     """
 
     gain: float
     burst_gain: float
     beside: float
+    other: float
     metres: float
     metres_beside: float
 
     @property
     def is_burst(self) -> bool:
-        """Whether it comes and goes."""
-        return self.burst_gain > _BURST * self.gain and self.beside < _LEAST
+        """Whether it comes and goes, or another burst follows one that does."""
+        return self._comes_and_goes and not self.is_beside
 
     @property
     def is_beside(self) -> bool:
         """Whether it is there beside a burst, which explains most of it."""
-        return self.burst_gain > _BURST * self.gain and self.beside >= _LEAST
+        return self._comes_and_goes and self.beside >= _LEAST and self.other <= _BURST * self.beside
+
+    @property
+    def _comes_and_goes(self) -> bool:
+        return self.burst_gain > _BURST * self.gain
 
     @property
     def is_told(self) -> bool:
@@ -75,23 +84,54 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: float) -> Step:
     K = sigma**2 * np.exp(-np.abs(t[:, None] - t) / _STAYS) + max(white, 1e-3 * sigma) ** 2 * np.eye(len(t))
     L = np.linalg.cholesky(K)
 
-    # What the level and the slope leave of the errors and of every column: then each column alone says what it explains.
-    shapes = [t > 0.0, *((t > 0.0) & (t < end) for end in t[(t > 1.0) & (t < _LONGEST)])]
-    shapes += [(t < 0.0) & (t >= begin) for begin in t[(t < -1.0) & (t > -_LONGEST)]]
-    whole = np.column_stack([np.ones(len(t)), t, e, *shapes]).astype(np.float64)
-    whole = solve_triangular(L, whole, lower=True)
-    Q = np.linalg.qr(whole[:, :2])[0]
-    rest = whole[:, 2:] - Q @ (Q.T @ whole[:, 2:])
-    r, columns = rest[:, :2], rest[:, 2:]
-    energy = np.maximum((columns**2).sum(axis=0), 1e-12)
-    length = columns.T @ r / energy[:, None]
-    gain = (length**2).sum(axis=1) * energy
+    after, before = t[t > 0.0], t[t < 0.0]
+    ends = after[1:][(after[1:] > _SHORTEST) & (after[:-1] - after[0] <= _LONGEST)]
+    begins = before[(before < -_SHORTEST) & (before[-1] - before <= _LONGEST)]
+    shapes = [t > 0.0, *((t > 0.0) & (t < end) for end in ends), *((t < 0.0) & (t >= begin) for begin in begins)]
+    base = solve_triangular(L, np.column_stack([np.ones(len(t)), t]), lower=True)
+    Q = np.linalg.qr(base)[0]
+    r, columns = (_without(Q, solve_triangular(L, own, lower=True)) for own in (e, np.column_stack(shapes).astype(np.float64)))
+    gain, metres = _explained(columns, r)
     if len(gain) == 1:
-        metres = float(np.linalg.norm(length[0]))
-        return Step(float(gain[0]), 0.0, float(gain[0]), metres, metres)
+        return Step(float(gain[0]), 0.0, float(gain[0]), 0.0, float(metres[0]), float(metres[0]))
     best = 1 + int(np.argmax(gain[1:]))
-    burst = columns[:, best] / math.sqrt(energy[best])
-    own = columns[:, 0] - burst * (burst @ columns[:, 0])
-    left = own @ r / math.sqrt(max(float(own @ own), 1e-12))
-    beside = float(np.linalg.norm(left)) / math.sqrt(max(float(own @ own), 1e-12))
-    return Step(float(gain[0]), float(gain[best]), float(left @ left), float(np.linalg.norm(length[0])), beside)
+    burst = columns[:, [best]] / np.linalg.norm(columns[:, best])
+    left = _without(burst, r)
+    beside, metres_beside = _explained(_without(burst, columns[:, :1]), left)
+    step = Step(float(gain[0]), float(gain[best]), float(beside[0]), 0.0, float(metres[0]), float(metres_beside[0]))
+    if not step.is_beside:
+        return step
+    whitened = solve_triangular(L, (t[:, None] >= t[1:]).astype(np.float64), lower=True)
+    return replace(step, other=_best_of_all(t[1:], _without(Q, whitened), burst, left))
+
+
+def _best_of_all(edges: Floats, steps: Floats, burst: Floats, left: Floats) -> float:
+    """By how much the best burst of any begin and end lowers the cost of `left` (N, 2), where `burst` (N, 1) is off.
+
+    A burst is the difference of two of the steps (N, M), that at its begin and that at its end.
+    """
+    own = _without(burst, steps)
+    length = edges - edges[:, None]
+    energy, whole = _of_differences(own), _of_differences(steps)
+    is_one = (length > _SHORTEST) & (length <= _LONGEST) & (energy > _DISTINCT * whole)
+    along = own.T @ left
+    gain = ((along[:, None] - along) ** 2).sum(axis=-1)[is_one] / energy[is_one]
+    return float(gain.max(initial=0.0))
+
+
+def _of_differences(columns: Floats) -> Floats:
+    """(M, M) squared norms of the differences of columns (N, M)."""
+    G = columns.T @ columns
+    return np.diag(G)[:, None] + np.diag(G) - 2.0 * G
+
+
+def _without(Q: Floats, columns: Floats) -> Floats:
+    """What orthonormal columns leave of others: then each of these alone says what it explains."""
+    return columns - Q @ (Q.T @ columns)
+
+
+def _explained(columns: Floats, r: Floats) -> tuple[Floats, Floats]:
+    """By how much each of (N, M) lowers the cost of (N, 2), and the length of the step that it then is [m]."""
+    energy = np.maximum((columns**2).sum(axis=0), 1e-12)
+    length = np.linalg.norm(columns.T @ r, axis=1) / energy
+    return length**2 * energy, length

@@ -10,7 +10,7 @@ import math
 
 from boxplus.systems.slam.lengths import Lengths
 
-_SHARE = 0.006  # by which lengths have to differ: docs/localization.md says what sound maps come to
+OTHER_LENGTHS = 0.006  # share, by which lengths have to differ: docs/localization.md says what sound maps come to
 _SIGMAS = 3.5
 _FEWEST = 5  # scans
 _PLACE_M = 5.0  # m of way after which other surfaces are seen
@@ -45,7 +45,7 @@ class MapLengths:
     def doubt(self) -> str | None:
         """Why the map's lengths are not to be trusted; None where nothing speaks against them."""
         ratio, sigma = self.ratio
-        if self._count < _FEWEST or abs(ratio - 1.0) < max(_SHARE, _SIGMAS * sigma):
+        if self._count < _FEWEST or abs(ratio - 1.0) < max(OTHER_LENGTHS, _SIGMAS * sigma):
             return None
         return (
             f"lengths in the map are {ratio:.4f} times those that are seen (± {sigma:.4f}): one of the two is not in metres, or "

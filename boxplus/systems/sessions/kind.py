@@ -4,8 +4,7 @@ How well two of a kind do, the sessions tell themselves: shifted by a bay or tur
 other things in it. Let d be the mean distance of what stands in one of them from the planes of the other, each point counted with
 15 cm at most, and without a plane with that. At the right alignment most of what is in the racks lies where it did; at that of
 another aisle it fits no better than at the next bay. The lead is 1 − d/d', with the smallest d' of all other alignments; where
-nothing looks alike elsewhere d' is those 15 cm. Among trees that few noisy rays meet, points scatter by that much about planes of
-the same session already; how much they do, its successive local maps say.
+nothing looks alike elsewhere d' is those 15 cm.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.other_alignments import difference, is_same, laid_over, nearest_pairs, spread
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats
-from boxplus.systems.slam.registration import Surface, mean_distance, register
+from boxplus.systems.slam.registration import mean_distance, register
 from boxplus.systems.slam.structure import upright_where_seen
 
 _FAR = 0.15  # m, that a point is off a plane at most
 _PAIRS = 6  # of local maps, for one alignment
-_AS_ITSELF = 1.1  # of the distance between successive maps of one session, up to which two sessions fit as one does
 _FEWEST = 500  # points that stand, for an alignment to be compared
 
 
@@ -33,13 +31,10 @@ class Lead:
     Attributes:
         share: 1 − d/d'.
         over: where that other alignment is, in words; None where no other one looks alike.
-        is_scattered: no other one looks alike, and what stands lies as near to planes of the other session as within one: that it
-            lies hardly nearer than 15 cm says nothing against the two.
     """
 
     share: float
     over: str | None
-    is_scattered: bool = False
 
 
 def lead_of(place: Places, query: Places, T_place_query: Floats, others: list[Floats], config: SessionsConfig) -> Lead | None:
@@ -50,22 +45,7 @@ def lead_of(place: Places, query: Places, T_place_query: Floats, others: list[Fl
     rivals = [(d, other) for other in others if (d := _distance(place, query, other, T_place_query, config)) is not None]
     nearest, best = min(rivals, key=lambda rival: rival[0], default=(_FAR, None))
     share = 1.0 - here / max(nearest, 1e-9)
-    if best is not None:
-        return Lead(share, difference(query, T_place_query, best))
-    if share >= config.least_lead:
-        return Lead(share, None)
-    return Lead(share, None, here <= _AS_ITSELF * max(_within(place, config), _within(query, config)))
-
-
-def _within(places: Places, config: SessionsConfig) -> float:
-    """The same of successive local maps of one session [m]; zero where none tell."""
-    total, count, T = 0.0, 0, places.session.T_session_map
-    for a, b in spread([(k, k + 1) for k in range(len(places) - 1)], _PAIRS):
-        if not (len(places.session.maps[a].points) and len(places.session.maps[b].points)):
-            continue
-        distance, of = _both_ways(places.surface(a), places.surface(b), se3.compose(se3.inverse(T[b]), T[a]), config)
-        total, count = total + distance, count + of
-    return total / count if count >= _FEWEST else 0.0
+    return Lead(share, None if best is None else difference(query, T_place_query, best))
 
 
 def _distance(place: Places, query: Places, T_place_query: Floats, found: Floats | None, config: SessionsConfig) -> float | None:
@@ -87,17 +67,9 @@ def _distance(place: Places, query: Places, T_place_query: Floats, found: Floats
             first = laid_over(place, query, pair, found)
             if is_same(se3.log(se3.compose(se3.inverse(first), T)), config):
                 continue
-        distance, of = _both_ways(own, there, T, config)
-        total, count = total + distance, count + of
+        for a, b, T_b_a in ((own, there, T), (there, own, se3.inverse(T))):
+            stands = upright_where_seen(a, b, T_b_a, registration)
+            if len(stands):
+                total += len(stands) * mean_distance(stands, b, T_b_a, _FAR, registration)
+                count += len(stands)
     return total / count if count >= _FEWEST else None
-
-
-def _both_ways(own: Surface, there: Surface, T_there_own: Floats, config: SessionsConfig) -> tuple[float, int]:
-    """Sum of the distances of what stands in either map from planes of the other [m], and of how many points."""
-    total, count = 0.0, 0
-    for a, b, T_b_a in ((own, there, T_there_own), (there, own, se3.inverse(T_there_own))):
-        stands = upright_where_seen(a, b, T_b_a, config.slam.registration)
-        if len(stands):
-            total += len(stands) * mean_distance(stands, b, T_b_a, _FAR, config.slam.registration)
-            count += len(stands)
-    return total, count

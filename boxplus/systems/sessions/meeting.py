@@ -132,7 +132,7 @@ class _Meeting:
         if lead is None and others:
             why = "something else looks alike, and too little stands upright where they lie over each other to compare the two"
             return self._refused(why, predicted, confirmed, share)
-        if lead is not None and lead.share < asked and not lead.is_scattered:
+        if lead is not None and lead.share < asked:
             why = f"what stands lies {100.0 * lead.share:.0f} % nearer to surfaces of the other than {lead.over or 'anywhere'}"
             why = f"two places of a kind, perhaps: {why}, {100.0 * asked:.0f} % are asked for"
             return self._refused(why, predicted, confirmed, share)
@@ -141,11 +141,6 @@ class _Meeting:
             doubt = (
                 f"are at the same place or at two of a kind: what stands lies only {100.0 * lead.share:.0f} % nearer to surfaces "
                 f"of the other than {lead.over}"
-            )
-        if lead is not None and lead.is_scattered:
-            doubt = (
-                "are at the same place as far as points that scatter so much tell: what stands lies as near to surfaces of the "
-                "other as within one of them, and hardly nearer than where nothing is in common"
             )
         against = "contradicts the encounters that agree with each other"
         final = [

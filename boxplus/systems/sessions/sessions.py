@@ -27,6 +27,7 @@ from boxplus.systems.sessions.session import Session
 from boxplus.systems.slam.loop import Floats
 from boxplus.systems.slam.odometry_chain import mahalanobis
 
+IN_DOUBT = "joined in doubt only: "  # begins why `place_surely` keeps two sessions apart
 _START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -73,7 +74,7 @@ class SessionAlignment:
             if m.refusal is not None and session in (m.place_session, m.query_session)
         ]
 
-    def doubtful_joins(self, held: int = 1) -> dict[int, list[str]]:
+    def doubtful_joins(self, held: int) -> dict[int, list[str]]:
         """Sessions of the largest world that only meetings with a doubt join with the rest of it, and these in sentences.
 
         What sound meetings bear out, through whichever sessions, is no longer in doubt.
@@ -164,6 +165,25 @@ def place_sessions(sessions: Sequence[Session], meetings: Sequence[Meeting], con
             return SessionAlignment(tuple(sessions), worlds, decided)
         why = "most of its encounters contradict those with other sessions"
         decided = [_apart(meeting, why) if k in doubted else meeting for k, meeting in enumerate(decided)]
+
+
+def place_surely(sessions: Sequence[Session], meetings: Sequence[Meeting], config: SessionsConfig) -> SessionAlignment:
+    """As `place_sessions`, but sessions that only meetings with a doubt join with the rest of the largest world stay apart.
+
+    The refusal of such meetings begins with `IN_DOUBT`.
+    """
+    decided = list(meetings)
+    while True:
+        alignment = place_sessions(sessions, decided, config)
+        out = alignment.doubtful_joins(0).keys()
+        if not out:
+            return alignment
+        decided = [
+            _apart(m, f"{IN_DOUBT}the two {m.doubt}")
+            if m.refusal is None and m.doubt is not None and out & {m.place_session, m.query_session}
+            else m
+            for m in alignment.meetings
+        ]
 
 
 class _Anchors:

@@ -134,11 +134,14 @@ def test_recordings_that_met_are_joined_and_failed_ones_named(
     )
     with pytest.raises(InputError, match="a folder, to remove what was seen through – got memory"):
         run_fleet(recordings, OBJECTS, InProcess(), remove_dynamic=True)
-    # A join that only a meeting with a doubt bears out is said to be one.
+    # A join that only a meeting with a doubt bears out is none: nobody could be asked, and it is said to be left out.
     shutil.copytree(tmp_path / "a" / "runs", tmp_path / "d" / "runs")
     monkeypatch.setattr(fleet_run, "meet_runs", lambda *_: replace(meeting, doubt="are at two places of a kind, perhaps"))
     doubted = run_fleet(recordings, tmp_path / "d", InProcess(), None, merging)
-    assert "the joint map is in doubt: monday and friday are at two places of a kind, perhaps" in doubted.doubts
+    why = "monday and friday: joined in doubt only: the two are at two places of a kind, perhaps"
+    assert doubted.joined == [] and doubted.pairs_in_doubt == [why] and doubted.contradictions == []
+    assert f"left out of the joint map: {why}" in doubted.doubts
+    assert [own.apart_because for own in doubted.recordings if own.state == "finished"] == [[why], [why]]
     monkeypatch.setattr(fleet_run, "meet_runs", tasks.meet_runs)
     # A pair whose task is lost is said to be, and is not joined.
     lost = run_fleet(recordings, tmp_path / "b", Backwards(lost=0), None, merging)
@@ -150,7 +153,7 @@ def test_recordings_that_met_are_joined_and_failed_ones_named(
         refused = place_sessions(given[0], [Meeting(0, 1, [], refusal="lies 9 standard deviations away")], given[2])
         return refused
 
-    monkeypatch.setattr(fleet_run, "place_sessions", contradicted)
+    monkeypatch.setattr(fleet_run, "place_surely", contradicted)
     doubted = run_fleet(recordings, tmp_path / "b", InProcess(), None, merging)
     assert doubted.contradictions == ["monday and friday: lies 9 standard deviations away"]
     assert "the recordings contradict each other: monday and friday: lies 9 standard deviations away" in doubted.doubts

@@ -24,7 +24,7 @@ from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.joined import merge_facts
-from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
+from boxplus.runs.sessions.merge_run import MergeResult, WorseMapError, merge_runs
 from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.sessions.update_run import update_map
 from boxplus.runs.settings_file import load_settings
@@ -243,7 +243,8 @@ def test_a_trajectory_that_was_cut_is_refused(
     lines = (cut / "trajectory.csv").read_text().splitlines(keepends=True)
     text = "".join(lines[: len(lines) // 2])
     (cut / "trajectory.csv").write_text(text if at_line else text[:-20])
-    with pytest.raises(InputError, match=r"the trajectory of a whole run in .*trajectory.csv – got .*cut"):
+    said = r"one that ends \d+\.\d s before its last local map: it was cut" if at_line else "is incomplete"
+    with pytest.raises(InputError, match=rf"the trajectory of a whole run in .*trajectory\.csv – got [^–]*{said}"):
         update_map(merged[0], [cut])
 
 
@@ -279,11 +280,14 @@ def test_a_doubtful_join_ends_with_code_3_and_replaces_no_map_unasked(
     before = {path: path.stat().st_mtime_ns for path in old.rglob("*")}
     again = ["merge", *given, "-o", str(old), "--overwrite"]
     shown = CliRunner().invoke(map_app, again)
-    assert isinstance(shown.exception, InputError) and "--accept-doubts" in str(shown.exception) and DOUBT in str(shown.exception)
+    said = " ".join(shown.output.split())
+    assert shown.exit_code == 3 and "--accept-doubts" in said and DOUBT in said
+    told = json.loads(CliRunner().invoke(map_app, [*again, "--json"]).stdout)
+    assert (told["outcome"], told["exit_code"]) == ("not to be trusted", 3) and DOUBT in told["error"]
     assert {path: path.stat().st_mtime_ns for path in old.rglob("*")} == before
     alone = replace(found, worlds=[replace(found.worlds[0], members=(0,)), *found.worlds[1:]])
     monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: alone)
-    with pytest.raises(InputError, match=r"to replace the one in .* – got no two of the runs met – choose another folder"):
+    with pytest.raises(WorseMapError, match=r"to replace the one in .* – got no two of the runs met – choose another folder"):
         merge_runs(runs[0], old, overwrite=True)
     monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: found)
     shown = CliRunner().invoke(map_app, [*again, "--accept-doubts"])
@@ -313,12 +317,42 @@ def test_an_update_in_doubt_leaves_the_map_alone(
     assert shown.exit_code == 3 and "elsewhere and friday are at two places, perhaps" in said and DOUBT not in said
     assert "stays as it was: --accept-doubts" in said
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    told = json.loads(CliRunner().invoke(map_app, [*update, "--json"]).stdout)
+    assert (told["outcome"], told["exit_code"]) == ("not to be trusted", 3)
+    assert "elsewhere and friday are at two places, perhaps" in told["error"]
     taken = []
     monkeypatch.setattr("boxplus.runs.sessions.update_run.merge_runs", lambda *_, **given: taken.append(given) or result)
     assert CliRunner().invoke(map_app, [*update, "--accept-doubts"]).exit_code == 0 and len(taken) == 1
     one = replace(found, meetings=[replace(found.meetings[0], doubt="are at two places, perhaps"), met])
     monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: one)
     assert CliRunner().invoke(map_app, update).exit_code == 0 and len(taken) == 2
+
+
+def test_an_update_does_not_launder_a_doubt(
+    runs: tuple[list[Path], list[DriftingDrive]],
+    merged: tuple[Path, MergeResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A sound run is added to a map in doubt: once that ended with code 0, although nobody had accepted the doubt."""
+    two = doubted(merged[1].alignment)
+    joined = two.worlds[0]
+    only = replace(two, sessions=two.sessions[:2], worlds=[joined], meetings=two.meetings[:1])
+    maps = [*joined.T_world_map, two.sessions[2].T_session_map]
+    world = JointWorld((0, 1, 2), np.tile(joined.T_world_session[:1], (3, 1)), np.zeros((3, 6, 6)), maps, [],
+                       SOUND_SCALE)  # fmt: skip
+    sound = replace(merged[1].alignment.meetings[0], place_session=1, query_session=2)
+    three = replace(two, worlds=[world], meetings=[two.meetings[0], sound])
+    monkeypatch.setattr("boxplus.runs.sessions.merge_run.align_sessions", lambda *_, **__: only)
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", lambda *_, **__: three)
+    given = [str(path) for path in runs[0]]
+    for accepts, code in (([], 3), (["--accept-doubts"], 0)):
+        out = str(tmp_path / f"out{code}")
+        assert CliRunner().invoke(map_app, ["merge", *given[:2], "-o", out, *accepts]).exit_code == code
+        shown = CliRunner().invoke(map_app, ["update", out, given[2], "--json"])
+        told = json.loads(shown.stdout)
+        assert shown.exit_code == told["exit_code"] == code
+        assert len(told["run"]["doubts"]) == 1 and told["run"]["accepted"] == (told["run"]["doubts"] if accepts else [])
 
 
 @pytest.mark.slow

@@ -11,15 +11,15 @@ from boxplus.systems.georeference.step import step_at
 SECONDS = np.arange(100.0)
 
 
-def noise(seed: int, white: float = 0.5, slow: float = 0.5) -> NDArray[np.float64]:
-    """(100, 2) of a usual receiver [m]."""
+def noise(seed: int, white: float = 0.5, slow: float = 0.5, seconds: NDArray[np.float64] = SECONDS) -> NDArray[np.float64]:
+    """(N, 2) of a usual receiver [m]."""
     random = np.random.default_rng(seed)
-    keep, state = np.exp(-1.0 / 60.0), random.standard_normal(2)
+    keep, state = np.exp(-(seconds[1] - seconds[0]) / 60.0), random.standard_normal(2)
     stays = []
-    for _ in SECONDS:
+    for _ in seconds:
         stays.append(state)
         state = keep * state + np.sqrt(1.0 - keep**2) * random.standard_normal(2)
-    return slow * np.array(stays) + white * random.standard_normal((100, 2))
+    return slow * np.array(stays) + white * random.standard_normal((len(seconds), 2))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -58,3 +58,30 @@ def test_a_step_is_told_beside_a_burst_that_hides_it(seed: int) -> None:
         both, alone = (step_at(SECONDS, noise(seed) + errors, 40, 0.7) for errors in (jump + burst, burst))
         assert both.is_beside and not both.is_burst and both.metres_beside == pytest.approx(5.0, abs=2.0)
         assert alone.is_burst and not alone.is_beside
+
+
+BURSTS = {
+    "one after the other": [(6.0, (-7.0, 4.0)), (6.0, (-6.0, -2.0))],
+    "longer": [(8.0, (-8.0, 1.0)), (7.0, (-6.0, -2.0))],
+    "long": [(10.0, (6.0, 8.0)), (12.0, (-5.0, 6.0))],
+    "with a pause": [(5.0, (8.0, 0.0)), (2.0, (0.0, 0.0)), (8.0, (0.0, 8.0))],
+    "one as long as any": [(25.0, (12.0, 0.0))],
+}
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+@pytest.mark.parametrize("bursts", BURSTS.values(), ids=BURSTS)
+def test_bursts_in_a_row_are_no_step(bursts: list[tuple[float, tuple[float, float]]], rate: float) -> None:
+    """Beside the first of them the second once was a datum that jumps, as only one was taken off."""
+    seconds = np.arange(0.0, 140.0, 1.0 / rate)
+    for seed in range(3):
+        errors, begin = noise(seed, seconds=seconds), 50.13 + 0.31 * seed
+        edges = [begin]
+        for duration, metres in bursts:
+            errors[(seconds >= begin) & (seconds < begin + duration)] += metres
+            begin += duration
+            edges.append(begin)
+        for at in np.searchsorted(seconds, edges).tolist():
+            step = step_at(seconds, errors, at, 0.7)
+            assert not step.is_beside, (seed, at)
+        assert step.is_burst and not step.is_told

@@ -19,7 +19,7 @@ from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import join
 from boxplus.systems.sessions.session import OwnLoop, Session
-from boxplus.systems.sessions.sessions import JointWorld, SessionAlignment, align_sessions, place_sessions
+from boxplus.systems.sessions.sessions import IN_DOUBT, JointWorld, SessionAlignment, align_sessions, place_sessions, place_surely
 from tests.systems.sessions.sessions import drawn, measured
 
 GRAVITY = 0.005
@@ -160,6 +160,22 @@ def test_a_meeting_that_contradicts_others_is_refused() -> None:
     np.testing.assert_allclose(alignment.worlds[0].T_world_session[2], turned(0.0, 10.0, 0.0), atol=1e-6)
 
 
+def test_where_nobody_can_be_asked_what_only_a_doubt_joins_stays_apart() -> None:
+    """And what met it soundly goes along; a doubt between two that sound meetings join through others costs nothing."""
+    T = [A] * 5
+    sessions = [drawn(name, poses) for name, poses in zip("abcde", T, strict=True)]
+    doubt = "are at two places of a kind, perhaps"
+    step = turned(0.0, 5.0, 0.0)
+    found = [meeting(k, k + 1, step, T) for k in range(4)] + [meeting(0, 2, turned(0.0, 10.0, 0.0), T)]
+    found[2], found[4] = replace(found[2], doubt=doubt), replace(found[4], doubt=doubt)
+    assert [world.members for world in place_sessions(sessions, found, SessionsConfig()).worlds] == [(0, 1, 2, 3, 4)]
+    alignment = place_surely(sessions, found, SessionsConfig())
+    assert [world.members for world in alignment.worlds] == [(0, 1, 2), (3, 4)]
+    assert alignment.why_apart(3) == [f"d and c: {IN_DOUBT}the two {doubt}"]
+    assert [m.refusal is None for m in alignment.meetings] == [True, True, False, True, True]
+    assert alignment.doubtful_joins(0) == {}
+
+
 def test_what_makes_no_session_is_refused() -> None:
     a = drawn("a", A)
     with pytest.raises(InputError, match="local maps 0, 1, … of session b"):
@@ -174,7 +190,7 @@ def test_what_makes_no_session_is_refused() -> None:
         align_sessions([a])
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.994, 1.006])
+@pytest.mark.parametrize("scale", [1.0, 0.99, 0.9945, 1.0055, 1.01])
 def test_a_session_of_another_scale_is_named(scale: float) -> None:
     """Encounters are where both sessions truly are; the steps of one are too long, as its LiDAR's ranges are."""
     T = lane(10, 0.1)
@@ -188,6 +204,7 @@ def test_a_session_of_another_scale_is_named(scale: float) -> None:
     assert graph.is_kept.all() and fits == pytest.approx(1.0 / scale, abs=2e-4) and 1e-4 < sigma < 5e-3
     np.testing.assert_array_equal(graph.scale[0], [1.0, 0.0])
     world = JointWorld((0, 1), graph.T_world_session, graph.covariance, graph.T_world_map, encounters, graph.scale)
-    doubts = merge_facts(SessionAlignment(sessions, [world], []), ["a", "b"], [None, None]).doubts
-    assert len(doubts) == (scale != 1.0)
-    assert all("b has another scale" in text and f"times {fits:.4f}" in text for text in doubts)
+    summary = merge_facts(SessionAlignment(sessions, [world], []), ["a", "b"], [None, None])
+    assert len(summary.doubts) == (abs(scale - 1.0) > 0.006) and len(summary.warnings) == (0.0 < abs(scale - 1.0) < 0.006)
+    told = [*summary.doubts, *summary.warnings]
+    assert all("b has another scale" in text and f"times {fits:.4f}" in text for text in told)

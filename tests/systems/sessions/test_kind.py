@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
-from boxplus.systems.sessions.kind import lead_of
+from boxplus.systems.sessions.kind import Lead, lead_of
 from tests.systems.sessions.test_other_alignments import CONFIG, HERE, session, wall
 
 BAY = 2.8
@@ -66,9 +66,9 @@ def test_what_stands_too_little_is_not_compared() -> None:
     assert lead_of(session("a", ground, 1), session("b", ground, 2), HERE, [NEXT_BAY], CONFIG) is None
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.2])
-def test_points_that_scatter_as_much_within_a_session_say_nothing_against_two(noise: float) -> None:
-    """Once two drives through one forest were two places of a kind, as a LiDAR of few noisy rings finds no trunk where it was."""
-    same = lead_of(session("a", aisle(1), 1, noise), session("b", aisle(1), 2, noise), HERE, [], CONFIG)
-    assert same is not None
-    assert (same.share < CONFIG.least_lead) == same.is_scattered == (noise > 0.1)
+@pytest.mark.parametrize("noise", [0.15, 0.2])
+@pytest.mark.parametrize("other", [11, 12])
+def test_where_points_scatter_another_aisle_is_not_joined(noise: float, other: int) -> None:
+    """Both fit as well as the local maps of one session do, to 1.03 times: once either was joined. Nothing tells, so none is."""
+    found = lead_of(session("a", aisle(1), 1, noise), session("b", aisle(other), 2, noise), HERE, [], CONFIG)
+    assert found is not None and found.share < CONFIG.least_lead and found == Lead(found.share, None)
