@@ -77,6 +77,15 @@ def earlier_folder(path: str | Path) -> Path:
     return target.with_name(target.name + EARLIER_SUFFIX)
 
 
+def advice_to_put_back(*folders: Path) -> str:
+    """What to do about the first of these folders that is missing where an earlier one was left beside it; empty: none is."""
+    for folder in folders:
+        earlier = earlier_folder(folder)
+        if not folder.exists() and earlier.is_dir():
+            return f"rename {earlier}, in which the one that was there is whole, to {folder.name}"
+    return ""
+
+
 def put_back(path: str | Path) -> None:
     """Put back the folder that a process left beside `path` which was killed between the two renames of `replaced_folder`.
 

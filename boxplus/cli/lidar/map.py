@@ -11,7 +11,8 @@ from boxplus.cli.help import Command
 from boxplus.cli.lidar.map_grid import grid, height
 from boxplus.cli.options import RESULTS, ConfigOption, JsonOption, OverwriteOption, QuietOption, SettingsOption
 from boxplus.errors import InputError
-from boxplus.formats.output import earlier_folder
+from boxplus.formats.output import advice_to_put_back
+from boxplus.maps.tiles.layout import MANIFEST
 
 if TYPE_CHECKING:
     from boxplus.cli.terminal import Terminal
@@ -37,12 +38,9 @@ _AcceptDoubts = Annotated[
 
 def _tiles(folder: Path) -> Path:
     """The map folder: the one given, or the one inside the output folder of a run."""
-    if not folder.exists() and earlier_folder(folder).is_dir():
-        raise InputError(
-            "a map folder", f"nothing at {folder}, and the map that was there whole in {earlier_folder(folder)}",
-            "'boxplus map update' puts it back, or rename it",
-        )  # fmt: skip
     inner = folder / "map"
+    if not (folder / MANIFEST).is_file() and (advice := advice_to_put_back(folder, folder.absolute().parent, inner)):
+        raise InputError("a map folder", f"no map in {folder}: a process was killed as it replaced one", advice)
     return inner if (folder / "run.json").is_file() and inner.is_dir() else folder
 
 

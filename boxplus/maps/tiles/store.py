@@ -54,12 +54,14 @@ class TileStore:
         manifest: its settings; `manifest.closed` says whether the run that wrote it came to its regular end.
         counts: points per tile, before thinning across segments.
         report: one sentence for everything that is torn, incomplete or was recovered; empty for a whole map.
+        damage: those of them on points that are lost or left out.
     """
 
     folder: Path
     manifest: Manifest
     counts: dict[TileIndex, int]
     report: tuple[str, ...]
+    damage: tuple[str, ...]
     _segments: dict[TileIndex, list[Path]]
     _unsorted: dict[TileIndex, list[NDArray[np.float32]]]
 
@@ -72,7 +74,7 @@ class TileStore:
         """
         base = Path(folder)
         manifest = read_manifest(base)
-        report: list[str] = []
+        report, damage = list[str](), list[str]()
         if not manifest.closed:
             report.append("the run that wrote this map did not close it: it was interrupted, or is still going on")
         segments: dict[TileIndex, list[Path]] = {}
@@ -83,7 +85,7 @@ class TileStore:
                 try:
                     count = ply_vertex_count(path)
                 except InputError as error:
-                    report.append(f"a segment is damaged and left out: {error}")
+                    damage.append(f"a segment is damaged and left out: {error}")
                     continue
                 written.add((index, generation))
                 segments.setdefault(index, []).append(path)
@@ -95,7 +97,7 @@ class TileStore:
         for generation, path in list_journals(base).items():
             records, cut = read_journal(path)
             if len(records) and manifest.intensity is not None and manifest.intensity != (records.shape[1] == 4):
-                report.append(f"{path.name} has points {'without' if manifest.intensity else 'with'} intensities and is left out")
+                damage.append(f"{path.name} has points {'without' if manifest.intensity else 'with'} intensities and is left out")
                 continue
             taken = 0
             for index, rows in split_by_tile(records, manifest.tile_size_m):
@@ -103,11 +105,11 @@ class TileStore:
                     unsorted.setdefault(index, []).append(rows)
                     counts[index] = counts.get(index, 0) + len(rows)
                     taken += len(rows)
-            report.append(
-                f"{taken} points were read from {path.name}, not yet sorted into tiles"
-                + ("; its last block was cut and is lost" if cut else "")
-            )
-        return cls(base, manifest, dict(sorted(counts.items())), tuple(report), segments, unsorted)
+            report.append(f"{taken} points were read from {path.name}, not yet sorted into tiles")
+            if cut:
+                damage.append(f"{path.name}: its last block was cut and is lost")
+        whole = (*report, *damage)
+        return cls(base, manifest, dict(sorted(counts.items())), whole, tuple(damage), segments, unsorted)
 
     @property
     def point_count(self) -> int:

@@ -157,6 +157,7 @@ def _summary(
 ) -> LocalizationSummary:
     search = beside.localizer.last_search
     warnings = [printable(f"the map is damaged: {text}") for text in saved.damage]
+    warnings += [printable(f"the map is not to be trusted, as the run that wrote it says: {text}") for text in saved.doubts]
     texts: list[str] = []
     if beside.T_map_world is None:
         # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
@@ -174,7 +175,7 @@ def _summary(
         recording=printable(str(recording.info.path.resolve())),
         map=printable(str(saved.path.resolve())),
         map_kind=saved.kind,
-        map_report=[printable(text) for text in [*saved.report, *saved.damage]],
+        map_report=[printable(text) for text in saved.report],
         map_origin=saved.origin.tolist(),
         places=len(saved.local_maps),
         contradiction=odometry.contradiction,

@@ -23,7 +23,7 @@ class LocalizationSummary(Part):
     recording: str = Field(description="path of the recording")
     map: str = Field(description="path of the map")
     map_kind: str = Field(description="what wrote it")
-    map_report: list[str] = Field(default=[], description="what of it is torn, left out or was computed")
+    map_report: list[str] = Field(default=[], description="what it was opened as, what of it was recovered or computed")
     map_origin: list[float] = Field(
         default=[0.0, 0.0, 0.0],
         description="what positions in the map are counted from, in the coordinates of a LAS or LAZ file [m]",

@@ -12,7 +12,7 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
 from boxplus.formats.clouds.las import read_survey
-from boxplus.formats.output import earlier_folder
+from boxplus.formats.output import advice_to_put_back
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
@@ -22,7 +22,7 @@ from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
-from boxplus.runs.storage.output_folder import SUMMARY, program_of
+from boxplus.runs.storage.output_folder import doubts_of, program_of
 
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file
@@ -44,6 +44,7 @@ class SavedMap:
             a LAS or LAZ file has coordinates of the Earth.
         report: sentences on what it was opened as, and what had to be computed.
         damage: on what is torn and left out, as it was found so far: a tile may turn out damaged when it is read.
+        doubts: why the run that wrote it says it is not to be trusted.
     """
 
     path: Path
@@ -55,6 +56,7 @@ class SavedMap:
     _points: TiledPoints
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     damage: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     def points_near(self, centre: ArrayLike, radius: float) -> NDArray[np.float32]:
         """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
@@ -79,18 +81,17 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     config = as_settings(LocalMapConfig, config)
     base = Path(path)
     if not base.exists():
-        earlier = earlier_folder(base)
-        whole = f"; the map that was there is whole in {earlier}: 'boxplus map update' puts it back, or rename it"
-        raise InputError(_WHAT, f"nothing at {base}", "check the path" + (whole if earlier.is_dir() else ""))
-    report, damage = list[str](), list[str]()
+        advice = advice_to_put_back(base, base.absolute().parent) or "check the path"
+        raise InputError(_WHAT, f"nothing at {base}", advice)
+    report, damage, doubts = list[str](), list[str](), list[str]()
     kind, trajectory, origin = "point cloud", None, np.zeros(3)
     if base.is_file():
         points, origin = _of_file(base, config.voxel)
         if origin.any():
             report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
-        tiles, kind, trajectory = _what_is_in(base, report, damage)
-        points = _of_tiles(tiles, config.voxel, damage)
+        tiles, kind, trajectory = _what_is_in(base, report, doubts)
+        points = _of_tiles(tiles, config.voxel, report, damage)
     if not points.tiles:
         raise InputError("a map with points", f"none in {base}", "; ".join(damage) or "give the map of a run that went through")
     if trajectory is not None:
@@ -104,47 +105,58 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         )
     if not local_maps:
         raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
-    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage)
+    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage, doubts)
 
 
-def _what_is_in(base: Path, report: list[str], damage: list[str]) -> tuple[Path, str, Trajectory | None]:
+def _what_is_in(base: Path, report: list[str], doubts: list[str]) -> tuple[Path, str, Trajectory | None]:
     """The folder with the tiles, what wrote it, and the trajectory they were made on."""
-    if (base / MANIFEST).is_file():
-        run = base.parent
-        if (run / SUMMARY).is_file() and RunFolder(run).tiles == base and RunFolder(run).trajectory.is_file():
-            report.append(f"the map belongs to the run in {run}, whose trajectory is used")
-            return base, program_of(run / SUMMARY) or "map folder", _trajectory(run, damage)
+    is_bare = (base / MANIFEST).is_file()
+    run = base.parent if is_bare else base
+    folder = RunFolder(run)
+    if not is_bare and not (folder.tiles / MANIFEST).is_file():
+        advice = advice_to_put_back(folder.tiles) or "run without --no-map"
+        raise InputError(_WHAT, f"a folder without map tiles, {base}", advice)
+    program = program_of(folder.summary) if folder.summary.is_file() else None
+    has_trajectory = folder.trajectory.is_file()
+    if is_bare and (not folder.summary.is_file() or folder.tiles != base):
         return base, "map folder", None
-    folder = RunFolder(base)
-    if not (folder.tiles / MANIFEST).is_file():
-        raise InputError(_WHAT, f"a folder without map tiles, {base}", "run without --no-map")
-    kind = (program_of(base / SUMMARY) if (base / SUMMARY).is_file() else None) or "map folder"
-    return folder.tiles, kind, _trajectory(base, damage) if folder.trajectory.is_file() else None
+    if program is not None:
+        doubts.extend(doubts_of(folder.summary))
+    if is_bare and has_trajectory:
+        report.append(f"the map belongs to the run in {run}, whose trajectory is used")
+    kind = "map folder" if is_bare and not has_trajectory else program or "map folder"
+    return folder.tiles, kind, _trajectory(run, report) if has_trajectory else None
 
 
-def _trajectory(run: Path, damage: list[str]) -> Trajectory:
+def _trajectory(run: Path, report: list[str]) -> Trajectory:
     trajectory = read_trajectory(RunFolder(run).trajectory)
-    damage.extend(trajectory.warnings)
+    report.extend(trajectory.warnings)
     trajectory.times  # noqa: B018 - refuses one without times
     return trajectory
 
 
-def _of_tiles(folder: Path, voxel: float, damage: list[str]) -> TiledPoints:
+def _of_tiles(folder: Path, voxel: float, report: list[str], damage: list[str]) -> TiledPoints:
     store = TileStore.open(folder)
-    damage.extend(store.report)
+    damage.extend(store.damage)
+    report.extend(text for text in store.report if text not in store.damage)
+
+    def note(text: str) -> None:
+        if text not in damage:  # a tile that was let go of is read again
+            damage.append(text)
 
     size = store.manifest.tile_size_m
 
     def read(index: TileIndex) -> NDArray[np.float32]:
         torn: list[str] = []
         points = store.read_tile(index, damaged=torn).points
-        damage.extend(f"a tile is damaged, and what could not be read is left out: {text}" for text in torn)
+        for text in torn:
+            note(f"a tile is damaged, and what could not be read is left out: {text}")
         # Overwritten bytes read as numbers too; those of a tile lie in it.
         low = np.array(index) * size
         inside = ((points >= low - _ROUNDING) & (points <= low + size + _ROUNDING)).all(axis=1)
         if not inside.all():
             name = tile_folder(folder, index).name
-            damage.append(f"tile {name} is damaged: {np.count_nonzero(~inside)} of its points lie outside of it and are left out")
+            note(f"tile {name} is damaged: {np.count_nonzero(~inside)} of its points lie outside of it and are left out")
             points = points[inside]
         return np.ascontiguousarray(points[first_per_voxel(points, voxel)])
 

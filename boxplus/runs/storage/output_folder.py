@@ -105,6 +105,18 @@ def _has_to_be_cleared(
     return True
 
 
+def doubts_of(summary: Path) -> list[str]:
+    """Why a run is not to be trusted, as its summary says; none where nothing speaks against it, or it cannot be read."""
+    try:
+        found = json.loads(summary.read_bytes())
+    except ValueError:
+        return []
+    if not isinstance(found, dict):
+        return []
+    doubts, contradiction = found.get("doubts"), found.get("contradiction")
+    return [*map(str, doubts if isinstance(doubts, list) else []), *([str(contradiction)] if contradiction else [])]
+
+
 def program_of(summary: Path) -> str | None:
     """Who wrote a summary; None where it cannot be read."""
     try:

@@ -107,7 +107,6 @@ class Localizer:
         self.losses = 0
         self.stays = Stays()
         self.lengths = MapLengths()
-        self._way = 0.0  # since lengths were seen
         self._map = place_map
         self._images = PlaceImages(place_map.local_maps)
         self._tracker: Tracker | None = None
@@ -158,7 +157,7 @@ class Localizer:
             self.stays.jump()
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
-        self._way += float(np.linalg.norm(step[4:]))
+        self.lengths.walk(float(np.linalg.norm(step[4:])))
         up = as_floats(up_odo, "up_odo")
         if self._tracker is None:
             return self._search(int(time_ns), T_odo, points[:0] if lost else points, up)
@@ -246,11 +245,11 @@ class Localizer:
         self._is_odometry_lost |= lost
         if not lost and len(points) and (time_ns - self._tried_ns) * 1e-9 >= config.track_interval:
             self._tried_ns = time_ns
-            matched = tracker.correct(points, _level(T_odo, up))
+            is_due = self.lengths.is_due
+            matched = tracker.correct(points, _level(T_odo, up), with_lengths=is_due)
             self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
-            if matched.lengths is not None:
-                self.lengths.see(matched.lengths, self._way)
-                self._way = 0.0
+            if is_due and matched.measured:
+                self.lengths.see(matched.lengths)
             # One that fails ends it at once: a sensor that was carried away is not where the odometry has it.
             self._held_ns = time_ns if matched.measured else _NEVER
             # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.
@@ -318,6 +317,7 @@ class Localizer:
     def _begin_search(self) -> None:
         config = self.config
         self._tracker = None
+        self.lengths.begin()
         self._promising = self._leading = None
         self._leads = []
         self._earlier = []

@@ -46,7 +46,7 @@ class Matched:
         innovation: distance of the registration from the prediction, and its limit, in standard deviations; NaN where there was
             none.
         measured: how many directions it determined; 0 where it was not taken.
-        lengths: the map's against those of the scan; None where it was not taken, or tells nothing of them.
+        lengths: the map's against those of the scan; None where it was not asked for or not taken, or tells nothing of them.
     """
 
     share: float
@@ -87,11 +87,12 @@ class Tracker:
         self.T_map_body = se3.compose(self.T_map_body, step)
         self.covariance = Ad @ self.covariance @ Ad.T + np.diag(np.repeat([rotation, position], 3))
 
-    def correct(self, p_body: Points, R_level_body: Floats) -> Matched:
+    def correct(self, p_body: Points, R_level_body: Floats, *, with_lengths: bool = False) -> Matched:
         """Register a scan (N, 3) to the map around and take what it says.
 
         Args:
             R_level_body: (3, 3) to a frame whose z is up, in which what stands is told.
+            with_lengths: compare the map's lengths too.
         """
         config = self._config
         points = np.ascontiguousarray(p_body[:: max(len(p_body) // (_LOOKED_AT * config.track_points), 1)])
@@ -118,7 +119,7 @@ class Tracker:
         P = np.linalg.inv(np.linalg.inv(self.covariance) + found.information)
         self.covariance = 0.5 * (P + P.T)
         self.T_map_body = se3.compose(self.T_map_body, se3.exp(self.covariance @ found.information @ xi))
-        lengths = compare_lengths(points, around, T, config.registration, distance=_DISTANCE)
+        lengths = compare_lengths(points, around, T, config.registration, distance=_DISTANCE) if with_lengths else None
         return Matched(share, True, False, innovation, limit, 6 - len(found.weak), lengths)
 
     def _sees_through(self, p_body: Points, around: Surface) -> bool:

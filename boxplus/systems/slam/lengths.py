@@ -1,9 +1,10 @@
 """By what factor the lengths of a target are longer than those of a source that lies in it.
 
 Beside the pose of a registration a seventh number is solved for: p goes to T (m + s (p − m)), with m the middle of the points.
-Along log s a residual e = uᵀ(T p − q) changes by uᵀR (p − m). What is left of its information when the pose is eliminated, over
-the weight of the points, is the square of a lever: by so many metres surfaces close in from all sides. Where they stand on one
-side only, a scale is a shift, and there is no lever.
+Along log s a residual e = uᵀ(T p − q) changes by uᵀR (p − m). Ranges may all be off by the same few centimetres, which data
+sheets allow; along such an offset it changes by uᵀR p/|p|. What is left of the information of log s when pose and offset are
+eliminated, over the weight of the points, is the square of a lever: by so many metres surfaces close in from all sides, beyond
+what an offset does as well. Where they stand on one side only, or all as far away, there is no lever.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from boxplus.systems.slam.registration import (
 
 Floats = NDArray[np.float64]
 
-_BLUNT = (0.25, 0.25, 0.1, 0.0, 0.0)  # of the distance, least scale of the residuals at each step: far surfaces are off at first
+_BLUNT = (0.25, 0.1, 0.0)  # of the distance, least scale of the residuals at each step: far surfaces are off at first
+_FAR = 0.1  # of log s: maps that are followed do not differ by as much, and what says so knows nothing
+_LEAST_OFFSET = 1e-6  # of the weight: less information on an offset is rounding, and the pose does all that one does
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,45 +71,60 @@ def compare_lengths(
         p, e = scaled[valid].astype(np.float64), planes[valid, 3]
         scale = residual_scale(e, max(blunt * distance, LEAST_RESIDUAL_SCALE))
         weight = residual_weights(e, scale)
-        along, information, pose = _along_scale(p, planes[valid], T, weight, config)
         middle = p.mean(axis=0)
+        ways = _ways(p)
+        normals = planes[valid, :3] @ quaternion.to_matrix(T[:4])
+        columns = np.einsum("nka,na->nk", ways, normals)
+        nuisances = _nuisances(columns, weight, planes[valid], config)
+        outwards = columns[:, 7]
+        others = nuisances @ (weight * outwards)
+        along = outwards - columns[:, :7] @ others
+        information = float(along @ (weight * along))
         # As of a direction of the pose: normals that noise tilts seem to see along a wall how far it reaches.
-        told = information - NOISE * float((weight * planes[valid, 4]) @ ((p - middle) ** 2).sum(axis=1))
+        way = ways[:, 7] - np.einsum("nka,k->na", ways[:, :7], others)
+        told = information - NOISE * float((weight * planes[valid, 4]) @ (way**2).sum(axis=1))
         if not told > 0.0:
             return None
-        step = -float(along @ (weight * e)) / information
-        log_ratio += step
         sigma = scale / np.sqrt(told / weight.sum())
-        xi = -pose @ (weight * (e + _outwards(p, planes[valid], T) * step))
+        step = float(np.clip(-float(along @ (weight * e)) / information, -0.5 * _FAR, 0.5 * _FAR))
+        log_ratio += step
+        if not abs(log_ratio) < _FAR:
+            return None
+        # The offset stays in the residuals: each step finds all of it anew.
+        xi = -(nuisances @ (weight * (e + outwards * step)))[:6]
+        xi[:3] /= _lever(p)
+        xi[3:] += np.cross(middle, xi[:3])
         T = se3.compose(T, se3.exp(xi))
         T = se3.compose(T, np.r_[1.0, 0.0, 0.0, 0.0, middle - np.exp(step) * middle])
-    return Lengths(log_ratio, float(sigma))
+    return Lengths(log_ratio, float(sigma)) if sigma < _FAR else None
 
 
-def _outwards(p: Floats, planes: Floats, T: Floats) -> Floats:
-    """(N,) derivative of the residuals along log s."""
-    normals = planes[:, :3] @ quaternion.to_matrix(T[:4])
-    return np.asarray(np.einsum("na,na->n", normals, p - p.mean(axis=0)))
+def _lever(p: Floats) -> float:
+    """Of turns about the middle of points (N, 3), at least 1 [m]."""
+    return max(float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
 
 
-def _along_scale(
-    p: Floats, planes: Floats, T: Floats, weight: Floats, config: LocalMapRegistrationConfig
-) -> tuple[Floats, float, Floats]:
-    """(N,) derivative along log s without what the pose does as well; its information; (6, N) what gives the pose's step."""
-    middle = p.mean(axis=0)
-    normals = planes[:, :3] @ quaternion.to_matrix(T[:4])
-    J = np.hstack([np.cross(p - middle, normals), normals])
-    lever = max(float(np.sqrt(((p - middle) ** 2).sum(axis=1).mean())), 1.0)
-    J[:, :3] /= lever
+def _ways(p: Floats) -> Floats:
+    """(N, 8, 3) of points (N, 3): along a turn about their middle times the lever, a shift, an offset of ranges, and log s."""
+    arm = p - p.mean(axis=0)
+    ways = np.zeros((len(p), 8, 3))
+    for axis, unit in enumerate(np.eye(3)):
+        ways[:, axis] = np.cross(unit, arm) / _lever(p)
+        ways[:, 3 + axis] = unit
+    ways[:, 6] = p / np.maximum(np.linalg.norm(p, axis=1), 1e-3)[:, None]
+    ways[:, 7] = arm
+    return ways
+
+
+def _nuisances(columns: Floats, weight: Floats, planes: Floats, config: LocalMapRegistrationConfig) -> Floats:
+    """(7, N) of columns (N, 8): what gives the step of pose and offset from weighted residuals, where surfaces tell of it."""
+    J, offset = columns[:, :6], columns[:, 6]
     values, vectors = np.linalg.eigh(J.T @ (J * weight[:, None]))
     good = has_information(values, weight, planes, config)
     V = vectors[:, good]
     pose = (V / values[good]) @ V.T @ J.T
-    outwards = _outwards(p, planes, T)
-    along = outwards - (pose @ (weight * outwards)) @ J.T
-    # [lever w, v'] about the middle to [w, v] about the origin.
-    x, y, z = middle
-    A = np.eye(6)
-    A[:3, :3] /= lever
-    A[3:, :3] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / lever
-    return along, float(along @ (weight * along)), A @ pose
+    by_pose = pose @ (weight * offset)
+    own = offset - J @ by_pose
+    information = float(own @ (weight * own))
+    row = own / information if information > _LEAST_OFFSET * weight.sum() else np.zeros_like(own)
+    return np.vstack([pose - np.outer(by_pose, row), row])

@@ -76,7 +76,7 @@ def test_a_map_that_a_killed_process_left_beside_is_named(folder: Path) -> None:
     earlier = folder.with_name("map.boxplus-earlier")
     folder.rename(earlier)
     result = CliRunner().invoke(map_app, ["info", str(folder)])
-    assert isinstance(result.exception, InputError) and f"whole in {earlier}" in str(result.exception)
+    assert isinstance(result.exception, InputError) and f"rename {earlier}, in which" in str(result.exception)
 
 
 def test_no_map(tmp_path: Path) -> None:

@@ -90,6 +90,8 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     shutil.copytree(mapped, torn)
     segment = min((torn / "map" / "tiles").glob("*/*.ply"), key=lambda file: file.stat().st_size)
     segment.write_bytes(segment.read_bytes()[:-4])
+    said = json.loads((torn / "run.json").read_text())
+    (torn / "run.json").write_text(json.dumps(said | {"contradiction": "its sensors disagree"}))
     words = ["localize", str(bag), "--map", str(torn), "-o", str(tmp_path / "out"), "--json"]
     called = CliRunner().invoke(app, [*words, *(f"--set={text}" for text in SETTINGS)])
     assert called.exit_code == 0, called.stderr
@@ -98,7 +100,9 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     summary = LocalizationSummary.model_validate(found["run"])
     assert "found after" in called.stderr and str(own.trajectory.with_suffix(".tum")) in called.stderr
     assert any(text.startswith("the map is damaged: ") and segment.name in text for text in summary.warnings)
-    assert "the map is damaged" in " ".join(called.stderr.split())
+    assert " ".join(called.stderr.split()).count("a segment is damaged") == 1
+    against = "the map is not to be trusted, as the run that wrote it says: its sensors disagree"
+    assert against in summary.warnings and against in " ".join(called.stderr.split())
     assert summary.program == "boxplus localize" and summary.map_kind == "boxplus lio"
     assert summary.found_after_s is not None and summary.found_after_s <= 7.0 and not summary.losses
     trajectory, log = read_trajectory(own.trajectory), read_row_log(own.log, LOG_COLUMNS)

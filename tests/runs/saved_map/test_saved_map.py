@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.errors import InputError
 from boxplus.formats.clouds.pcd import write_pcd
 from boxplus.formats.clouds.ply import write_ply
@@ -136,12 +140,64 @@ def test_a_damaged_tile_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
     assert len(saved.local_maps) == 2 and all(len(m.points) > 500 for m in saved.local_maps)
 
 
+def test_a_tile_that_is_read_again_is_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(tmp_path / "run", two_rooms())
+    segment = sorted((tmp_path / "run" / "map" / "tiles").glob("*/*.ply"))[0]
+    content = bytearray(segment.read_bytes())
+    content[-600:-300] = b"\x7f" * 300
+    segment.write_bytes(bytes(content))
+    monkeypatch.setattr("boxplus.runs.saved_map.tiled_points._KEPT", 1)
+    saved = open_saved_map(tmp_path / "run", CONFIG)
+    for _ in range(3):
+        saved.points_near([6.0, 8.0, 1.0], 30.0)
+    assert len(saved.damage) == 1 and segment.parent.name in saved.damage[0]
+
+
+def test_a_map_that_was_recovered_is_not_damaged(tmp_path: Path) -> None:
+    """Of a run that was killed: all of its points are in the journal, and the last line of its trajectory is cut."""
+    write_run(tmp_path / "run", two_rooms())
+    shutil.rmtree(tmp_path / "run" / "map")
+    writer = TileWriter(tmp_path / "run" / "map", tile_size=10.0)
+    writer.append(two_rooms())
+    shutil.copytree(tmp_path / "run", tmp_path / "killed")  # before it is closed
+    writer.close()
+    trajectory = tmp_path / "killed" / "trajectory.csv"
+    trajectory.write_bytes(trajectory.read_bytes()[:-20])
+    saved = open_saved_map(tmp_path / "killed", CONFIG)
+    assert saved.damage == []
+    for text in ("did not close it", "points were read from journal", "is incomplete and was left out"):
+        assert any(text in line for line in saved.report), text
+
+
+def test_what_its_run_says_against_a_map_is_read(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", two_rooms())
+    summary = tmp_path / "run" / "run.json"
+    assert open_saved_map(tmp_path / "run", CONFIG).doubts == []
+    for found, expected in (
+        ({"program": "boxplus map merge", "doubts": ["two places of a kind", "a burst"]}, ["two places of a kind", "a burst"]),
+        ({"program": "boxplus slam", "contradiction": "loops contradict"}, ["loops contradict"]),
+        ({"program": "boxplus slam", "contradiction": None, "doubts": None}, []),
+        (["no summary"], []),
+    ):
+        summary.write_text(json.dumps(found))
+        assert open_saved_map(tmp_path / "run", CONFIG).doubts == expected
+        assert open_saved_map(tmp_path / "run" / "map", CONFIG).doubts == expected
+
+
+@pytest.mark.parametrize(("missing", "opened"), [("run/map", "run"), ("run/map", "run/map"), ("run", "run"), ("run", "run/map")])
+def test_a_map_left_between_two_renames_is_found(tmp_path: Path, missing: str, opened: str) -> None:
+    write_run(tmp_path / "run", two_rooms())
+    folder, earlier = tmp_path / missing, tmp_path / f"{missing}.boxplus-earlier"
+    folder.rename(earlier)
+    advice = f"rename {earlier}, in which the one that was there is whole, to {folder.name}"
+    with pytest.raises(InputError, match=f"{re.escape(advice)}$"):
+        open_saved_map(tmp_path / opened, CONFIG)
+    called = CliRunner().invoke(app, ["map", "info", str(tmp_path / opened)])
+    assert called.exit_code and advice.replace(" ", "") in "".join(called.output.split())
+
+
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing at"):
-        open_saved_map(tmp_path / "nowhere")
-    earlier = tmp_path / "nowhere.boxplus-earlier"
-    earlier.mkdir()
-    with pytest.raises(InputError, match=f"is whole in {earlier}: 'boxplus map update' puts it back"):
         open_saved_map(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="without map tiles"):

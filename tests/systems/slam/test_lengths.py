@@ -25,7 +25,7 @@ def test_the_ratio_of_lengths_is_found(ratio: float) -> None:
         target = Surface.of((ratio * seen(world, a, random).points).astype(np.float32))
         found = compare_lengths(seen(world, b, random, 4000).points, target, T, CONFIG, distance=0.6)
         assert found is not None and abs(found.log_ratio - np.log(ratio)) < 0.003
-        assert 0.0002 < found.sigma < 0.01
+        assert 0.0002 < found.sigma < 0.02  # of one scan, whose ranges may have an offset too
 
 
 def test_a_wall_on_one_side_tells_nothing_of_lengths() -> None:
@@ -39,3 +39,13 @@ def test_a_wall_on_one_side_tells_nothing_of_lengths() -> None:
     assert found is None or found.sigma > 0.05
     few = compare_lengths(wall[:20].astype(np.float32), Surface.of(wall.astype(np.float32)), here, CONFIG, distance=0.6)
     assert few is None
+
+
+def test_what_is_far_from_one_says_nothing() -> None:
+    """Steps of a fit that no surface holds once went to a factor of 150, ± 56 of its logarithm."""
+    random = np.random.default_rng(5)
+    wall = random.uniform([1.0, -1.0, -1.0], [1.2, 1.0, 1.0], (4000, 3)).astype(np.float32)
+    here = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for factor in (0.5, 0.8, 1.2, 1.5):
+        found = compare_lengths(np.float32(factor) * wall[::5], Surface.of(wall), here, CONFIG, distance=0.6)
+        assert found is None or (abs(found.log_ratio) < 0.1 and found.sigma < 0.1)
