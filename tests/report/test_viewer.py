@@ -153,5 +153,5 @@ def test_other_places_are_refused(where: str, message: str) -> None:
 
 def test_a_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(InputError, match=r"pip install 'boxplus\[view\]'"):
+    with pytest.raises(InputError, match=r"pip install .*rerun-sdk"):
         Viewer("walk.bag", "run.rrd")

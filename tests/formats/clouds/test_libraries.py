@@ -161,7 +161,7 @@ def test_ply_files_in_a_map_projection_are_not_read_to_half_a_metre(tmp_path: Pa
 @pytest.mark.parametrize(("module", "ending"), [("laspy", "las"), ("lazrs", "laz"), ("pye57", "e57")])
 def test_a_missing_library_is_a_sentence(tmp_path: Path, module: str, ending: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=rf"pip install 'boxplus\[{'e57' if ending == 'e57' else 'las'}\]'"):
+    with pytest.raises(InputError, match=rf"pip install .*{'pye57' if ending == 'e57' else 'laspy'}"):
         cloud_writer(tmp_path / f"a.{ending}")
     assert not list(tmp_path.iterdir())
 

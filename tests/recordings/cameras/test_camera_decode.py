@@ -141,8 +141,6 @@ def test_a_png_with_a_flipped_bit_is_refused() -> None:
 
 def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(
-        RecordingError, match=r"OpenCV, to decode JPEG images – got it is not installed – pip install 'boxplus\[vision\]'"
-    ):
+    with pytest.raises(RecordingError, match=r"OpenCV, to decode JPEG images – got it is not installed – .*pip install .*opencv"):
         decode_file(decode.JPEG_MAGIC + b"\xff\xda\xff\xd9")
     np.testing.assert_array_equal(decode_file(pgm(GREY)), GREY)

@@ -121,5 +121,5 @@ def test_a_format_without_its_library_is_refused_before_the_run(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pye57", None)
-    with pytest.raises(InputError, match=r"pip install 'boxplus\[e57\]'"):
+    with pytest.raises(InputError, match=r"pip install .*pye57"):
         run_odometry(recording, tmp_path / "out", load_run_config(settings=[*SETTINGS, "scans.frame=body", "scans.ending=e57"]))

@@ -75,7 +75,7 @@ def test_without_opencv_places_are_still_found(block: MappedDrive, monkeypatch: 
     accepted = [loop for loop in contexts.loops if loop.is_accepted]
     assert accepted and all(loop.source == "scan context" for loop in accepted)
     assert all(np.linalg.norm(block.error(loop)[3:]) < 0.25 for loop in accepted)
-    with pytest.raises(InputError, match=r"boxplus\[vision\]"):
+    with pytest.raises(InputError, match=r"pip install .*opencv"):
         closed(block)
 
 

@@ -158,7 +158,7 @@ def test_the_range_that_grows_takes_the_image_before_along() -> None:
 
 def test_opencv_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(InputError, match=r"boxplus\[vision\]"):
+    with pytest.raises(InputError, match=r"pip install .*opencv"):
         FeatureTracker(VioConfig(), stereo())
 
 
