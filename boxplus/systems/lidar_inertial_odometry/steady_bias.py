@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 _APART_S = 0.5  # between estimates that are kept, at first
 _MOST = 64  # of them; then every other one goes
-_SIGMAS = 5.0  # 2 at most in sound runs, simulated and real
+_SIGMAS = 5.0  # 2.5 at most in 25 sound runs, simulated and real
 _LEAST = 0.003  # rad/s, of a change that is worth a word
 _ROUGHLY = 0.1  # of a standard deviation, by which it is itself not known
 
