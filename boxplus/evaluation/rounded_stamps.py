@@ -20,10 +20,7 @@ _UNITS_NS = (1_000_000_000, 100_000_000, 10_000_000)
 _OF_ROUNDING, _EVEN = 0.3, 0.8  # of the whole error, that rounded stamps explain; share of equal steps that are no rounding's
 _LEAST = 30  # poses
 _ALONG, _NARROW, _WIDE = 0.8, 0.15, 0.45  # share of the error that shifts in time explain; their deviation, of the unit
-_MOST, _BOUNDED = (
-    0.65,
-    0.97,
-)  # of the unit, that rounding and noise shift a pose by, and the share of the poses of which that holds
+_MOST, _BOUNDED = 0.65, 0.97  # of the unit, that rounding and noise shift a pose by; share of the poses of which that holds
 _ALONE, _SAWTOOTH = 0.4, 0.7  # correlation of shifts with those before, and with those of even times, that rounding makes
 _SLOW = 0.2  # of the usual speed, below which an error says nothing of time
 
@@ -54,18 +51,17 @@ def rounding_doubts(
         told = f"all stamps of the {name} are multiples of {unit * 1e-9:g} s"
         apart = f"by up to {0.5e-9 * unit:g} s × {float(np.median(speed)):.3g} m/s"
         steps = np.unique(np.diff(own), return_counts=True)[1]
-        if len(steps) > 1 and _are_of_rounding(error, v, own, (aligned, truth)[one].times, unit):
-            share = _along(error, v)[0]
+        share = _of_rounding(error, v, own, (aligned, truth)[one].times, unit) if len(steps) > 1 else None
+        if share is not None:
             yield (
                 f"{told}, and {share:.0%} of the squared error lies along the way as rounding to that puts it, {apart}: poses "
                 "are compared with those of other moments, and the numbers are those of the stamps; write these with more digits"
             )
-        else:
-            if one == 0 and steps.max() <= _EVEN * steps.sum():  # even steps are those of a clock
-                yield (
-                    f"{told}: if they were rounded to that, it makes an error of about {makes:.3g} m, {apart}, and clocks up to "
-                    f"{0.5e-9 * unit:g} s apart"
-                )
+        elif one == 0 and steps.max() <= _EVEN * steps.sum():  # even steps are those of a clock
+            yield (
+                f"{told}: if they were rounded to that, it makes an error of about {makes:.3g} m, {apart}, and clocks up to "
+                f"{0.5e-9 * unit:g} s apart"
+            )
 
 
 def _velocities(poses: Trajectory, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -75,30 +71,25 @@ def _velocities(poses: Trajectory, time_ns: NDArray[np.int64]) -> NDArray[np.flo
     return np.column_stack([np.interp((time_ns - poses.times[0]) * 1e-9, t, axis) for axis in v.T])
 
 
-def _along(error: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[float, NDArray[np.float64], NDArray[np.bool_]]:
-    """Share of the squared error that a shift in time of every pose explains, these shifts [s], and which poses were moving."""
+def _of_rounding(
+    error: NDArray[np.float64], v: NDArray[np.float64], own: NDArray[np.int64], time_ns: NDArray[np.int64], unit: int
+) -> float | None:
+    """Share of squared errors (M, 3) at times (M,) along the way; None unless stamps `own` rounded to `unit` make such ones."""
     speed = np.linalg.norm(v, axis=1)
     able = speed > _SLOW * float(np.median(speed))
     if np.count_nonzero(able) < _LEAST:
-        return 0.0, np.zeros(0), able
+        return None
     shift = (error[able] * v[able]).sum(axis=1) / speed[able] ** 2
     left = error[able] - shift[:, None] * v[able]
-    return float(1.0 - (left**2).sum() / max((error[able] ** 2).sum(), 1e-300)), shift, able
-
-
-def _are_of_rounding(
-    error: NDArray[np.float64], v: NDArray[np.float64], own: NDArray[np.int64], time_ns: NDArray[np.int64], unit: int
-) -> bool:
-    """Whether errors (M, 3) at times (M,) are those of stamps `own` that were rounded to multiples of `unit`."""
-    share, shift, able = _along(error, v)
+    share = float(1.0 - (left**2).sum() / max((error[able] ** 2).sum(), 1e-300))
     if not share > _ALONG:
-        return False
+        return None
     shift = (shift - np.median(shift)) / (unit * 1e-9)
     if not (_NARROW < shift.std() < _WIDE and np.mean(np.abs(shift) < _MOST) > _BOUNDED):
-        return False
+        return None
     if abs(float(np.corrcoef(shift[1:], shift[:-1])[0, 1])) < _ALONE:
-        return True
+        return share
     row = np.searchsorted(own, time_ns[able]).clip(0, len(own) - 1)
     even = own[0] + (own[-1] - own[0]) / (len(own) - 1) * row
     made = own[row] - even
-    return bool(made.std() > 0.0 and abs(float(np.corrcoef(made, shift)[0, 1])) > _SAWTOOTH)
+    return share if made.std() > 0.0 and abs(float(np.corrcoef(made, shift)[0, 1])) > _SAWTOOTH else None

@@ -186,11 +186,7 @@ def _show(terminal: Terminal, summary: MergeSummary) -> None:
             terminal.say(f"{session.name}: apart" + "".join(f"\n  {text}" for text in session.apart_because))
     for text in summary.warnings:
         terminal.warn(text)
-    _show_doubts(terminal, summary.doubts)
-
-
-def _show_doubts(terminal: Terminal, doubts: list[str]) -> None:
-    for text in doubts:
+    for text in summary.doubts:
         terminal.doubt(f"{text}; look at the map before you trust it")
 
 

@@ -82,11 +82,12 @@ class Distances:
         left_out: NDArray[np.bool_],
     ) -> None:
         self._problem, self._total = problem, total
-        self._gauge = find_gauge(problem)
+        curvatures = problem.own_curvatures()
+        self._gauge = find_gauge(problem, curvatures)
         layout = problem.layout
         moved, seen = self._gauge.remove(way), problem.product(way)
         blocks, groups, begin = [], [], 0
-        for block, number, H in zip(layout.blocks, layout.number, problem.own_curvatures(), strict=True):
+        for block, number, H in zip(layout.blocks, layout.number, curvatures, strict=True):
             free, dof = number[number >= 0], block.manifold.dof
             first = int(layout.start[free[0]]) if len(free) else 0
             own = slice(first, first + len(free) * dof)
@@ -120,14 +121,14 @@ class Distances:
                     mine = sampled[part.is_rows][part.places].reshape(part.u.shape)
                     part.sums += mine[:, :, None] * mine[:, None, :]
             drawn += count
-            is_open, is_sure = 0, False
+            is_open = 0
             for part in parts:
                 # Of K samples, uᵀ S⁻¹ u K is that of the covariance over a χ² of K − dof + 1 over K.
                 freedom = drawn - part.u.shape[1] + 1
                 away = _distance(part.sums / freedom + part.unknown, part.u, _SEES_NOTHING if part.is_rows else 0.0)
                 away = part.away[:] = np.where(part.is_asked, np.minimum(away, self._total), 0.0)
                 sure = away / (1.0 + _SURE / math.sqrt(2.0 * freedom)) > AWAY
-                is_open, is_sure = is_open + int(np.count_nonzero((away > AWAY) & ~sure)), is_sure or bool(sure.any())
+                is_open += int(np.count_nonzero((away > AWAY) & ~sure))
             if is_open <= _LOOKS:
                 return
 

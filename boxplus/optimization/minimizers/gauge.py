@@ -36,9 +36,12 @@ class Gauge:
         return np.asarray(e - (self.share * (self.motions * e[:, None]).sum(axis=0)[:, None]).sum(axis=0))
 
 
-def find_gauge(problem: LeastSquares) -> Gauge:
-    """Of the problem as it is linearised; without motions where something holds the world, or where there are no poses."""
-    curvatures = problem.own_curvatures()
+def find_gauge(problem: LeastSquares, curvatures: list[NDArray[np.float64]]) -> Gauge:
+    """Of the problem as it is linearised; without motions where something holds the world, or where there are no poses.
+
+    Args:
+        curvatures: `own_curvatures` of the problem.
+    """
     found = [_gauge(problem, kind, curvatures) for kind in POSE_KINDS]
     return max(found, key=lambda gauge: gauge.motions.shape[1])
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
@@ -107,20 +108,21 @@ def _has_to_be_cleared(
 
 def doubts_of(summary: Path) -> list[str]:
     """Why a run is not to be trusted, as its summary says; none where nothing speaks against it, or it cannot be read."""
-    try:
-        found = json.loads(summary.read_bytes())
-    except ValueError:
-        return []
-    if not isinstance(found, dict):
-        return []
+    found = _facts(summary)
     doubts, contradiction = found.get("doubts"), found.get("contradiction")
     return [*map(str, doubts if isinstance(doubts, list) else []), *([str(contradiction)] if contradiction else [])]
 
 
 def program_of(summary: Path) -> str | None:
     """Who wrote a summary; None where it cannot be read."""
+    found = _facts(summary)
+    return str(found["program"]) if "program" in found else None
+
+
+def _facts(summary: Path) -> dict[str, Any]:
+    """What a summary holds; nothing where it cannot be read."""
     try:
         found = json.loads(summary.read_bytes())
     except ValueError:
-        return None
-    return str(found.get("program")) if isinstance(found, dict) and "program" in found else None
+        return {}
+    return found if isinstance(found, dict) else {}

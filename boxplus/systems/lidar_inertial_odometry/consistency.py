@@ -232,7 +232,7 @@ class Consistency:
 
     def _steadiness(self, end_ns: int, posterior: Posterior) -> list[str]:
         """Whether the gyroscope's bias is where it was known to be."""
-        if not posterior.valid or "steady" in self._told:
+        if not posterior.valid:
             return []
         variance = np.diagonal(posterior.cov)[T_BW : T_BW + 3]
         text = self._steady.update(end_ns, posterior.x[BW : BW + 3], variance)

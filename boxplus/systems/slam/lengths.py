@@ -72,7 +72,8 @@ def compare_lengths(
         scale = residual_scale(e, max(blunt * distance, LEAST_RESIDUAL_SCALE))
         weight = residual_weights(e, scale)
         middle = p.mean(axis=0)
-        ways = _ways(p)
+        lever = max(float(np.sqrt(((p - middle) ** 2).sum(axis=1).mean())), 1.0)  # of turns about the middle [m]
+        ways = _ways(p, p - middle, lever)
         normals = planes[valid, :3] @ quaternion.to_matrix(T[:4])
         columns = np.einsum("nka,na->nk", ways, normals)
         nuisances = _nuisances(columns, weight, planes[valid], config)
@@ -92,24 +93,22 @@ def compare_lengths(
             return None
         # The offset stays in the residuals: each step finds all of it anew.
         xi = -(nuisances @ (weight * (e + outwards * step)))[:6]
-        xi[:3] /= _lever(p)
+        xi[:3] /= lever
         xi[3:] += np.cross(middle, xi[:3])
         T = se3.compose(T, se3.exp(xi))
         T = se3.compose(T, np.r_[1.0, 0.0, 0.0, 0.0, middle - np.exp(step) * middle])
     return Lengths(log_ratio, float(sigma)) if sigma < _FAR else None
 
 
-def _lever(p: Floats) -> float:
-    """Of turns about the middle of points (N, 3), at least 1 [m]."""
-    return max(float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
+def _ways(p: Floats, arm: Floats, lever: float) -> Floats:
+    """(N, 8, 3) of points (N, 3): along a turn about their middle times the lever, a shift, an offset of ranges, and log s.
 
-
-def _ways(p: Floats) -> Floats:
-    """(N, 8, 3) of points (N, 3): along a turn about their middle times the lever, a shift, an offset of ranges, and log s."""
-    arm = p - p.mean(axis=0)
+    Args:
+        arm: (N, 3) from the middle to the points.
+    """
     ways = np.zeros((len(p), 8, 3))
     for axis, unit in enumerate(np.eye(3)):
-        ways[:, axis] = np.cross(unit, arm) / _lever(p)
+        ways[:, axis] = np.cross(unit, arm) / lever
         ways[:, 3 + axis] = unit
     ways[:, 6] = p / np.maximum(np.linalg.norm(p, axis=1), 1e-3)[:, None]
     ways[:, 7] = arm
