@@ -260,7 +260,7 @@ class _Fleet:
             if end.error is not None:
                 raise OutputError(
                     f"expected every part of the joint map – got {end.error} ({arguments[end.number][1]}) – "
-                    "the runs are kept: give the same command again"
+                    "the runs are kept: give the same command again, where files of a run are damaged without its folder"
                 )
             found[end.number] = end.value
         return [found[number] for number in range(len(arguments))]

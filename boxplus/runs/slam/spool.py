@@ -1,10 +1,16 @@
-"""Registered scans on disk, each with its pose along the odometry, to be placed where the closed loops put them."""
+"""Registered scans on disk, each with its pose along the odometry, to be placed where the closed loops put them.
+
+A record is a head, and the points that it counts, with or without intensities. The head ends with the checksum of the points and
+its own, so that a byte that changed on the disk is found wherever it is, and a damaged count is never believed.
+"""
 
 from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -16,9 +22,9 @@ from boxplus.formats.output import output_error
 from boxplus.manifolds import quaternion
 from boxplus.maps.tiles.voxel_thinning import RecentVoxels
 
-_HEAD = struct.Struct("<qqB7d")  # time, points, whether with intensity, pose
+_HEAD = struct.Struct("<qqB7dI")  # time, points, whether with intensity, pose, CRC-32 of what follows the head
+_CHECK = struct.Struct("<I")  # CRC-32 of that, the end of the head
 _POINT, _INTENSITY = 12, 4  # bytes
-_UNIT = 1e-6  # by which the length of a quaternion may differ from one
 
 
 class SpooledScan(NamedTuple):
@@ -66,11 +72,13 @@ class ScanSpool:
         if self._recent is not None:
             keep = keep[self._recent.new(p_odo[keep])]
         points = np.ascontiguousarray(scan.p_body[keep], dtype=np.float32)
+        data = points.tobytes()
+        if scan.intensity is not None:
+            data += np.ascontiguousarray(scan.intensity[keep], dtype=np.float32).tobytes()
+        has_intensity, pose = scan.intensity is not None, scan.T_odo_body.tolist()
+        head = _HEAD.pack(scan.time_ns, len(points), has_intensity, *pose, zlib.crc32(data))
         try:
-            self._file.write(_HEAD.pack(scan.time_ns, len(points), scan.intensity is not None, *scan.T_odo_body.tolist()))
-            self._file.write(points.tobytes())
-            if scan.intensity is not None:
-                self._file.write(np.ascontiguousarray(scan.intensity[keep], dtype=np.float32).tobytes())
+            self._file.write(head + _CHECK.pack(zlib.crc32(head)) + data)
         except OSError as error:
             raise output_error(self.path, error) from error
 
@@ -96,34 +104,40 @@ class ScanSpool:
         """Take away what was appended after a mark.
 
         Raises:
-            InputError: there is less than that.
+            InputError: there is less than that, or it is damaged.
         """
         if (size := self._file.seek(0, os.SEEK_END)) < mark.size:
             raise InputError(f"the {mark.size} bytes of the checkpoint in {self.path}", f"{size}", "start the run anew")
         self._file.truncate(mark.size)
         self._file.seek(mark.stretch)
         self.forget()
-        while (scan := _next_scan(self._file)) is not None:
-            if self._recent is not None:
-                self._recent.new(_in_odometry(scan))
+        with _named(self.path):
+            while (scan := _next_scan(self._file)) is not None:
+                if self._recent is not None:
+                    self._recent.new(_in_odometry(scan))
 
     def scans(self) -> Iterator[SpooledScan]:
-        """All scans so far, in order."""
+        """All scans so far, in order.
+
+        Raises:
+            InputError: what is on the disk is not what was written.
+        """
         self.mark()
-        with self.path.open("rb") as file:
-            while (scan := _next_scan(file)) is not None:
-                yield scan
+        return read_spool(self.path)
 
     def poses(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Times (n,) and poses (n, 7) along the odometry of all scans so far, without their points."""
+        """Times (n,) and poses (n, 7) along the odometry of all scans so far, without their points.
+
+        Raises:
+            InputError: what is on the disk is not what was written.
+        """
         self.mark()
         times, poses = [], []
-        with self.path.open("rb") as file:
-            while head := file.read(_HEAD.size):
-                time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
-                times.append(time_ns)
-                poses.append(pose)
-                file.seek((_POINT + _INTENSITY * has_intensity) * count, os.SEEK_CUR)
+        with _named(self.path), self.path.open("rb") as file:
+            while (head := _next_head(file)) is not None:
+                times.append(head.time_ns)
+                poses.append(head.T_odo_body)
+                file.seek(head.size, os.SEEK_CUR)
         return np.array(times, dtype=np.int64), np.array(poses).reshape(-1, 7)
 
     def close(self) -> None:
@@ -135,34 +149,73 @@ def read_spool(path: Path) -> Iterator[SpooledScan]:
     """The scans of a spool that was closed, in order.
 
     Raises:
-        InputError: it cannot be read, or ends within a scan.
+        InputError: it cannot be read, ends within a scan, or a byte of it is not what was written.
     """
+    with _named(path), path.open("rb") as file:
+        while (scan := _next_scan(file)) is not None:
+            yield scan
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of what is read here say which file it is, and what to do."""
     try:
-        with path.open("rb") as file:
-            while (scan := _next_scan(file)) is not None:
-                yield scan
-    except (OSError, ValueError, struct.error) as error:
-        raise InputError("the scans of a finished run of 'boxplus slam'", f"{path}: {error}", "run it again") from error
+        yield
+    except (OSError, ValueError) as error:
+        raise InputError("the scans that a run of 'boxplus slam' kept", f"{path}: {error}", "run it again") from error
+
+
+class _Head(NamedTuple):
+    """What stands before the points of a scan, with their size [bytes] and checksum."""
+
+    time_ns: int
+    count: int
+    has_intensity: bool
+    T_odo_body: NDArray[np.float64]
+    size: int
+    checksum: int
+
+
+def _next_head(file: BinaryIO) -> _Head | None:
+    """The head at the position of a file, which moves on; None at its end.
+
+    Raises:
+        ValueError: it ends within the scan, or the head is not as it was written.
+    """
+    begin = file.tell()
+    if not (head := file.read(_HEAD.size + _CHECK.size)):
+        return None
+    if len(head) < _HEAD.size + _CHECK.size:
+        raise ValueError(f"it ends within a scan that begins at byte {begin}")
+    own = head[: _HEAD.size]
+    if _CHECK.pack(zlib.crc32(own)) != head[_HEAD.size :]:
+        raise ValueError(f"{_damaged(begin)} (or the file is of another version of boxplus)")
+    time_ns, count, has_intensity, *pose, checksum = _HEAD.unpack(own)
+    size = (_POINT + _INTENSITY * has_intensity) * count
+    if size > os.fstat(file.fileno()).st_size - file.tell():
+        raise ValueError(f"it ends within a scan that begins at byte {begin}")
+    return _Head(time_ns, count, bool(has_intensity), np.array(pose), size, checksum)
 
 
 def _next_scan(file: BinaryIO) -> SpooledScan | None:
     """The scan at the position of a file, which moves on; None at its end.
 
     Raises:
-        ValueError: it ends within the scan, or what is there is none.
+        ValueError: it ends within the scan, or the scan is not as it was written.
     """
-    if not (head := file.read(_HEAD.size)):
+    begin = file.tell()
+    if (head := _next_head(file)) is None:
         return None
-    time_ns, count, has_intensity, *pose = _HEAD.unpack(head)
-    T = np.array(pose)
-    if has_intensity not in (0, 1) or not (np.isfinite(T).all() and abs(np.linalg.norm(T[:4]) - 1.0) < _UNIT):
-        raise ValueError(f"no scan before byte {file.tell()}")
-    size = (_POINT + _INTENSITY * has_intensity) * count  # asked of the file before memory is: a damaged count may be any
-    if count < 0 or size > os.fstat(file.fileno()).st_size - file.tell():
-        raise ValueError(f"it ends within a scan, before byte {file.tell()}")
-    points = np.frombuffer(file.read(_POINT * count), dtype=np.float32).reshape(-1, 3)
-    intensity = np.frombuffer(file.read(_INTENSITY * count), dtype=np.float32) if has_intensity else None
-    return SpooledScan(time_ns, T, points, intensity)
+    data = file.read(head.size)
+    if zlib.crc32(data) != head.checksum:
+        raise ValueError(_damaged(begin))
+    points = np.frombuffer(data, dtype=np.float32, count=3 * head.count).reshape(-1, 3)
+    intensity = np.frombuffer(data, dtype=np.float32, offset=_POINT * head.count) if head.has_intensity else None
+    return SpooledScan(head.time_ns, head.T_odo_body, points, intensity)
+
+
+def _damaged(begin: int) -> str:
+    return f"the scan that begins at byte {begin} is damaged: its checksum is another one"
 
 
 def _in_odometry(scan: SpooledScan) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -232,6 +233,27 @@ def test_a_spool_that_is_damaged_is_not_read_as_another_one(tmp_path: Path, dama
     (tmp_path / "spool").write_bytes(damage((tmp_path / "spool").read_bytes()))
     with pytest.raises(InputError, match="run it again"):
         list(read_spool(tmp_path / "spool"))
+
+
+def test_no_byte_of_a_spool_changes_unnoticed(tmp_path: Path) -> None:
+    """Once a flipped bit of a point or of a pose was a wall or a scan elsewhere in the joint map."""
+    pose = np.array([1.0, 0, 0, 0, 5.0, 0, 0])
+    spool = ScanSpool(tmp_path / "spool", None)
+    for k in range(2):
+        points = np.arange(9, dtype=np.float32).reshape(-1, 3)
+        spool.append(SpooledScan(k, pose, points, np.arange(3, dtype=np.float32)))
+    spool.mark()
+    whole = spool.path.read_bytes()
+    second = len(whole) // 2
+    for at in range(len(whole)):
+        spool.path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])
+        said = f"{spool.path}: the scan that begins at byte {second * (at >= second)} is damaged"
+        with pytest.raises(InputError, match=re.escape(said)):
+            list(read_spool(spool.path))
+        if at % second < second - 48:  # in the head
+            with pytest.raises(InputError, match=re.escape(said)):
+                spool.poses()
+    spool.close()
 
 
 def test_a_spool_goes_on_from_a_mark_with_the_same_bytes(tmp_path: Path) -> None:
