@@ -113,6 +113,11 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
     """
     target = as_path(path, "a file")
     made, earlier = target.with_name(target.name + TEMPORARY_SUFFIX), earlier_folder(target)
+    if os.path.ismount(target):  # it could not be renamed, and that would show at the end
+        raise OutputError(
+            f"expected a folder that another one can take the place of – got {target}, which a file system is mounted at – "
+            "choose a folder in it"
+        )
     put_back(target)
     try:
         for leftover in (made, earlier):

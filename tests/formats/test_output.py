@@ -59,3 +59,12 @@ def test_killed_between_the_renames_one_of_both_is_whole(folder: Path, renames: 
         assert content(folder) == {"tiles/one": "old"}
         raise ValueError("again")
     assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]
+
+
+def test_a_folder_that_cannot_be_renamed_is_refused_before_anything_is_computed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os.path, "ismount", lambda path: path == folder)
+    with pytest.raises(OutputError, match="which a file system is mounted at – choose a folder in it"), replaced_folder(folder):
+        raise AssertionError("it was begun")
+    assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]

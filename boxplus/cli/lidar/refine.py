@@ -103,7 +103,7 @@ def refine_command(
                 with outcome.drawing(terminal):
                     from boxplus.report.refinement_page import write_refinement_report
 
-                    write_refinement_report(folder, summary, result)
+                    write_refinement_report(claimed.path, summary, result)
         _print(terminal, summary, comparison, folder)
         outcome.end(summary, summary.state, untrusted=summary.doubt is not None)
         outcome.compare(comparison)

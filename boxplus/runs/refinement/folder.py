@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
+from boxplus.formats.output import earlier_folder, output_error, put_back, replaced_folder
 from boxplus.runs.run_folder import RunFolder
-from boxplus.runs.storage.output_folder import output_folder
+from boxplus.runs.storage.folder_lock import LOCK, locked_beside
+from boxplus.runs.storage.output_folder import output_folder, program_of, state_of
 
 PROGRAM = "boxplus refine"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +39,16 @@ class RefineFolder(RunFolder):
         yield from self.existing([self.points, self.georeference], ())
 
 
+class _NotFinishedError(Exception):
+    """A refinement did not come to its end; it never leaves this file."""
+
+
 @contextmanager
 def claim_refine_folder(folder: str | Path, run: str | Path, *, overwrite: bool = False) -> Iterator[RefineFolder]:
     """A folder to write a refined run into, locked while the block runs; see `claim_run_folder`.
+
+    With `overwrite`, a refinement that came to its end stays whole until the new one has: what is yielded is a folder beside it
+    then, which takes its place at the end of the block, together with what others have put there.
 
     Args:
         run: the folder of the run that is refined, which is not written into.
@@ -44,10 +56,50 @@ def claim_refine_folder(folder: str | Path, run: str | Path, *, overwrite: bool 
     Raises:
         InputError: it is the folder of the run itself, or lies in it; another process is writing there; the folder holds
             something else, or an earlier run and `overwrite` is not set.
-        OutputError: it cannot be created or cleared.
+        OutputError: it cannot be created, cleared or replaced.
     """
-    own = RefineFolder(Path(folder))
-    if own.path.resolve().is_relative_to(Path(run).resolve()):
+    own = RefineFolder(Path(folder).resolve())  # what takes the place of a link would leave the folder that it leads to
+    if own.path.is_relative_to(Path(run).resolve()):
         raise InputError("another folder than that of the run", f"{own.path}", "choose one beside it with --output")
+    if earlier_folder(own.path).is_dir():
+        with locked_beside(own.path, PROGRAM):
+            put_back(own.path)
+    if overwrite and _is_finished(own):
+        with locked_beside(own.path, PROGRAM), _replaced(own) as made:
+            yield made
+        return
     with output_folder(own.path, PROGRAM, own.own_files, own.own_folders, overwrite=overwrite, holds_results=own.holds_estimates):
         yield own
+
+
+@contextmanager
+def _replaced(own: RefineFolder) -> Iterator[RefineFolder]:
+    """A folder beside an earlier refinement, which takes its place when the new one has come to its end."""
+    replaced = False
+    try:
+        with suppress(_NotFinishedError), replaced_folder(own.path) as path:
+            made = RefineFolder(path)
+            yield made
+            if not _is_finished(made):
+                raise _NotFinishedError
+            _copy_what_others_put(own, path)
+            replaced = True
+    finally:
+        if not replaced:
+            _log.warning("the earlier refinement in %s stays as it was", own.path)
+
+
+def _is_finished(own: RefineFolder) -> bool:
+    return own.summary.is_file() and program_of(own.summary) == PROGRAM and state_of(own.summary) == "finished"
+
+
+def _copy_what_others_put(own: RefineFolder, into: Path) -> None:
+    written = {own.path / LOCK, *own.own_files()}
+    try:
+        for path in own.path.rglob("*"):
+            if path not in written and (path.is_symlink() or not path.is_dir()):
+                there = into / path.relative_to(own.path)
+                there.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, there, follow_symlinks=False)
+    except OSError as error:
+        raise output_error(into, error) from error

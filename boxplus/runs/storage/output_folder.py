@@ -119,6 +119,12 @@ def program_of(summary: Path) -> str | None:
     return str(found["program"]) if "program" in found else None
 
 
+def state_of(summary: Path) -> str | None:
+    """How a run ended, as its summary says; None where it cannot be read."""
+    state = _facts(summary).get("state")
+    return None if state is None else str(state)
+
+
 def _facts(summary: Path) -> dict[str, Any]:
     """What a summary holds; nothing where it cannot be read."""
     try:

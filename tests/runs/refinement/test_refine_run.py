@@ -192,9 +192,41 @@ def test_results_are_replaced_on_demand_only(folders: tuple[Path, Path], refined
     assert code == 2 and "the results of an earlier run" in err
 
 
-def test_stopping_leaves_no_half_results(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    from boxplus.runs.refinement.folder import claim_refine_folder
+def test_a_second_refinement_replaces_the_first_when_it_is_whole(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """Once `--overwrite` cleared the folder before anything was computed, and a full disk left neither of the two."""
+    run, out = folders[0], tmp_path / "out"
+    once = ("-o", out, "--no-report", "--no-map", "--set", "refinement.rounds=1")
+    assert call("refine", run, *once)[0] == 0
+    (out / "plots").mkdir(exist_ok=True)
+    (out / "plots" / "notes.txt").write_text("mine")
 
+    def there() -> dict[str, bytes]:
+        return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    before = there()
+    code, _, err = call("refine", run, *once, "--overwrite", "--recording", tmp_path / "gone.bag")
+    assert code in (1, 2) and "gone.bag" in err and there() == before
+    with claim_refine_folder(out, run, overwrite=True) as claimed:
+        stopped = refine_run.refine_run(refine_run.read_odometry_run(run), claimed, should_stop=lambda: True)
+        assert there() == before
+    assert stopped.summary.state == "interrupted" and there() == before
+
+    # A process that is killed leaves what it had begun beside the folder, and the next one takes it away.
+    (tmp_path / "out.boxplus-tmp").mkdir()
+    (tmp_path / "out.boxplus-tmp" / "run.json").write_text("{")
+    code, _, err = call("refine", run, *once, "--overwrite")
+    assert code == 0, err
+    after = there()
+    assert after.keys() == before.keys() and after["plots/notes.txt"] == b"mine" and after["run.json"] != before["run.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    # Between its two renames it leaves the earlier folder under another name.
+    out.rename(tmp_path / "out.boxplus-earlier")
+    code, _, err = call("refine", run, *once)
+    assert code == 2 and "the results of an earlier run" in err and there() == after
+
+
+def test_stopping_leaves_no_half_results(folders: tuple[Path, Path], tmp_path: Path) -> None:
     with claim_refine_folder(tmp_path / "out", folders[0]) as claimed:
         run = refine_run.read_odometry_run(folders[0])
         result = refine_run.refine_run(run, claimed, should_stop=lambda: True)
