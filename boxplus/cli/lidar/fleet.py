@@ -73,7 +73,8 @@ def run_command(
     --config and --set are settings of 'boxplus slam'. What is finished in the output folder is kept: the same command goes on
     with a fleet that was stopped. Needs pip install ray fsspec. Exit codes: 0 done, 1 the results could not be written,
     2 bad input, 3 not all of it is to be trusted (a recording failed or is not to be trusted itself, recordings contradict each
-    other or are joined in doubt only, no two of them met), 130 interrupted.
+    other or are joined in doubt only, no two of them met, or something speaks against their joint map, which then takes the place
+    of no sound one that is there), 130 interrupted.
     """
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
@@ -136,7 +137,7 @@ def _show(terminal: RunTerminal, status: FleetStatus, merged: str) -> None:
         terminal.warn(text)
     for text in status.doubts:
         terminal.doubt(text)
-    if status.joined:
+    if status.joined and not status.earlier_map_kept:
         terminal.say(
             f"{len(status.joined)} of {len(status.recordings)} recordings in one map, {status.map_points:,} points; "
             f"{status.pairs_joined} of {status.pairs_looked_at} pairs met → {merged}"

@@ -13,6 +13,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from boxplus.errors import InputError, OutputError
 from boxplus.maps.tiles.layout import MANIFEST, Manifest, write_manifest
 from boxplus.maps.tiles.store import merge
@@ -23,9 +25,10 @@ from boxplus.runs.fleet.store import MERGED, SharedFolder, Store, open_store
 from boxplus.runs.fleet.tasks import RunOutline, meet_runs, outline_run, run_of, run_recording
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import claim_merge_folder
-from boxplus.runs.sessions.joined import merge_facts
+from boxplus.runs.sessions.joined import doubts_of_joining, merge_facts
 from boxplus.runs.sessions.merge_run import merge_runs
 from boxplus.runs.sessions.repeated import repeated
+from boxplus.runs.sessions.summary import MergeSummary
 from boxplus.runs.sessions.tables import write_encounters
 from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.storage.output_folder import SUMMARY
@@ -111,8 +114,10 @@ class _Fleet:
             sessions = [outline.session for outline in outlines.values()]
             if len(sessions) > 1:
                 alignment = place_surely(sessions, meetings, self._merging.sessions)
-                self._write_map(alignment, remove_dynamic)
-                self._note_alignment(meetings, alignment)
+                earlier = self._better_map(alignment)
+                if earlier is None:
+                    self._write_map(alignment, remove_dynamic)
+                self._note_alignment(meetings, alignment, earlier)
         elif self._store.read(f"{MERGED}/{SUMMARY}") is not None:
             self._note(warnings=[f"{self._store / MERGED} is of an earlier fleet: nothing was joined this time"])
         self._note(stage="finished")
@@ -201,6 +206,23 @@ class _Fleet:
                 self._note(pairs_failed=[*self.status.pairs_failed, f"{names[a]} and {names[b]}: {end.error}"])
         return [found[number] for number in sorted(found)]
 
+    def _better_map(self, alignment: SessionAlignment) -> MergeSummary | None:
+        """An earlier joint map that nothing speaks against, where something does against the new one: it stays."""
+        against = doubts_of_joining(alignment, [None] * len(alignment.sessions))
+        if len(alignment.worlds[0].members) == 1:
+            against = ["no two of the recordings met"]
+        facts = self._store.read(f"{MERGED}/{SUMMARY}")
+        if not against or facts is None:
+            return None
+        try:
+            earlier = MergeSummary.model_validate_json(facts)
+        except ValidationError:  # nobody knows what it is
+            return None
+        if not earlier.joined or earlier.unaccepted:
+            return None
+        self._note(map_points=earlier.map_points, earlier_map_kept=against)
+        return earlier
+
     def _write_map(self, alignment: SessionAlignment, remove_dynamic: bool) -> None:
         """The folder of `boxplus map merge`; an earlier one stays whole until this one is, where the store can do that."""
         names = [session.name for session in alignment.sessions]
@@ -265,8 +287,12 @@ class _Fleet:
             found[end.number] = end.value
         return [found[number] for number in range(len(arguments))]
 
-    def _note_alignment(self, meetings: Sequence[Meeting], alignment: SessionAlignment) -> None:
-        """Who is where, and which pairs met by themselves but not in the light of the others."""
+    def _note_alignment(self, meetings: Sequence[Meeting], alignment: SessionAlignment, earlier: MergeSummary | None) -> None:
+        """Who is where, and which pairs met by themselves but not in the light of the others.
+
+        Args:
+            earlier: the joint map that is there, if it is not the one of this alignment.
+        """
         names = [session.name for session in alignment.sessions]
         facts = {own.name: own for own in merge_facts(alignment, names, [None] * len(names)).sessions}
         lost = [
@@ -277,10 +303,12 @@ class _Fleet:
             for before, after in zip(meetings, alignment.meetings, strict=True)
             if before.refusal is None and after.refusal is not None
         ]
+        in_earlier = None if earlier is None else {own.name for own in earlier.joined}
         for number, own in enumerate(self._rows):
             if (found := facts.get(own.name)) is not None:
-                known = {"joined": found.joined, "apart_because": found.apart_because}
+                joined = found.joined if in_earlier is None else own.name in in_earlier
+                known = {"joined": joined, "apart_because": found.apart_because}
                 self._rows[number] = own.model_copy(update=known)
         against, in_doubt = ([text for text, is_in_doubt in lost if is_in_doubt == which] for which in (False, True))
-        joined = sum(meeting.refusal is None for meeting in alignment.meetings)
-        self._note(contradictions=against, pairs_in_doubt=in_doubt, pairs_joined=joined)
+        count = sum(meeting.refusal is None for meeting in alignment.meetings)
+        self._note(contradictions=against, pairs_in_doubt=in_doubt, pairs_joined=count)

@@ -46,6 +46,10 @@ class FleetStatus(Part):
     map_points: int = Field(0, description="in the joint map; 0 where there is none")
     warnings: list[str] = Field(default=[], description="of the joint map")
     map_doubts: list[str] = Field(default=[], description="why the joint map is not to be trusted")
+    earlier_map_kept: list[str] = Field(
+        default=[],
+        description="what speaks against a new joint map, for which that of an earlier fleet stays; none: it is the new one",
+    )
     seconds: float = 0.0
 
     @property
@@ -67,8 +71,13 @@ class FleetStatus(Part):
         found += [f"the recordings contradict each other: {text}" for text in self.contradictions]
         found += [f"left out of the joint map: {text}" for text in self.pairs_in_doubt]
         found += [f"the joint map is in doubt: {text}" for text in self.map_doubts]
+        found += [
+            f"the joint map of an earlier fleet stays as it was, as something speaks against a new one: {text}; move it away, "
+            "and the same command writes the new one"
+            for text in self.earlier_map_kept
+        ]
         sound = [own for own in self.recordings if own.state == "finished" and own.doubt is None]
-        if self.stage == "finished" and len(sound) > 1 and not self.joined:
+        if self.stage == "finished" and len(sound) > 1 and not self.joined and not self.earlier_map_kept:
             found.append("no two of the recordings met: there is no joint map")
         return found
 

@@ -27,6 +27,7 @@ from boxplus.runs.fleet.recordings import find_recordings, holds_recordings
 from boxplus.runs.fleet.status import RecordingStatus
 from boxplus.runs.fleet.store import open_store
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
+from boxplus.runs.sessions import joined
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.merge_run import merge_runs
 from boxplus.runs.sessions.summary import read_merge_summary
@@ -143,10 +144,30 @@ def test_recordings_that_met_are_joined_and_failed_ones_named(
     assert f"left out of the joint map: {why}" in doubted.doubts
     assert [own.apart_because for own in doubted.recordings if own.state == "finished"] == [[why], [why]]
     monkeypatch.setattr(fleet_run, "meet_runs", tasks.meet_runs)
-    # A pair whose task is lost is said to be, and is not joined.
+    # A pair whose task is lost is said to be, and is not joined. Nor does an earlier map go for it.
+    kept = (tmp_path / "b" / "merged" / "run.json").read_bytes()
     lost = run_fleet(recordings, tmp_path / "b", Backwards(lost=0), None, merging)
-    assert lost.joined == [] and lost.pairs_failed == ["friday and monday: lost 4 times: the worker died"]
-    assert "no two of the recordings met: there is no joint map" in lost.doubts
+    assert lost.pairs_failed == ["friday and monday: lost 4 times: the worker died"]
+    assert lost.earlier_map_kept == ["no two of the recordings met"] and lost.map_points == status.map_points
+    assert [text for text in lost.doubts if "the joint map of an earlier fleet stays as it was, as" in text]
+    assert not [text for text in lost.doubts if "there is no joint map" in text]
+    # A map with a doubt is written where there is none, and where one with a doubt is, but not over a sound one.
+    scale = "friday has another scale: it fits the others best with its lengths times 1.02"
+    with monkeypatch.context() as patched:
+        patched.setattr(joined, "_other_scales", lambda _: {0: (scale, False)})
+        for remove_dynamic in (False, True):
+            worse = run_fleet(recordings, tmp_path / "b", InProcess(), None, merging, remove_dynamic=remove_dynamic)
+            assert worse.earlier_map_kept == [scale] and worse.map_doubts == [] and worse.joined == ["friday", "monday"]
+            assert any(scale in text for text in worse.doubts)
+            assert (tmp_path / "b" / "merged" / "run.json").read_bytes() == kept
+        shutil.move(tmp_path / "b" / "merged", tmp_path / "earlier")
+        for _ in range(2):
+            first = run_fleet(recordings, tmp_path / "b", InProcess(), None, merging)
+            assert first.earlier_map_kept == [] and first.map_doubts == [scale]
+            assert first.joined == ["friday", "monday"]
+    shutil.rmtree(tmp_path / "b" / "merged")
+    lost = run_fleet(recordings, tmp_path / "b", Backwards(lost=0), None, merging)
+    assert lost.joined == [] and "no two of the recordings met: there is no joint map" in lost.doubts
 
     # Nor one that the others contradict.
     def contradicted(*given: Any) -> Any:
