@@ -95,8 +95,12 @@ class RunTerminal(Terminal):
             warnings, doubt: of what was made of the odometry, and why that is not to be trusted.
         """
         console = self.console
-        good = summary.state == "finished" and summary.contradiction is None
-        (console if good else self.alarms).print(Text(printable(summary.describe_state()), "green" if good else "yellow"))
+        good = summary.state == "finished" and summary.contradiction is None and doubt is None
+        told = summary.describe_state()
+        if doubt is not None and doubt != summary.contradiction:
+            known = "" if summary.contradiction is None else summary.contradiction  # it is told, and may be a part of the doubt
+            told = f"{told.removesuffix(f'; not to be trusted: {known}')}; not to be trusted: {doubt}"
+        (console if good else self.alarms).print(Text(printable(told), "green" if good else "yellow"))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")
         table.add_column()
@@ -115,8 +119,6 @@ class RunTerminal(Terminal):
             self.alarms.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
         for text in warnings:
             self.warn(text)
-        if doubt is not None and doubt != summary.contradiction:
-            self.doubt(doubt)
         self.print_files(folder, files)
 
     def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -52,8 +52,9 @@ def _body(own: LocalizationFolder, result: LocalizationResult) -> str:
         f"boxplus {escape(summary.versions['boxplus'])} · {summary.started:%Y-%m-%d %H:%M} UTC · "
         '<a href="odometry/report.html">report of the odometry</a></p>' + tiles(numbers)
     )
-    said = [*summary.warnings, *(f"lost at {text}" for text in summary.losses)]
-    said[:0] = [text for text in (summary.doubt, summary.contradiction) if text is not None]
+    candidates = set(summary.best_candidates)  # which have a table of their own
+    against = [text for text in summary.reasons if text not in candidates]
+    said = [*against, *summary.warnings, *(f"lost at {text}" for text in summary.losses)]
     notes = "".join(f"<li>{escape(text)}</li>" for text in summary.map_report)
     map_section = f"<section><h2>The map</h2><ul>{notes}</ul></section>"
     parts = [head, warnings_section([escape(text) for text in said]), _overview(own, result), _timeline(own)]

@@ -47,6 +47,10 @@ def localize(
         bool, typer.Option("--keep-map", help="Write the odometry's own map too.", rich_help_panel=RESULTS)
     ] = False,
     no_report: NoReportOption = False,
+    accept_doubts: Annotated[
+        bool,
+        typer.Option("--accept-doubts", help="End with code 0 also where the run that wrote the map says something against it."),
+    ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
     overwrite: OverwriteOption = False,
@@ -57,7 +61,7 @@ def localize(
 
     The odometry of 'boxplus lio', and beside it the search for its place in the map. Poses in the map's frame are written from
     where it is found on, and never while it is searched for. Exit codes: as 'boxplus lio'; 3 also where no place was found,
-    or where one was and may be wrong.
+    where one was and may be wrong, or where the map is not to be trusted, as the run that wrote it says.
     """
     from boxplus.runs.localization.config import load_localization_config
 
@@ -83,17 +87,22 @@ def localize(
                 opened_map = open_saved_map(saved, run_config.local_maps)
             terminal.print_evidence(opened.info, opened.info.evidence)
             with terminal.progress() as progress:
-                result = run_localization(opened, claimed, opened_map, run_config, progress=progress, should_stop=should_stop)
+                result = run_localization(
+                    opened,
+                    claimed,
+                    opened_map,
+                    run_config,
+                    accept_doubts=accept_doubts,
+                    progress=progress,
+                    should_stop=should_stop,
+                )
             if not no_report:
                 with outcome.drawing(terminal):
                     from boxplus.report.localization_page import write_localization_report
 
                     write_localization_report(folder, result)
         summary, files = result.summary, ("report.html", "trajectory.tum", "localization.csv", "searches.csv")
-        doubts = [text for text in (summary.doubt, summary.contradiction) if text is not None]
-        if summary.found_after_s is None:
-            doubts = ["no place was found", *summary.best_candidates, *doubts]
-        doubt = "; ".join(doubts) or None
+        doubt = "; ".join(summary.reasons) or None
         terminal.print_results(result.odometry, _rows(result), folder, files, warnings=summary.warnings, doubt=doubt)
         outcome.end(summary, summary.state, untrusted=doubt is not None)
 

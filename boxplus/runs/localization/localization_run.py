@@ -53,6 +53,7 @@ def run_localization(
     *,
     extrinsic: Extrinsic | None = None,
     overwrite: bool = False,
+    accept_doubts: bool = False,
     progress: Callable[[Progress], None] | None = None,
     view: View | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -64,6 +65,7 @@ def run_localization(
         folder: created; see docs/output_folder.md for what it holds. Or what `claim_localization_folder` yields.
         saved: from `open_saved_map`.
         config: settings; each has a default.
+        accept_doubts: of the map, which the run that wrote it says: they are warnings then, and no reason to distrust the poses.
         extrinsic, overwrite, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
@@ -92,7 +94,7 @@ def run_localization(
             recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, overwrite=overwrite, progress=progress,
             view=beside, should_stop=should_stop,
         )  # fmt: skip
-        summary = _summary(started, recording, odometry, saved, beside)
+        summary = _summary(started, recording, odometry, saved, beside, accept_doubts)
         summary.write(own.summary)
     return LocalizationResult(summary, odometry, saved)
 
@@ -153,11 +155,12 @@ class _Beside:
 
 
 def _summary(
-    started: datetime, recording: Recording, odometry: RunSummary, saved: SavedMap, beside: _Beside
+    started: datetime, recording: Recording, odometry: RunSummary, saved: SavedMap, beside: _Beside, accept_doubts: bool
 ) -> LocalizationSummary:
     search = beside.localizer.last_search
     warnings = [printable(f"the map is damaged: {text}") for text in saved.damage]
-    warnings += [printable(f"the map is not to be trusted, as the run that wrote it says: {text}") for text in saved.doubts]
+    accepted = [*saved.accepted, *(saved.doubts if accept_doubts else [])]
+    warnings += [printable(f"the run that wrote the map says against it, which somebody accepted: {text}") for text in accepted]
     texts: list[str] = []
     if beside.T_map_world is None:
         # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
@@ -185,6 +188,7 @@ def _summary(
         searches=beside.searches,
         losses=beside.losses,
         doubt=beside.localizer.doubt,
+        map_doubts=[] if accept_doubts else [printable(text) for text in saved.doubts],
         best_candidates=texts,
         T_map_world=beside.T_map_world,
         search_s=beside.search_s,

@@ -36,6 +36,9 @@ class LocalizationSummary(Part):
     searches: int = Field(0, description="queries looked for in the whole map")
     losses: list[str] = Field(default=[], description="when and why the place was lost")
     doubt: str | None = Field(None, description="why poses in the map that were given out are not to be trusted; null: nothing")
+    map_doubts: list[str] = Field(
+        default=[], description="why the map is not to be trusted, as the run that wrote it says, and nobody accepted"
+    )
     best_candidates: list[str] = Field(default=[], description="of the last search, where no place was found at its end")
     T_map_world: list[float] | None = Field(
         None, description="the odometry's world in the map at the end [qw … z]; null: unknown"
@@ -43,6 +46,13 @@ class LocalizationSummary(Part):
     search_s: float = Field(0.0, description="seconds spent on searches")
     tracking_s: float = Field(0.0, description="and on following the place")
     warnings: list[str] = Field(default=[])
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the result is not to be trusted, in sentences; none where nothing speaks against it."""
+        found = [] if self.found_after_s is not None else ["no place was found", *self.best_candidates]
+        found += [text for text in (self.doubt, self.contradiction) if text is not None]
+        return found + [f"the map is not to be trusted, as the run that wrote it says: {text}" for text in self.map_doubts]
 
     def write(self, path: Path) -> None:
         """Replace the file in one step.

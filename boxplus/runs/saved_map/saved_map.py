@@ -44,7 +44,7 @@ class SavedMap:
             a LAS or LAZ file has coordinates of the Earth.
         report: sentences on what it was opened as, and what had to be computed.
         damage: on what is torn and left out, as it was found so far: a tile may turn out damaged when it is read.
-        doubts: why the run that wrote it says it is not to be trusted.
+        doubts: why the run that wrote it says it is not to be trusted; accepted: what of that somebody accepted.
     """
 
     path: Path
@@ -57,6 +57,7 @@ class SavedMap:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     damage: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    accepted: list[str] = field(default_factory=list)
 
     def points_near(self, centre: ArrayLike, radius: float) -> NDArray[np.float32]:
         """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
@@ -83,14 +84,14 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     if not base.exists():
         advice = advice_to_put_back(base, base.absolute().parent) or "check the path"
         raise InputError(_WHAT, f"nothing at {base}", advice)
-    report, damage, doubts = list[str](), list[str](), list[str]()
+    report, damage, doubts, accepted = list[str](), list[str](), list[str](), list[str]()
     kind, trajectory, origin = "point cloud", None, np.zeros(3)
     if base.is_file():
         points, origin = _of_file(base, config.voxel)
         if origin.any():
             report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
-        tiles, kind, trajectory = _what_is_in(base, report, doubts)
+        tiles, kind, trajectory = _what_is_in(base, report, doubts, accepted)
         points = _of_tiles(tiles, config.voxel, report, damage)
     if not points.tiles:
         raise InputError("a map with points", f"none in {base}", "; ".join(damage) or "give the map of a run that went through")
@@ -105,10 +106,10 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         )
     if not local_maps:
         raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
-    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage, doubts)
+    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage, doubts, accepted)
 
 
-def _what_is_in(base: Path, report: list[str], doubts: list[str]) -> tuple[Path, str, Trajectory | None]:
+def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list[str]) -> tuple[Path, str, Trajectory | None]:
     """The folder with the tiles, what wrote it, and the trajectory they were made on."""
     is_bare = (base / MANIFEST).is_file()
     run = base.parent if is_bare else base
@@ -121,7 +122,8 @@ def _what_is_in(base: Path, report: list[str], doubts: list[str]) -> tuple[Path,
     if is_bare and (not folder.summary.is_file() or folder.tiles != base):
         return base, "map folder", None
     if program is not None:
-        doubts.extend(doubts_of(folder.summary))
+        for kept, texts in zip((doubts, accepted), doubts_of(folder.summary), strict=True):
+            kept.extend(texts)
     if is_bare and has_trajectory:
         report.append(f"the map belongs to the run in {run}, whose trajectory is used")
     kind = "map folder" if is_bare and not has_trajectory else program or "map folder"

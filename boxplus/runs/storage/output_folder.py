@@ -106,11 +106,15 @@ def _has_to_be_cleared(
     return True
 
 
-def doubts_of(summary: Path) -> list[str]:
-    """Why a run is not to be trusted, as its summary says; none where nothing speaks against it, or it cannot be read."""
+def doubts_of(summary: Path) -> tuple[list[str], list[str]]:
+    """Why a run is not to be trusted, as its summary says: what nobody accepted, and what somebody did.
+
+    None where nothing speaks against it, or the summary cannot be read.
+    """
     found = _facts(summary)
-    doubts, contradiction = found.get("doubts"), found.get("contradiction")
-    return [*map(str, doubts if isinstance(doubts, list) else []), *([str(contradiction)] if contradiction else [])]
+    doubts, accepted = ([*map(str, own)] if isinstance(own := found.get(key), list) else [] for key in ("doubts", "accepted"))
+    doubts += [str(found[key]) for key in ("doubt", "contradiction") if found.get(key)]
+    return [text for text in doubts if text not in accepted], [text for text in doubts if text in accepted]
 
 
 def program_of(summary: Path) -> str | None:

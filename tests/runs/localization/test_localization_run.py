@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from boxplus.errors import InputError
 from boxplus.formats.clouds.ply import read_ply, write_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion, se3
+from boxplus.recordings import open_recording
 from boxplus.recordings.recording import Recording
 from boxplus.report.localization_page import write_localization_report
 from boxplus.runs.lidar_inertial.config import load_run_config
@@ -94,15 +96,16 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     (torn / "run.json").write_text(json.dumps(said | {"contradiction": "its sensors disagree"}))
     words = ["localize", str(bag), "--map", str(torn), "-o", str(tmp_path / "out"), "--json"]
     called = CliRunner().invoke(app, [*words, *(f"--set={text}" for text in SETTINGS)])
-    assert called.exit_code == 0, called.stderr
+    assert called.exit_code == 3, called.stderr
     own, found = LocalizationFolder(tmp_path / "out"), json.loads(called.stdout)
-    assert found["outcome"] == "finished" and found["run"] == json.loads(own.summary.read_text())
+    assert found["outcome"] == "not to be trusted" and found["run"] == json.loads(own.summary.read_text())
     summary = LocalizationSummary.model_validate(found["run"])
     assert "found after" in called.stderr and str(own.trajectory.with_suffix(".tum")) in called.stderr
     assert any(text.startswith("the map is damaged: ") and segment.name in text for text in summary.warnings)
     assert " ".join(called.stderr.split()).count("a segment is damaged") == 1
     against = "the map is not to be trusted, as the run that wrote it says: its sensors disagree"
-    assert against in summary.warnings and against in " ".join(called.stderr.split())
+    assert summary.reasons == [against] and summary.map_doubts == ["its sensors disagree"]
+    assert re.search(r"finished: \d+ scans \([0-9.]+ s\); not to be trusted: " + against, " ".join(called.stderr.split()))
     assert summary.program == "boxplus localize" and summary.map_kind == "boxplus lio"
     assert summary.found_after_s is not None and summary.found_after_s <= 7.0 and not summary.losses
     trajectory, log = read_trajectory(own.trajectory), read_row_log(own.log, LOG_COLUMNS)
@@ -124,6 +127,14 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     assert "until the place was found" in page and "local maps were computed" in page
     with pytest.raises(InputError, match="earlier run"), claim_localization_folder(own.path):
         pass
+    # What somebody accepts is a warning.
+    saved, config = open_saved_map(torn), load_localization_config(settings=SETTINGS)
+    with open_recording(bag) as recording:
+        accepted = run_localization(
+            recording, tmp_path / "accepted", saved, config, accept_doubts=True, should_stop=lambda: True
+        ).summary
+    assert accepted.map_doubts == []
+    assert "the run that wrote the map says against it, which somebody accepted: its sensors disagree" in accepted.warnings
 
 
 @pytest.mark.slow

@@ -175,13 +175,16 @@ def test_what_its_run_says_against_a_map_is_read(tmp_path: Path) -> None:
     assert open_saved_map(tmp_path / "run", CONFIG).doubts == []
     for found, expected in (
         ({"program": "boxplus map merge", "doubts": ["two places of a kind", "a burst"]}, ["two places of a kind", "a burst"]),
+        ({"program": "boxplus map merge", "doubts": ["two places", "a burst"], "accepted": ["a burst"]}, ["two places"]),
+        ({"program": "boxplus refine", "doubt": "poses moved by 9 sigma"}, ["poses moved by 9 sigma"]),
         ({"program": "boxplus slam", "contradiction": "loops contradict"}, ["loops contradict"]),
         ({"program": "boxplus slam", "contradiction": None, "doubts": None}, []),
         (["no summary"], []),
     ):
         summary.write_text(json.dumps(found))
         assert open_saved_map(tmp_path / "run", CONFIG).doubts == expected
-        assert open_saved_map(tmp_path / "run" / "map", CONFIG).doubts == expected
+        bare = open_saved_map(tmp_path / "run" / "map", CONFIG)
+        assert bare.doubts == expected and bare.accepted == (["a burst"] if "accepted" in found else [])
 
 
 @pytest.mark.parametrize(("missing", "opened"), [("run/map", "run"), ("run/map", "run/map"), ("run", "run"), ("run", "run/map")])
