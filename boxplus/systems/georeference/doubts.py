@@ -6,13 +6,13 @@ import math
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.fit import Fit
 from boxplus.systems.georeference.jump import Jump
+from boxplus.systems.georeference.plateau import Plateau
 
 _MANY_GATED = 0.15
 _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
@@ -23,33 +23,30 @@ NOISY = 1.5
 _BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
 
 
-def runs_of(gated: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Stretches [begin, end) of successive gated fixes."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], gated, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def gated_stretches(attached: AttachedFixes, found: Fit) -> list[tuple[float, float, float]]:
     """(begin since the first fix [s], duration [s], median distance [m]) of stretches of fixes that are not used."""
     seconds = (attached.time_ns - attached.time_ns[0]) * 1e-9
     distance = np.linalg.norm(found.errors, axis=1)
-    return [
-        (float(seconds[a]), float(seconds[b - 1] - seconds[a]), float(np.median(distance[a:b])))
-        for a, b in runs_of(~found.is_used)
-    ]
+    return [(float(seconds[a]), float(seconds[b - 1] - seconds[a]), float(np.median(distance[a:b]))) for a, b in found.gated]
 
 
 def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
     """Gated fixes by what they look like."""
     counts: Counter[str] = Counter()
-    for a, b in runs_of(~found.is_used):
+    for a, b in found.gated:
         counts["off for a stretch (multipath)" if b - a > 2 else "off alone"] += b - a
     return counts
 
 
-def contradiction_of(jump: Jump | None, found: Fit) -> str | None:
-    """Why the result is not to be trusted: it lies between two datums, farther from either than its covariance says."""
-    return None if jump is None or not jump.is_beyond(found) else _of_jump(jump)
+def contradiction_of(jump: Jump | None, plateau: Plateau | None, found: Fit) -> str | None:
+    """Why the result is not to be trusted: it lies between two datums, or in one of them."""
+    said = [_of_jump(jump)] if jump is not None and found.is_off(jump.metres) else []
+    if plateau is not None:
+        said.append(
+            f"fixes lie {plateau.metres:.1f} m off for {plateau.duration:.0f} s from {plateau.begin:.0f} s on, all by the same "
+            "and longer than multipath lasts: another datum or base station there, which is not used; nobody knows which is right"
+        )
+    return "; ".join(said) or None
 
 
 def _of_jump(jump: Jump) -> str:
@@ -67,6 +64,7 @@ def doubts_of(
     has_lever: bool,
     stretches: list[tuple[float, float, float]],
     jump: Jump | None,
+    plateau: Plateau | None,
     config: GeoreferenceConfig,
 ) -> list[str]:
     """Sentences about what to doubt, beside what contradicts itself."""
@@ -88,12 +86,13 @@ def doubts_of(
         warnings.append(f"{100 * share:.0f} % of the fixes contradict the others and are not used")
     total = (attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
     for begin, duration, metres in stretches:
-        if duration > max(_LONG * total, _LASTING):
+        is_told = plateau is not None and plateau.begin <= begin <= plateau.begin + plateau.duration
+        if duration > max(_LONG * total, _LASTING) and not is_told:
             warnings.append(
                 f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
                 "another datum or base station, or the odometry is wrong there"
             )
-    if jump is not None and not jump.is_beyond(found):
+    if jump is not None and not found.is_off(jump.metres):
         warnings.append(_of_jump(jump))
     if found.noise_scale > NOISY:
         warnings.append(

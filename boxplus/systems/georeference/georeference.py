@@ -21,6 +21,7 @@ from boxplus.systems.georeference.fit import Fit, antennas, fit, level
 from boxplus.systems.georeference.heights import climb_of
 from boxplus.systems.georeference.hypotheses import other_clock, other_readings
 from boxplus.systems.georeference.jump import jump_of
+from boxplus.systems.georeference.plateau import plateau_of
 from boxplus.systems.georeference.start import Start, extent_of, find_start
 from boxplus.systems.slam.graph import MapGraph, mean_up
 
@@ -198,6 +199,7 @@ def _judged(
     ]
     warnings = warnings + [text for text in doubts if text is not None]
     jump = jump_of(attached, found, lambda after: fit(graph, attached, p_enu, found.T_enu_map, used, lever, config, after))
+    plateau = plateau_of(attached, found)
     left_out = Counter(attached.left_out) + of_gated(attached, found)
     return Georeference(
         refusal=None,
@@ -206,8 +208,8 @@ def _judged(
         attached=attached,
         left_out=dict(left_out),
         stretches=stretches,
-        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, jump, config),
-        contradiction=contradiction_of(jump, found),
+        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, jump, plateau, config),
+        contradiction=contradiction_of(jump, plateau, found),
     )
 
 

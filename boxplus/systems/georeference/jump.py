@@ -4,7 +4,7 @@ At the jump the errors of the fixes step, whatever the map makes of it before an
 ends. But where it is the datum, and all fixes from there on may be shifted by the same, the step is gone.
 
 Near to the begin or the end of a recording it may be multipath as well that began before, or goes on after it: one side of the
-step is wrong all the same, and the map is bent between the two. That is said, though it is no proof of another datum.
+step is wrong all the same, and the map, which rests on both, is bent between the two.
 
 The fit with two datums bends the odometry before it lets a datum jump, as a fix counts for little beside those near to it in
 time: of a usual receiver much of a step may stay. Then the step itself is asked, from near (`step`), which also tells bursts
@@ -37,8 +37,6 @@ _TRIED = 4  # steps, the largest first
 _BESIDE = 2  # fixes, by which a step may be off
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
 _SIDE_USED = 0.5  # of the fixes on the short side of a step, for the map to be bent by them
-_SIGMAS = 3.0
-_LEAST_M = 0.1  # between two datums: less than that is no reason to distrust a map
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +50,6 @@ class Jump:
     seconds: float
     metres: float
     lasts: bool = True
-
-    def is_beyond(self, found: Fit) -> bool:
-        """Whether a map between two datums is off by more than it claims, and by more than matters."""
-        return self.lasts and self.metres > max(_SIGMAS * float(np.median(found.sigma)), _LEAST_M)
 
 
 def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.bool_]], Fit]) -> Jump | None:
@@ -113,9 +107,16 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
 
 
 def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:
-    """The step at a fix or one beside it: means of a few fixes do not tell which."""
+    """The step at a fix or one beside it: means of a few fixes do not tell which.
+
+    Bursts of multipath elsewhere, which the map does not rest on, say nothing of it, and a large one would be half of the step.
+    """
     inside = range(max(at - _BESIDE, 1), min(at + _BESIDE + 1, len(seconds)))
-    return max((step_at(seconds, found.errors[:, :2], k, sigma) for k in inside), key=lambda step: step.gain)
+    kept = found.is_used.copy()
+    for begin, end in found.gated:
+        kept[begin:end] = begin <= inside[-1] and end >= inside[0]
+    row, e = np.cumsum(kept) - 1, found.errors[kept, :2]
+    return max((step_at(seconds[kept], e, int(row[k]), sigma) for k in inside if row[k] > 0), key=lambda step: step.gain)
 
 
 def _steps(errors: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,16 +15,19 @@ from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
-from boxplus.systems.georeference.doubts import doubts_of
+from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches
 from boxplus.systems.georeference.fit import Fit, level
 from boxplus.systems.georeference.georeference import Georeference, georeference
 from boxplus.systems.georeference.jump import jump_of
+from boxplus.systems.georeference.plateau import plateau_of
 from boxplus.systems.georeference.start import find_start
 from tests.systems.georeference.drives import LAPS, ORIGIN, Drive, drive
 
 LEVER = (0.8, -0.3, 1.1)
 STEP = np.array([3.0, 0.0, 0.0])
 GOOD = GnssConfig(sigma=0.3, slow_sigma=0.1, claimed=0.3, lever=LEVER)
+USUAL = GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.5, "claimed": 0.7})
+CONFIG = GeoreferenceConfig()
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +123,66 @@ def test_bursts_near_the_ends_do_not_hide_a_jump(laps: Drive) -> None:
     assert jump is not None and jump.lasts and jump.seconds == pytest.approx(half, abs=1.5)
 
 
+def test_bursts_elsewhere_are_no_half_of_a_jump(laps: Drive) -> None:
+    """A burst of 34 m that was gated half a minute before another one made a jump of 31 m of that, in a drive that was right."""
+    good = found(laps, USUAL)
+    assert good.fit is not None
+    seconds, random = np.arange(93.0), np.random.default_rng(5)
+    covariance = np.tile(good.attached.covariance[:1], (93, 1, 1))
+    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(93, np.intp))
+    errors, used = random.normal(0.0, 0.5, (93, 3)), np.ones(93, dtype=bool)
+    for begin, metres in ((11, [30.0, 0.0, 0.0]), (23, [-20.0, 28.0, 0.0]), (55, [12.0, -18.0, 0.0])):
+        errors[begin : begin + 6] += metres
+        used[begin : begin + 6] = False
+    right = replace(good.fit, errors=errors, is_used=used)
+    assert jump_of(fixes, right, lambda after: replace(right, datum_step=np.array([0.4, -0.9, 0.0]))) is None
+
+
+@pytest.mark.parametrize(
+    ("metres", "wanders", "standing", "told"), [(12.0, 0.0, False, True), (12.0, 12.0, False, False), (12.0, 0.0, True, False)]
+)
+def test_fixes_that_are_off_by_the_same_for_long_contradict_the_others(
+    laps: Drive, metres: float, wanders: float, standing: bool, told: bool
+) -> None:
+    """They were gated, and a map that may lie in the wrong one of two datums ended with code 0."""
+    good = found(laps, USUAL)
+    assert good.fit is not None and plateau_of(good.attached, good.fit) is None
+    seconds = (good.attached.time_ns - good.attached.time_ns[0]) * 1e-9
+    inside = (seconds >= 20.0) & (seconds < 60.0)
+    way = np.stack([np.cos(seconds), np.sin(seconds), 0.0 * seconds], axis=1)
+    errors = good.fit.errors + inside[:, None] * (metres * np.array([0.8, 0.6, 0.0]) + wanders * way)
+    used = ~inside
+    used[np.flatnonzero(inside)[5]] = True  # by chance
+    gated = replace(good.fit, errors=errors, is_used=used)
+    attached = replace(good.attached, v_map=good.attached.v_map * (0.0 if standing else 1.0))
+    plateau = plateau_of(attached, gated)
+    assert (plateau is not None) == told
+    said = contradiction_of(None, plateau, gated)
+    if not told:
+        assert said is None
+        return
+    assert plateau is not None and plateau.metres == pytest.approx(metres, abs=1.0) and 36.0 < plateau.duration < 41.0
+    assert said is not None and re.search("fixes lie 1[12].. m off for [34]. s from 2. s on, all by the same and longer", said)
+    stretches = gated_stretches(attached, gated)
+    assert not any("longer than multipath" in text for text in doubts_of(attached, gated, True, stretches, None, plateau, CONFIG))
+
+
+def test_a_long_jump_is_a_contradiction_wherever_it_begins(laps: Drive) -> None:
+    there = drive([*LAPS, [0, 60], [0, 0], [120, 0]])
+
+    def jumped(given: Drive, receiver: GnssConfig, begin: float, end: float, metres: list[float]) -> Georeference:
+        fixes = given.fixes(receiver)
+        seconds = (fixes.time_ns - fixes.time_ns[0]) * 1e-9
+        moved = shifted(fixes, np.array(metres), (seconds >= begin * seconds[-1]) & (seconds < end * seconds[-1]))
+        return georeference(given.graph, moved, given.time_ns, given.T_odo_imu, None, np.array(LEVER))
+
+    long = jumped(there, USUAL, 0.3, 0.65, [9.6, 7.2, 0.0])
+    assert long.fit is not None and long.contradiction is not None and "nobody knows which is right" in long.contradiction
+    late = jumped(laps, GOOD.model_copy(update=PRECISE), 0.67, 2.0, [0.5, 0.3, 0.0])
+    assert late.fit is not None and laps.off(late).max() > 3.0 * np.sqrt(2.0) * np.median(late.fit.sigma)
+    assert late.contradiction is not None and "that lasts to the begin or the end" in late.contradiction
+
+
 def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
     """And no reason to refuse the map, which is."""
 
@@ -160,7 +224,7 @@ def test_an_antenna_elsewhere_is_named_where_speeds_do_not_tell_it_from_a_delay(
     assert fit is not None
 
     def said(attached: AttachedFixes) -> str:
-        (warning,) = [text for text in doubts_of(attached, fit, True, [], None, GeoreferenceConfig()) if "stamped" in text]
+        (warning,) = [text for text in doubts_of(attached, fit, True, [], None, None, CONFIG) if "stamped" in text]
         return warning
 
     assert "farther back than the lever arm says would look the same" in said(result.attached)  # driven at one speed
@@ -262,12 +326,9 @@ def test_a_step_near_to_the_begin_is_said_and_none_that_is_gated(laps: Drive) ->
     for metres, is_bent in ((2.5, True), (40.0, False), (0.0, False)):
         moved = shifted(fixes, np.array([0.8 * metres, -0.6 * metres, 0.0]), early)
         result = georeference(laps.graph, moved, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
-        assert result.contradiction is None
-        said = [text for text in result.warnings if "multipath that lasts to the begin or the end" in text]
-        assert len(said) == is_bent, (metres, result.warnings)
-
-
-USUAL = GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.5, "claimed": 0.7})
+        assert not any("fixes jump" in text for text in result.warnings)
+        said = "multipath that lasts to the begin or the end" in (result.contradiction or "")
+        assert said == is_bent and (result.contradiction is not None) == is_bent, (metres, result.contradiction)
 
 
 @pytest.mark.parametrize("seed", [14, 20, 24])
