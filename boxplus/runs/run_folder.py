@@ -11,12 +11,20 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import SUMMARY, output_folder, program_of, refuse_both
+from boxplus.runs.storage.output_folder import SUMMARY, doubts_of, output_folder, program_of, refuse_both
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
 
 _SCAN_FILE = re.compile(r"-?\d+\.(pcd|ply|las|laz|e57)")
+
+
+def doubts_of_map(tiles: Path) -> list[str]:
+    """Why a map folder is not to be trusted, as the run that it lies in says, in sentences; none where it lies in none."""
+    run = RunFolder(tiles.absolute().parent)
+    if run.tiles != tiles.absolute() or not run.summary.is_file():
+        return []
+    return [f"not to be trusted, as the run that wrote it says: {text}" for text in doubts_of(run.summary)[0]]
 
 
 def is_map_file(inside: Path) -> bool:

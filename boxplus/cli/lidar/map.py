@@ -46,10 +46,12 @@ def _tiles(folder: Path) -> Path:
 
 @map_app.command("info", cls=Command)
 def info_command(folder: _Folder) -> None:
-    """Say how many points and tiles a map has, where it lies, and what of it is incomplete."""
+    """Say how many points and tiles a map has, where it lies, what of it is incomplete, and what its run says against it."""
     from boxplus.maps.tiles.store import TileStore
+    from boxplus.runs.run_folder import doubts_of_map
 
-    store = TileStore.open(_tiles(folder))
+    tiles = _tiles(folder)
+    store = TileStore.open(tiles)
     size = store.manifest.tile_size_m
     thinning = "every point" if store.manifest.voxel_m is None else f"one point per {store.manifest.voxel_m:g} m voxel"
     typer.echo(f"{folder}: {store.point_count:,} points in {len(store.counts)} tiles of {size:g} m, {thinning}")
@@ -59,6 +61,8 @@ def info_command(folder: _Folder) -> None:
         extent = ", ".join(f"{name} {a:g} … {b:g} m" for name, a, b in zip("xyz", low, high, strict=True))
         typer.echo(f"tiles span {extent}")
     for sentence in store.report or ("whole: the run that wrote it closed it, and every file is complete",):
+        typer.echo(sentence)
+    for sentence in doubts_of_map(tiles):
         typer.echo(sentence)
 
 
@@ -79,9 +83,10 @@ def export_command(
 ) -> None:
     """Write all tiles of a map into one file: PLY or PCD, LAS or LAZ (pip install laspy lazrs), E57 (pip install pye57)."""
     from boxplus.maps.tiles.store import TileStore, merge
+    from boxplus.runs.run_folder import doubts_of_map
 
     tiles = _tiles(folder)
-    for sentence in TileStore.open(tiles).report:
+    for sentence in (*TileStore.open(tiles).report, *doubts_of_map(tiles)):
         typer.echo(f"warning: {sentence}", err=True)
     outputs = output or [tiles.resolve().parent / f"{tiles.resolve().name}.ply"]
     for path in outputs:

@@ -38,6 +38,7 @@ def grid(
     from boxplus.formats.ros_map import write_ros_map
     from boxplus.maps.floor_plan.occupancy import FREE, OCCUPIED, FloorPlanConfig
     from boxplus.runs.map_from_above import MapFromAbove
+    from boxplus.runs.run_folder import doubts_of_map
 
     if not 0.0 < heights[0] < heights[1]:
         raise InputError("heights that ascend from above 0 m", f"{heights[0]:g} and {heights[1]:g}", "correct --heights")
@@ -45,7 +46,7 @@ def grid(
     _check_new([stem.with_name(f"{stem.name}.{ending}") for ending in ("pgm", "yaml")], overwrite)
     config = FloorPlanConfig(resolution=resolution, least_height=heights[0], largest_height=heights[1], slope=slope)
     above = MapFromAbove(folder, config, z)
-    _warn(above.store.report)
+    _warn([*above.store.report, *doubts_of_map(above.store.folder)])
     voxel = above.store.manifest.voxel_m
     if voxel is not None and resolution < voxel:
         _warn([f"cells of {resolution:g} m are smaller than the map's voxels of {voxel:g} m: walls may have holes"])
@@ -76,12 +77,13 @@ def height(
     from boxplus.formats.geotiff import require_rasterio, write_geotiff
     from boxplus.maps.floor_plan.occupancy import FloorPlanConfig
     from boxplus.runs.map_from_above import MapFromAbove
+    from boxplus.runs.run_folder import doubts_of_map
 
     path = output or folder / "height.tif"
     _check_new([path], overwrite)
     require_rasterio()
     above = MapFromAbove(folder, FloorPlanConfig(ground_cell=resolution, slope=slope), z)
-    _warn(above.store.report)
+    _warn([*above.store.report, *doubts_of_map(above.store.folder)])
     heights, raster = above.surface() if surface else above.ground()
     projection = None if above.frame is None else above.frame.projection
     heights = above.above_ellipsoid(heights)
@@ -98,6 +100,6 @@ def _check_new(paths: list[Path], overwrite: bool) -> None:
             raise InputError("a new file", f"{path}, which exists", "give another path, or --overwrite")
 
 
-def _warn(sentences: tuple[str, ...] | list[str]) -> None:
+def _warn(sentences: list[str]) -> None:
     for sentence in sentences:
         typer.echo(f"warning: {sentence}", err=True)

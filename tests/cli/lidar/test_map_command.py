@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,19 @@ def test_export_replaces_nothing_unasked(folder: Path, tmp_path: Path) -> None:
 
 def test_the_output_folder_of_a_run_will_do(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{}")
-    assert "3 points in 2 tiles" in CliRunner().invoke(map_app, ["info", str(tmp_path)]).output
+    said = CliRunner().invoke(map_app, ["info", str(tmp_path)]).output
+    assert "3 points in 2 tiles" in said and "not to be trusted" not in said
+
+
+def test_what_its_run_says_against_a_map_is_told(folder: Path, tmp_path: Path) -> None:
+    """It was called whole, and exported without a word."""
+    (tmp_path / "run.json").write_text(json.dumps({"doubts": ["two places of a kind", "a burst"], "accepted": ["a burst"]}))
+    said = "not to be trusted, as the run that wrote it says: two places of a kind"
+    for path in (tmp_path, folder):
+        info = CliRunner().invoke(map_app, ["info", str(path)])
+        assert info.output.endswith(f"{said}\n") and "burst" not in info.output
+    exported = CliRunner().invoke(map_app, ["export", str(folder), "-o", str(tmp_path / "a.ply")])
+    assert exported.exit_code == 0 and f"warning: {said}" in exported.stderr
 
 
 def test_a_dot_in_the_folder_is_kept(tmp_path: Path) -> None:
