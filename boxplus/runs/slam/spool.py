@@ -169,7 +169,7 @@ class _Head(NamedTuple):
     """What stands before the points of a scan, with their size [bytes] and checksum."""
 
     time_ns: int
-    count: int
+    points: int
     has_intensity: bool
     T_odo_body: NDArray[np.float64]
     size: int
@@ -209,8 +209,8 @@ def _next_scan(file: BinaryIO) -> SpooledScan | None:
     data = file.read(head.size)
     if zlib.crc32(data) != head.checksum:
         raise ValueError(_damaged(begin))
-    points = np.frombuffer(data, dtype=np.float32, count=3 * head.count).reshape(-1, 3)
-    intensity = np.frombuffer(data, dtype=np.float32, offset=_POINT * head.count) if head.has_intensity else None
+    points = np.frombuffer(data, dtype=np.float32, count=3 * head.points).reshape(-1, 3)
+    intensity = np.frombuffer(data, dtype=np.float32, offset=_POINT * head.points) if head.has_intensity else None
     return SpooledScan(head.time_ns, head.T_odo_body, points, intensity)
 
 
