@@ -40,7 +40,7 @@ def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
 
 def contradiction_of(jump: Jump | None, plateau: Plateau | None, found: Fit) -> str | None:
     """Why the result is not to be trusted: it lies between two datums, or in one of them."""
-    said = [_of_jump(jump)] if jump is not None and found.is_off(jump.metres) else []
+    said = [_of_jump(jump)] if jump is not None and jump.contradicts(found) else []
     if plateau is not None:
         said.append(
             f"fixes lie {plateau.metres:.1f} m off for {plateau.duration:.0f} s from {plateau.begin:.0f} s on, all by the same "
@@ -92,7 +92,7 @@ def doubts_of(
                 f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
                 "another datum or base station, or the odometry is wrong there"
             )
-    if jump is not None and not found.is_off(jump.metres):
+    if jump is not None and not jump.contradicts(found):
         warnings.append(_of_jump(jump))
     if found.noise_scale > NOISY:
         warnings.append(

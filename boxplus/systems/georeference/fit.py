@@ -32,7 +32,7 @@ _DAMPING = 1e-9
 _MEDIAN_SQUARE = 2.366  # of a normal vector of three
 _ROUNDS = 4
 _SETTLED = 1.1
-_OFF_SIGMAS = 3.0
+OFF_SIGMAS = 3.0
 _LEAST_OFF = 0.1  # m: less is no reason to distrust a map
 _HERE = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
 _SHIFTED = np.diag(np.repeat([1e-6, 100.0], 3) ** 2)[None]  # rad, m: of one datum in another
@@ -75,9 +75,14 @@ class Fit:
         edges = np.flatnonzero(np.diff(np.concatenate([[True], self.is_used, [True]]).astype(np.int8)))
         return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
+    @property
+    def p_enu_map(self) -> Floats:
+        """(n, 3) where the local maps are, in the first datum [m]."""
+        return np.asarray(se3.compose(self.T_enu_map, self.T_map)[:, 4:])
+
     def is_off(self, metres: float) -> bool:
         """Whether a map that is off by so much on the ground is so by more than it claims, and by more than matters."""
-        return metres > max(_OFF_SIGMAS * float(np.median(self.sigma)), _LEAST_OFF)
+        return metres > max(OFF_SIGMAS * float(np.median(self.sigma)), _LEAST_OFF)
 
 
 def level(T_odo: Floats) -> Floats:

@@ -4,7 +4,8 @@ At the jump the errors of the fixes step, whatever the map makes of it before an
 ends. But where it is the datum, and all fixes from there on may be shifted by the same, the step is gone.
 
 Near to the begin or the end of a recording it may be multipath as well that began before, or goes on after it: one side of the
-step is wrong all the same, and the map, which rests on both, is bent between the two.
+step is wrong all the same, and the map, which rests on both, is bent between the two. How far that is, is asked: few fixes bend
+it by less than it claims to be known.
 
 The fit with two datums bends the odometry before it lets a datum jump, as a fix counts for little beside those near to it in
 time: of a usual receiver much of a step may stay. Then the step itself is asked, from near (`step`), which also tells bursts
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import SingularProblemError
 from boxplus.systems.georeference.attachment import AttachedFixes
-from boxplus.systems.georeference.fit import Fit
+from boxplus.systems.georeference.fit import OFF_SIGMAS, Fit
 from boxplus.systems.georeference.step import Step, step_at
 
 Floats = NDArray[np.float64]
@@ -45,11 +46,17 @@ class Jump:
 
     Attributes:
         lasts: both sides of it last longer than multipath does.
+        bend: by how many of its own standard deviations the map is off at least, whichever side is right.
     """
 
     seconds: float
     metres: float
-    lasts: bool = True
+    lasts: bool
+    bend: float
+
+    def contradicts(self, found: Fit) -> bool:
+        """Whether the map is off by more than it claims: by the jump, or on a short side by what that bends it at least."""
+        return found.is_off(self.metres) and (self.lasts or self.bend > OFF_SIGMAS)
 
 
 def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.bool_]], Fit]) -> Jump | None:
@@ -99,11 +106,21 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
             # Of the map that lies bent between both the errors step by less: it goes along.
             metres = float(np.linalg.norm(split.datum_step[:2]))
             alone = step.metres_beside if step.is_beside else step.metres
-            jump = Jump(float(seconds[at[largest]]), metres if is_explained else max(metres, alone), not is_short)
+            jump = Jump(
+                float(seconds[at[largest]]), metres if is_explained else max(metres, alone), not is_short, _bend(found, split)
+            )
             if jump.lasts:
                 return jump
             short = jump
     return short
+
+
+def _bend(found: Fit, split: Fit) -> float:
+    """How far the map lies from where it would in either datum, in its standard deviations, where it is the farthest."""
+    bent = found.p_enu_map - split.p_enu_map
+    return min(
+        float((np.linalg.norm((bent - shift)[:, :2], axis=1) / found.sigma).max()) for shift in (np.zeros(3), split.datum_step)
+    )
 
 
 def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:

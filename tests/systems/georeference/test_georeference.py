@@ -326,9 +326,9 @@ def test_a_step_near_to_the_begin_is_said_and_none_that_is_gated(laps: Drive) ->
     for metres, is_bent in ((2.5, True), (40.0, False), (0.0, False)):
         moved = shifted(fixes, np.array([0.8 * metres, -0.6 * metres, 0.0]), early)
         result = georeference(laps.graph, moved, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER))
-        assert not any("fixes jump" in text for text in result.warnings)
-        said = "multipath that lasts to the begin or the end" in (result.contradiction or "")
-        assert said == is_bent and (result.contradiction is not None) == is_bent, (metres, result.contradiction)
+        assert result.contradiction is None  # the few fixes bend it by less than it claims to be known
+        said = [text for text in result.warnings if "multipath that lasts to the begin or the end" in text]
+        assert len(said) == is_bent, (metres, result.warnings)
 
 
 @pytest.mark.parametrize("seed", [14, 20, 24])
