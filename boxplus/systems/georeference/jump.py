@@ -102,10 +102,10 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         is_explained = gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
         is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
-        if not step.is_burst and (is_explained or is_left):
+        alone = step.metres_beside if step.is_beside else step.metres
+        if not step.is_burst and (is_explained or (is_left and _rests_on_both(found, seconds, int(at[largest]), alone))):
             # Of the map that lies bent between both the errors step by less: it goes along.
             metres = float(np.linalg.norm(split.datum_step[:2]))
-            alone = step.metres_beside if step.is_beside else step.metres
             jump = Jump(
                 float(seconds[at[largest]]), metres if is_explained else max(metres, alone), not is_short, _bend(found, split)
             )
@@ -113,6 +113,17 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
                 return jump
             short = jump
     return short
+
+
+def _rests_on_both(found: Fit, seconds: Floats, at: int, metres: float) -> bool:
+    """Whether a map may lie between two datums so far apart: fixes of either are used, and so within reach of it.
+
+    One that rests on the fixes of one side lies in their datum; what is on the other is another question (`plateau`).
+    """
+    near = np.abs(seconds - seconds[at]) <= _LASTING
+    sides = found.is_used[:at][near[:at]], found.is_used[at:][near[at:]]
+    reach = float(np.linalg.norm(found.errors[found.is_used, :2], axis=1).max(initial=0.0))
+    return min(float(side.mean()) for side in sides) >= _SIDE_USED and metres <= 2.0 * reach
 
 
 def _bend(found: Fit, split: Fit) -> float:

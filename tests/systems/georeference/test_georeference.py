@@ -183,6 +183,24 @@ def test_a_long_jump_is_a_contradiction_wherever_it_begins(laps: Drive) -> None:
     assert late.contradiction is not None and "that lasts to the begin or the end" in late.contradiction
 
 
+@pytest.mark.parametrize("seed", [6, 8])
+def test_multipath_that_wanders_for_long_is_no_jump(seed: int) -> None:
+    """The map rests on the fixes before and after it, and was said to lie between two datums 25 and 50 m apart."""
+    there = drive([*LAPS, [0, 60], [0, 0], [120, 0]])
+    fixes, random = there.fixes(USUAL, seed), np.random.default_rng(seed)
+    seconds = (fixes.time_ns - fixes.time_ns[0]) * 1e-9
+    off, wander = random.normal(0.0, 15.0, 2), np.zeros((len(seconds), 3))
+    for k, step in enumerate(np.diff(seconds), 1):
+        stays = np.exp(-step / 12.0)
+        off = stays * off + np.sqrt(1.0 - stays**2) * random.normal(0.0, 15.0, 2)
+        wander[k, :2] = off
+    inside = (seconds >= 30.0) & (seconds < 68.0)
+    moved = shifted(fixes, wander[inside], inside)
+    result = georeference(there.graph, moved, there.time_ns, there.T_odo_imu, None, np.array(LEVER))
+    assert result.fit is not None and there.off(result).max() < 3.0 * np.median(result.fit.sigma)
+    assert result.contradiction is None and any("longer than multipath lasts" in text for text in result.warnings)
+
+
 def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
     """And no reason to refuse the map, which is."""
 
