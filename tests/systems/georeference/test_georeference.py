@@ -198,7 +198,7 @@ def test_multipath_that_wanders_for_long_is_no_jump(seed: int) -> None:
     moved = shifted(fixes, wander[inside], inside)
     result = georeference(there.graph, moved, there.time_ns, there.T_odo_imu, None, np.array(LEVER))
     assert result.fit is not None and there.off(result).max() < 3.0 * np.median(result.fit.sigma)
-    assert result.contradiction is None and any("longer than multipath lasts" in text for text in result.warnings)
+    assert result.contradiction is None and any("contradict the others and are not used" in text for text in result.warnings)
 
 
 def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
