@@ -231,6 +231,16 @@ def test_scans_that_are_not_all_there_are_no_smaller_map(
     summary.model_copy(update={"spool_bytes": size + 1000}).write(cut / "run.json")
     with pytest.raises(InputError, match=f"expected the {size + 1000} bytes of .*scans.spool – got {size}: it was cut"):
         update_map(merged[0], [cut])
+    summary.write(cut / "run.json")
+    data = bytearray((cut / "scans.spool").read_bytes())
+    data[size // 2] ^= 0x40
+    (cut / "scans.spool").write_bytes(data)
+    before, (out, earlier) = (merged[0] / "map.ply").read_bytes(), merged
+    with pytest.raises(InputError, match=r"scans.spool: the scan that begins at byte \d+ is damaged: its checksum"):
+        merge_runs(
+            [cut, *runs[0][1:]], out, load_settings(MergeConfig, None, QUICK), overwrite=True, align=lambda _: earlier.alignment
+        )
+    assert (out / "map.ply").read_bytes() == before
 
 
 @pytest.mark.parametrize("at_line", [True, False])
