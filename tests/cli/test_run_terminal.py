@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import pytest
 from rich.console import Console
 
 from boxplus.cli.run_terminal import RunTerminal
+from boxplus.runs.run_facts import RunFacts
 from boxplus.runs.run_loop import Progress
 
 
@@ -28,3 +33,26 @@ def test_estimates_are_counted_where_there_are_some() -> None:
     with terminal.progress() as progress:
         progress(Progress(0.5, 40, "scans", "weak"))
     assert "odometry" in shown.getvalue() and "40 scans, 0/s, weak" in shown.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("contradiction", "doubt", "said"),
+    [
+        (None, None, "finished: 9 scans"),
+        (None, "loops contradict", "finished: 9 scans; not to be trusted: loops contradict"),
+        ("clocks differ", "clocks differ", "finished: 9 scans; not to be trusted: clocks differ"),
+        ("clocks differ", "clocks differ; fixes jump", "finished: 9 scans; not to be trusted: clocks differ; fixes jump"),
+    ],
+)
+def test_the_first_line_says_whether_a_result_is_to_be_trusted(contradiction: str | None, doubt: str | None, said: str) -> None:
+    """It was a green "finished" where something spoke against what was made of the odometry, and the reason stood far below."""
+    terminal, shown, alarms = RunTerminal(), io.StringIO(), io.StringIO()
+    terminal.console, terminal.alarms = Console(file=shown, width=140), Console(file=alarms, width=140)
+    known = "" if contradiction is None else f"; not to be trusted: {contradiction}"
+    summary = SimpleNamespace(
+        state="finished", contradiction=contradiction, status={}, estimates=(9, "scans"), start=None, path_length_m=1.0,
+        length_unit="m", duration_s=1.0, warnings=[], describe_state=lambda: f"finished: 9 scans{known}",
+    )  # fmt: skip
+    terminal.print_results(cast(RunFacts, summary), [], Path("out"), [], doubt=doubt)
+    first, other = (shown, alarms) if doubt is None else (alarms, shown)
+    assert first.getvalue().splitlines()[0] == said and "not to be trusted" not in other.getvalue()
