@@ -46,9 +46,10 @@ def _body(own: LocalizationFolder, result: LocalizationResult) -> str:
         (f"{len(summary.losses)}", "times lost"),
         (f"{summary.places}", "places of the map"),
     ]
+    color, told = ("failed", "not to be trusted · ") if summary.reasons else (summary.state, "")
     head = (
         f"<h1>{escape(Path(summary.recording).name)}</h1>"
-        f'<p class="lead"><span class="state {summary.state}">{summary.state}</span> in the map {escape(summary.map)} · '
+        f'<p class="lead"><span class="state {color}">{summary.state}</span> {told}in the map {escape(summary.map)} · '
         f"boxplus {escape(summary.versions['boxplus'])} · {summary.started:%Y-%m-%d %H:%M} UTC · "
         '<a href="odometry/report.html">report of the odometry</a></p>' + tiles(numbers)
     )

@@ -45,9 +45,10 @@ def _body(result: SlamResult) -> str:
         (f"{summary.path_length_m:.1f} m", "path of the odometry"),
         (f"{summary.map_points:,}", "points of the corrected map"),
     ]
+    color, told = (summary.state, "") if summary.contradiction is None else ("failed", "not to be trusted · ")
     head = (
         f"<h1>{escape(Path(summary.recording).name)}</h1>"
-        f'<p class="lead"><span class="state {summary.state}">{summary.state}</span> loops closed on LiDAR-inertial odometry · '
+        f'<p class="lead"><span class="state {color}">{summary.state}</span> {told}loops closed on LiDAR-inertial odometry · '
         f"boxplus {escape(summary.versions['boxplus'])} · {summary.started:%Y-%m-%d %H:%M} UTC · "
         '<a href="odometry/report.html">report of the odometry</a></p>' + tiles(numbers)
     )

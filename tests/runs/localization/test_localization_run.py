@@ -125,6 +125,7 @@ def test_another_way_through_the_map_is_found_and_followed(mapped: Path, tmp_pat
     assert "" in searches.texts["verdict"] and "passes" in searches.status
     page = (own.path / "report.html").read_text(encoding="utf-8")
     assert "until the place was found" in page and "local maps were computed" in page
+    assert '<span class="state failed">finished</span> not to be trusted · in the map' in page and against in page
     with pytest.raises(InputError, match="earlier run"), claim_localization_folder(own.path):
         pass
     # What somebody accepts is a warning.
