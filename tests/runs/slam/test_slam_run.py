@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.recordings.recording import Recording
 from boxplus.report import load_report, write_report
+from boxplus.report.slam_page import write_slam_report
 from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
@@ -95,6 +97,15 @@ def test_the_loop_is_closed_and_nothing_gets_worse(finished: Finished) -> None:
         finished.error(read_trajectory(path)) for path in (finished.folder.trajectory, finished.folder.odometry.trajectory)
     )
     assert after <= before + 0.005
+
+
+def test_the_head_of_the_report_says_what_is_not_to_be_trusted(finished: Finished, tmp_path: Path) -> None:
+    summary = finished.result.summary.model_copy(update={"contradiction": "positions by satellite: fixes jump by 3.0 m"})
+    copy = SlamFolder(tmp_path)
+    shutil.copy(finished.folder.gnss, copy.gnss)
+    page = write_slam_report(replace(finished.result, folder=copy, summary=summary)).read_text(encoding="utf-8")
+    assert '<span class="state failed">finished</span> not to be trusted · loops closed' in page
+    assert "fixes jump by 3.0 m" in page and summary.describe_state().endswith("fixes jump by 3.0 m")
 
 
 def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> None:
