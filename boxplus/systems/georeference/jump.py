@@ -30,10 +30,11 @@ Floats = NDArray[np.float64]
 
 _WINDOW = 5  # fixes on either side of a step
 _FEWEST = 2 * _WINDOW  # in a datum, to be one
-_STANDS_OUT = 4.0  # times the usual difference between windows
+_STANDS_OUT = 3.0  # times the usual difference between windows, which a map that is bent raises
 _NOISY = 3.0  # times what noise makes of it
 _GONE = 0.4  # of a step, what another datum leaves of it
 _LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
+_HALF = 0.5  # of the fixes that fit nothing, what another datum leaves where it is what they are of
 _TRIED = 4  # steps, the largest first
 _BESIDE = 2  # fixes, by which a step may be off
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
@@ -102,20 +103,21 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         is_explained = gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
         is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
-        alone = step.metres_beside if step.is_beside else step.metres
-        if not step.is_burst and (is_explained or (is_left and _rests_on_both(found, seconds, int(at[largest]), alone))):
+        is_left = is_left and _rests_on_both(found, seconds, int(at[largest]), step)
+        metres, bend = float(np.linalg.norm(split.datum_step[:2])), _bend(found, split)
+        # Fixes on both sides were gated against a map between the two: a burst gives none of the others back.
+        gives_back = before > 0 and gated <= _HALF * before and bend > OFF_SIGMAS
+        if gives_back or (not step.is_burst and (is_explained or is_left)):
             # Of the map that lies bent between both the errors step by less: it goes along.
-            metres = float(np.linalg.norm(split.datum_step[:2]))
-            jump = Jump(
-                float(seconds[at[largest]]), metres if is_explained else max(metres, alone), not is_short, _bend(found, split)
-            )
+            told = metres if is_explained or gives_back else max(metres, step.alone)
+            jump = Jump(float(seconds[at[largest]]), told, not is_short, bend)
             if jump.lasts:
                 return jump
             short = jump
     return short
 
 
-def _rests_on_both(found: Fit, seconds: Floats, at: int, metres: float) -> bool:
+def _rests_on_both(found: Fit, seconds: Floats, at: int, step: Step) -> bool:
     """Whether a map may lie between two datums so far apart: fixes of either are used, and so within reach of it.
 
     One that rests on the fixes of one side lies in their datum; what is on the other is another question (`plateau`).
@@ -123,7 +125,7 @@ def _rests_on_both(found: Fit, seconds: Floats, at: int, metres: float) -> bool:
     near = np.abs(seconds - seconds[at]) <= _LASTING
     sides = found.is_used[:at][near[:at]], found.is_used[at:][near[at:]]
     reach = float(np.linalg.norm(found.errors[found.is_used, :2], axis=1).max(initial=0.0))
-    return min(float(side.mean()) for side in sides) >= _SIDE_USED and metres <= 2.0 * reach
+    return min(float(side.mean()) for side in sides) >= _SIDE_USED and step.alone <= 2.0 * reach
 
 
 def _bend(found: Fit, split: Fit) -> float:

@@ -65,6 +65,11 @@ class Step:
         return self.burst_gain > _BURST * self.gain
 
     @property
+    def alone(self) -> float:
+        """Its length without the burst that it is beside, if it is beside one [m]."""
+        return self.metres_beside if self.is_beside else self.metres
+
+    @property
     def is_told(self) -> bool:
         """Whether noise makes no such step, nor a burst."""
         return self.gain >= _LEAST and not self.is_burst

@@ -201,6 +201,28 @@ def test_multipath_that_wanders_for_long_is_no_jump(seed: int) -> None:
     assert result.contradiction is None and any("contradict the others and are not used" in text for text in result.warnings)
 
 
+@pytest.mark.parametrize("given_back", [True, False])
+def test_a_datum_that_gives_gated_fixes_back_is_one_under_any_burst(laps: Drive, given_back: bool) -> None:
+    """With its burst the step looked like one, and a map 5 to 7 deviations off ended with code 0."""
+    good = found(laps, USUAL)
+    assert good.fit is not None
+    seconds, random = np.arange(100.0), np.random.default_rng(1)
+    covariance = np.tile(good.attached.covariance[:1], (100, 1, 1))
+    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(100, np.intp))
+    errors, used = random.normal(0.0, 0.5, (100, 3)), np.ones(100, dtype=bool)
+    errors[50:58] += [9.0, -12.0, 0.0]
+    used[46:64] = False
+    between = replace(good.fit, errors=errors, is_used=used, sigma=np.full_like(good.fit.sigma, 0.5))
+    kept = np.ones(100, dtype=bool)
+    kept[50 : 58 if given_back else 66] = False
+    moved = good.fit.T_enu_map + np.array([0.0, 0.0, 0.0, 0.0, -2.0, -1.5, 0.0])
+    split = replace(between, is_used=kept, T_enu_map=moved, datum_step=np.array([4.0, 3.0, 0.0]))
+    jump = jump_of(fixes, between, lambda after: split)
+    assert (jump is not None) == given_back
+    if jump is not None:
+        assert jump.metres == pytest.approx(5.0) and jump.bend == pytest.approx(5.0) and jump.contradicts(between)
+
+
 def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
     """And no reason to refuse the map, which is."""
 
