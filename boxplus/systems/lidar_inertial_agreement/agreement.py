@@ -27,9 +27,9 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.backwards import surer_path
 from boxplus.systems.lidar_inertial_agreement.explained_scans import explained_scans
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Turning, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
-from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for_all
+from boxplus.systems.lidar_inertial_agreement.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
 

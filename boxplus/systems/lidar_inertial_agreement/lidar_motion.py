@@ -8,7 +8,7 @@ determine stays without information, whatever number the registration has come t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.filtering.plane_information import ONE_LINE
-from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import REASONS, PlaneMeasurement
@@ -27,17 +26,18 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,
+    Turning,
     align,
     honest_information,
+    nodes_within,
     thinned,
     undistorted,
 )
 
-_MOST_POINTS = 1500  # that a scan is registered with
-_MOST_MAP_POINTS = 5000  # that it leaves in the map
-_MOST_RAW = 12_000  # that it is undistorted and filtered from
+MOST_POINTS = 1500  # that a scan is registered with
+MOST_MAP_POINTS = 5000  # that it leaves in the map
+MOST_RAW = 12_000  # that it is undistorted and filtered from
 _PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
-_NODES = 21  # within a scan, of a known turning
 # The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
 _WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
@@ -101,9 +101,6 @@ class LidarPath:
 Twist = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Turn rate (3,) [rad/s] and velocity (3,) [m/s] of the LiDAR, both in its own frame."""
 
-Turning = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-"""Attitudes (N, 3, 3) R_any_lidar of the LiDAR at times (N,) ns."""
-
 
 def lidar_path(
     scans: Iterable[Scan],
@@ -148,8 +145,8 @@ class LidarMotion:
         self._config = config.model_copy(update={"weak_threshold": min(config.weak_threshold, _WEAK)})
         self._guesses = tuple(guesses)
         self._undistort = undistort and bool(guesses)
-        self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _MOST_POINTS)
-        self._map_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+        self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)
+        self._map_filter = VoxelFilter(config.map_cell, MOST_MAP_POINTS)
         self._poses: list[_Pose] = []
         self._lasted_s: list[float] = []
         self._failed = 0
@@ -195,7 +192,7 @@ class LidarMotion:
             self._restart()
             return
         self._lasted_s.append((scan.end_ns - scan.start_ns) * 1e-9)
-        scan = thinned(scan, _MOST_RAW)
+        scan = thinned(scan, MOST_RAW)
         middle_ns = (scan.start_ns + scan.end_ns) // 2
         if self._previous_ns is None:
             self._begin(scan, middle_ns)
@@ -306,23 +303,7 @@ class LidarMotion:
         return best
 
     def _nodes(self, scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Nodes (n, 22) of the motion within the scan, relative to the LiDAR at `at_ns`; rate and velocity in its frame there."""
-        time_ns = np.linspace(scan.start_ns, scan.end_ns, _NODES, dtype=np.int64) if self._undistort else np.array([at_ns])
-        nodes = np.zeros((len(time_ns), NODE))
-        seconds = (time_ns - at_ns) * 1e-9
-        nodes[:, N_TIME] = seconds
-        nodes[:, N_P : N_P + 3] = seconds[:, None] * velocity
-        nodes[:, N_V : N_V + 3] = velocity
-        if not self._undistort:
-            nodes[:, N_R : N_R + 9] = np.eye(3).ravel()
-            nodes[:, N_W : N_W + 3] = rate
-            return nodes
-        R_any = self._guesses[0](np.append(time_ns, at_ns))
-        nodes[:, N_R : N_R + 9] = (R_any[-1].T @ R_any[:-1]).reshape(-1, 9)
-        rates = so3.log(np.swapaxes(R_any[:-2], 1, 2) @ R_any[1:-1]) / np.maximum(np.diff(seconds), 1e-9)[:, None]
-        nodes[:-1, N_W : N_W + 3] = rates
-        nodes[-1, N_W : N_W + 3] = rates[-1]
-        return nodes
+        return nodes_within(scan, at_ns, rate, velocity, self._guesses[0] if self._undistort else None)
 
     def _register(
         self, scan: Scan, middle_ns: int, step_s: float, rate: NDArray[np.float64], velocity: NDArray[np.float64]

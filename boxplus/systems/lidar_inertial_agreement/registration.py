@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.degeneracy import PoseDirections, strong_step
 from boxplus.filtering.nav_state import TANGENT, NavState, boxplus_into
+from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
+from boxplus.manifolds import so3
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.deskew import deskew_into
@@ -24,7 +26,12 @@ _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and
 _ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on planes
 _LEAST_CELL = 4.0  # range_sigma: of points closer together noise makes planes
 _ASKED = 6  # scans of a stretch
+_NODES = 21  # within a scan, of a known turning
 _LEAST_GAIN = 2.0  # surfaces fill cells of half the size with four times as many points, unless these are few
+
+
+Turning = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""Attitudes (N, 3, 3) R_any_lidar of the LiDAR at times (N,) ns."""
 
 
 def with_cells_for(scan: Scan, config: RegistrationConfig) -> RegistrationConfig:
@@ -88,6 +95,32 @@ def thinned(scan: Scan, most: int) -> Scan:
         return scan
     lidar = None if scan.lidar is None else scan.lidar[::stride].copy()
     return Scan(scan.p_lidar[::stride].copy(), scan.time_ns[::stride].copy(), None, scan.start_ns, scan.end_ns, lidar=lidar)
+
+
+def nodes_within(
+    scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64], turning: Turning | None
+) -> NDArray[np.float64]:
+    """Nodes (n, NODE) of the motion within a scan, relative to the LiDAR at `at_ns`, to undistort it with.
+
+    Args:
+        rate, velocity: (3,) in the LiDAR's frame at `at_ns`; the rate is not used where `turning` tells how it turned.
+    """
+    time_ns = np.linspace(scan.start_ns, scan.end_ns, _NODES, dtype=np.int64) if turning is not None else np.array([at_ns])
+    nodes = np.zeros((len(time_ns), NODE))
+    seconds = (time_ns - at_ns) * 1e-9
+    nodes[:, N_TIME] = seconds
+    nodes[:, N_P : N_P + 3] = seconds[:, None] * velocity
+    nodes[:, N_V : N_V + 3] = velocity
+    if turning is None:
+        nodes[:, N_R : N_R + 9] = np.eye(3).ravel()
+        nodes[:, N_W : N_W + 3] = rate
+        return nodes
+    R_any = turning(np.append(time_ns, at_ns))
+    nodes[:, N_R : N_R + 9] = (R_any[-1].T @ R_any[:-1]).reshape(-1, 9)
+    rates = so3.log(np.swapaxes(R_any[:-2], 1, 2) @ R_any[1:-1]) / np.maximum(np.diff(seconds), 1e-9)[:, None]
+    nodes[:-1, N_W : N_W + 3] = rates
+    nodes[-1, N_W : N_W + 3] = rates[-1]
+    return nodes
 
 
 def undistorted(scan: Scan, nodes: NDArray[np.float64], at_ns: int) -> NDArray[np.float32]:

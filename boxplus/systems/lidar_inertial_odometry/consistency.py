@@ -20,6 +20,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.steady_bias import SteadyBias
 
@@ -74,7 +75,7 @@ class Consistency:
         self._unmatched = 0
         self._previous_start_ns: int | None = None
         self._first_biases: NDArray[np.float64] | None = None
-        self._steady = SteadyBias(config.gyro_bias_walk)
+        self._steady, self._corrections = SteadyBias(config.gyro_bias_walk), Corrections()
         self._told: set[str] = set()
 
     @property
@@ -127,6 +128,7 @@ class Consistency:
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
         warnings += self._steadiness(frame.scan.end_ns, posterior)
+        warnings += self._pushes(frame, x_prior, cov_prior, posterior)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -237,6 +239,26 @@ class Consistency:
         variance = np.diagonal(posterior.cov)[T_BW : T_BW + 3]
         text = self._steady.update(end_ns, posterior.x[BW : BW + 3], variance)
         if text is None or not self._once("steady"):
+            return []
+        if self._innovation_text is None:
+            self._innovation_text = text
+        return [text]
+
+    def _pushes(
+        self,
+        frame: Frame,
+        x_prior: NDArray[np.float64],
+        cov_prior: NDArray[np.float64],
+        posterior: Posterior,
+    ) -> list[str]:
+        """Whether the corrections of position and velocity are as white as noise is."""
+        if not posterior.valid or frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES:
+            self._corrections.clear()
+            return []
+        correction = np.zeros(TANGENT)
+        boxminus_into(posterior.x, x_prior, correction)
+        text = self._corrections.update(frame.scan.end_ns, correction, cov_prior, posterior.cov)
+        if text is None or not self._once("pushes"):
             return []
         if self._innovation_text is None:
             self._innovation_text = text

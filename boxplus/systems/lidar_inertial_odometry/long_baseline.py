@@ -18,28 +18,18 @@ Source: docs/lidar_inertial_odometry.md, section 10.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.degeneracy import strong_covariance
 from boxplus.filtering.map_datum import MapDatum, positive_part
-from boxplus.filtering.nav_state import TANGENT, boxminus_into
-from boxplus.maps.ikd_tree import IkdTree
-from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.registration import align
+from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, register_to
 from boxplus.systems.lidar_inertial_odometry.mounting_drift import MountingDrift
 
 _BASELINE_NS = 1_250_000_000
 _MAP_SCANS = 5
-_STEPS = 6  # of the registration, which begins close by
-_FLOOR = np.repeat([3e-4, 3e-3], 3) ** 2  # rad², m²: surfaces are no planes
-_LEAST_USED, _LEAST_SHARE = 100, 0.25  # points on planes, and of all: the old scans show the same place
-_LEAST_FITTING = 0.9  # of the points with a plane
-_LARGEST_SIGMA_M = 0.05  # of the registration, or it says nothing
 _TOLD = 4.0  # standard deviations of position or rotation: √(δᵀ C⁻¹ δ)
 
 
@@ -115,8 +105,7 @@ class LongBaseline:
             return None
         delta, registration = found
         C = registration + between
-        squared = [float(delta[part] @ np.linalg.solve(C[part, part], delta[part])) for part in (slice(0, 3), slice(3, 6))]
-        deviations = float(np.sqrt(max(squared)))
+        deviations = deviations_of(delta, C)
         warnings = []
         if deviations > _TOLD:
             warnings.append(
@@ -126,35 +115,3 @@ class LongBaseline:
                 "repeating pattern, foliage, or T_imu_lidar); covariance widened"
             )
         return Drift(positive_part(np.outer(delta, delta) - C), deviations, warnings)
-
-
-def register_to(
-    old_world: Sequence[NDArray[np.float64]], x: NDArray[np.float64], p_lidar: NDArray[np.float32], config: RegistrationConfig
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Where a scan would lie if only some older scans were known.
-
-    Args:
-        old_world: the points (m, 3) of each of them, in the world.
-        x: (36,) packed state to begin at; p_lidar: (n, 3) the scan, LiDAR frame.
-        config: of the registration.
-
-    Returns:
-        The motion (6,) from x, [θ about the IMU's axes, p along the world's], and its covariance (6, 6), both without the
-        directions that the older scans do not determine; None where they fit too little of the scan.
-    """
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-    tree.insert(np.concatenate(old_world), downsample=True)
-    at = x.copy()
-    measurement = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False, confirm=True)
-    directions = align(at, measurement, config, steps=_STEPS)
-    if directions is None or directions.weak.all() or measurement.fitting_share < _LEAST_FITTING:
-        return None
-    information = measurement.at(at, rematch=False)
-    if information.used < max(_LEAST_USED, _LEAST_SHARE * len(p_lidar)):
-        return None
-    covariance = strong_covariance(information.A, directions) + np.diag(_FLOOR)
-    if float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > _LARGEST_SIGMA_M**2:
-        return None
-    delta = np.zeros(TANGENT)
-    boxminus_into(at, x, delta)
-    return delta[:6], covariance

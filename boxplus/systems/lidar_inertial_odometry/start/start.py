@@ -18,6 +18,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
@@ -240,6 +241,13 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
     path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(path), unbroken=True)
     if _broken(path):
         raise seen.not_moving("the first scans do not overlap enough for a moving start")
+    drift = path_drift(path, scans, seen.registration, guesses[0])
+    if drift is not None:
+        raise seen.not_moving(
+            f"the path of the LiDAR drifts: its last scan lies {np.linalg.norm(drift[3:]) * 100:.0f} cm and "
+            f"{np.degrees(np.linalg.norm(drift[:3])):.1f} deg off where its first ones want it (few rings, a repeating pattern, "
+            "foliage, or moving things)"
+        )
     fit = _checked_fit(seen, path)
     state, covariance = moving_state(seen.frames, path, imu, fit, seen.extrinsic, seen.config)
     sigma = _checked_speed(seen, state, covariance)
