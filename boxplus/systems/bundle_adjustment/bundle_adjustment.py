@@ -154,28 +154,26 @@ def adjust_bundle(
     _refuse_turned_lenses(reconstruction, solution.values[cameras.number])
     watch = Watch(callback)
     strayed: list[NDArray[np.int64]] = []
-    astray = np.zeros(0, dtype=np.int64)
+    are_late = False  # the last ones, for which no steps are left
     while True:
         errors = pixel_errors(problem, list(solution.values))
         adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
         depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss, watch)
         is_out = solution.limit == "steps"
         left = 0 if is_out else config.solver.max_iterations - solution.iterations
-        if len(strayed) == _ROUNDS or (solution.status == "stopped" and not is_out):  # by somebody, who does not wait for more
+        is_stopped = solution.status == "stopped" and not is_out  # by somebody, who does not wait for more
+        if len(strayed) == _ROUNDS or are_late or is_stopped:
             break
         numbers, places = stray_points(adjusted, sound.used, depth.ratio, config, loss, watch)
-        if left <= 0:
-            astray = numbers
-            break
-        if watch.is_stopped:
+        if watch.is_stopped or not len(numbers):
             break
         values = [array.copy() for array in solution.values]
         values[points.number][numbers] = places
-        again = _continued(problem, solution, config, values, left, callback) if len(numbers) else solution
+        again = _continued(problem, solution, config, values, left, callback)
         if not again.cost < solution.cost:
             break
         _refuse_turned_lenses(reconstruction, again.values[cameras.number])
-        solution = again
+        solution, are_late = again, left <= 0
         strayed.append(numbers)
     cheirality = count_behind(sound, adjusted)
     left = _redundancy(problem, points, point_of)
@@ -184,7 +182,7 @@ def adjust_bundle(
     by_start = None if other_axes else lens_of_start(sound.reconstruction, sound.used, config, solution, watch)
     if by_start is not None:
         notes.append(by_start)
-    notes += stray_notes(strayed, astray, ids)
+    notes += stray_notes(strayed, ids, are_late=are_late)
     notes += point_notes(errors, point_of, _weights(problem, solution, loss), ids)
     is_given = "sigma_px" in config.model_fields_set
     gross = outlier_notes(errors, loss)
@@ -256,11 +254,13 @@ def _continued(
     def watch(iteration: Iteration) -> bool:
         return callback is not None and bool(callback(replace(iteration, number=count + iteration.number)))
 
-    found = problem.solve(config.solver.model_copy(update={"max_iterations": left}), start=values, callback=watch)
+    found = problem.solve(config.solver.model_copy(update={"max_iterations": max(left, 0)}), start=values, callback=watch)
+    limit = config.solver.max_iterations
+    reason = f"iteration limit of {limit} reached" if found.limit == "steps" else found.reason  # of both together
     time_s = before.history[-1].time_s
     later = (replace(step, number=count + step.number, time_s=time_s + step.time_s) for step in found.history[1:])
     history = (*before.history, replace(found.history[0], number=count, time_s=time_s), *later)
-    return replace(found, cost_initial=before.cost_initial, history=history, descent=len(before.history))
+    return replace(found, cost_initial=before.cost_initial, reason=reason, history=history, descent=len(before.history))
 
 
 def _weights(problem: Problem, solution: Solution, loss: Loss | None) -> NDArray[np.float64] | None:
