@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._words import counted, either
+from boxplus._words import counted
 from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss, loss_at
@@ -94,15 +94,12 @@ def stray_notes(strayed: list[NDArray[np.int64]], ids: NDArray[np.int64] | None,
     if not strayed:
         return []
     numbers = np.unique(np.concatenate(strayed))
-    lay = (
-        "lay"
-        if are_late
-        else either(len(numbers), "had converged to a minimum of its own,", "had converged to minima of their own,")
-    )
+    one = len(numbers) == 1
+    lay = "lay" if are_late else f"had converged to {'a minimum of its' if one else 'minima of their'} own,"
     then = "but no steps were left to adjust all again (--max-iterations)" if are_late else "and all was adjusted again"
     return [
-        f"{counted(len(numbers), 'point')} {lay} at a wrong depth; "
-        f"{either(len(numbers), 'it was put where its', 'they were put where their')} rays meet, {then}: {names_text(numbers, ids)}"
+        f"{counted(len(numbers), 'point')} {lay} at a wrong depth; {'it was put where its' if one else 'they were put where their'} "
+        f"rays meet, {then}: {names_text(numbers, ids)}"
     ]
 
 
