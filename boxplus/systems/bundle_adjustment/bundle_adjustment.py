@@ -38,6 +38,7 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_doubt,
     sigma_notes,
     structure_notes,
+    unit_doubt,
 )
 from boxplus.systems.bundle_adjustment.readings import reading_doubt, refuse_other_columns
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
@@ -137,9 +138,8 @@ def adjust_bundle(
     if isinstance(reconstruction, BalProblem):
         refuse_other_columns(reconstruction)
     refuse_focal_lengths(reconstruction)
-    other_axes = reading_doubt(
-        reconstruction, is_lens_held=not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
-    )
+    is_lens_held = not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
+    other_axes = reading_doubt(reconstruction, is_lens_held=is_lens_held)
     problem = Problem()
     sound = make_sound(reconstruction)
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
@@ -199,6 +199,7 @@ def adjust_bundle(
     notes += late
     said = [
         other_axes,
+        unit_doubt(reconstruction) if is_lens_held and other_axes is None else None,
         bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution, watch) if gross else None,
         sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
         coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),

@@ -95,12 +95,10 @@ def stray_notes(strayed: list[NDArray[np.int64]], ids: NDArray[np.int64] | None,
         return []
     numbers = np.unique(np.concatenate(strayed))
     one = len(numbers) == 1
+    put = "it was put where its" if one else "they were put where their"
     lay = "lay" if are_late else f"had converged to {'a minimum of its' if one else 'minima of their'} own,"
     then = "but no steps were left to adjust all again (--max-iterations)" if are_late else "and all was adjusted again"
-    return [
-        f"{counted(len(numbers), 'point')} {lay} at a wrong depth; {'it was put where its' if one else 'they were put where their'} "
-        f"rays meet, {then}: {names_text(numbers, ids)}"
-    ]
+    return [f"{counted(len(numbers), 'point')} {lay} at a wrong depth; {put} rays meet, {then}: {names_text(numbers, ids)}"]
 
 
 def _settled(
