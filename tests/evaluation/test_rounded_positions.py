@@ -16,7 +16,7 @@ def six_digits(p: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", [1, 3, 5])
 def test_positions_of_a_map_projection_with_six_digits_are_told(seed: int) -> None:
     estimate = path(seed, 0.05)
-    p = six_digits(estimate.p + [450_000.0, 5_400_000.0, 300.0])
+    p = six_digits(estimate.p + np.array([450_000.0, 5_400_000.0, 300.0]))
     assert "all positions of the estimate are multiples, x of 1 m, y of 10 m, z of 0.001 m: if they were rounded" in told(
         moved(estimate, p)
     )

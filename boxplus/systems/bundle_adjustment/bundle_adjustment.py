@@ -20,15 +20,14 @@ from boxplus.optimization.outliers.convex_start import solve_from_convex
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.terms.variables import Variables
-from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
-from boxplus.systems.bundle_adjustment.ending import unconverged_findings
-from boxplus.systems.bundle_adjustment.examination import Watch
-from boxplus.systems.bundle_adjustment.lens import lens_finding, lens_of_start
-from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
-from boxplus.systems.bundle_adjustment.plausibility import (
+from boxplus.systems.bundle_adjustment.doubts.bent import bent_doubt
+from boxplus.systems.bundle_adjustment.doubts.ending import unconverged_findings
+from boxplus.systems.bundle_adjustment.doubts.lens import lens_finding, lens_of_start
+from boxplus.systems.bundle_adjustment.doubts.pixel_origin import pixel_origin
+from boxplus.systems.bundle_adjustment.doubts.plausibility import (
     coarse_doubt,
     input_notes,
     mirror_doubt,
@@ -40,7 +39,8 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     structure_notes,
     unit_doubt,
 )
-from boxplus.systems.bundle_adjustment.readings import reading_doubt, refuse_other_columns
+from boxplus.systems.bundle_adjustment.doubts.readings import reading_doubt, refuse_other_columns
+from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     add_reconstruction,
     adjusted_reconstruction,

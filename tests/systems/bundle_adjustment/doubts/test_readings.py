@@ -15,7 +15,7 @@ from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
-from boxplus.systems.bundle_adjustment.readings import reading_doubt
+from boxplus.systems.bundle_adjustment.doubts.readings import reading_doubt
 from tests.small_problems import scene
 from tests.systems.bundle_adjustment.scenes import FOCAL, FORMATS, perturbed, reconstruction, turning
 
