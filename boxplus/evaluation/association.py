@@ -169,10 +169,11 @@ def associate(
             find, limit = (_nearest, max_difference_s) if method == "nearest" else (_bracketed, max_gap_s)
             if len(find(shifted, t_gt, round(limit * 1e9))[0]) >= min_matches:
                 hint = f"; the motions suggest --offset {offset_s + offset.offset_s:.3f}"
+        known = "".join(f"; {warning}" for warning in (*estimate.warnings, *ground_truth.warnings))
         raise InputError(
             f"at least {min_matches} matched poses",
             f"{len(index_est)} of {len(estimate)} ({estimate.source} against {ground_truth.source}, {method}, {outside} outside "
-            "of the ground truth's time)",
+            f"of the ground truth's time{known})",
             f"raise --max-diff, use --interpolate, or correct the clocks with --offset{hint}",
         )
     within = int(((t_gt >= t_est[0]) & (t_gt <= t_est[-1])).sum())

@@ -24,7 +24,8 @@ _SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from
 _LEAST, _ROUNDS, _TURNS = 50, 10, 0.05  # poses; repetitions; turning in rad, about every axis, for another point to show
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
 _CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
-_STILL_DEG, _TURNED_DEG = 0.1, 10.0
+_STILL_DEG, _TURNED_DEG = 0.1, 5.0  # turns from the first orientation of a file that has none, and of one that has
+_ALONG = 0.99  # cosine between a lever and the way, where stamps that are off do the same
 _UNLIKE = 0.6  # of the size of the path, that an alignment leaves of one with which it has nothing in common
 _OVER_NOISE = 1.5  # times the noise of the estimate, which alone leaves a median of 0.9, and no other path shows up to
 _STRAIGHT = 0.02  # second against first principal deviation, up to which a way is straight
@@ -118,8 +119,6 @@ def reading_doubts(association: Association, alignment: Alignment, translation: 
 def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
     R = alignment.R_world_estimate
     scatter = _scatter_deg(R @ estimate.R, truth.R)
-    if scatter < _FAR_DEG:
-        return
     for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
         if _turned_deg(one) < _STILL_DEG and _turned_deg(other) > _TURNED_DEG:
             yield (
@@ -127,6 +126,8 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
                 "nothing"
             )
             return
+    if scatter < _FAR_DEG:
+        return
     conjugates = {
         "the estimate": _scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R),
         "the ground truth": _scatter_deg(R @ estimate.R, truth.R.transpose(0, 2, 1)),
@@ -247,11 +248,25 @@ def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     error = rms(np.linalg.norm(found.apply(moved).p - truth.p, axis=1))
     if error < min(_SCALED * rmse, _FITS * found.spread_m[0]) and np.linalg.norm(lever) > error:
         x, y, z = lever
+        late_s = _late_s(estimate, lever)
+        other = "" if late_s is None else f"; or stamps are off, as that lies along the way: with about --offset {late_s:.2g}"
         yield (
             f"the ground truth seems to be that of another point of the body, at ({x:.3f}, {y:.3f}, {z:.3f}) m in the frame of "
             f"the estimate's: of that point the ATE is {error:.4g} m instead of {rmse:.4g} m (where the axes of both bodies are "
-            f"parallel, --transform-right 'xyz: {-x:.3f} {-y:.3f} {-z:.3f}')"
+            f"parallel, --transform-right 'xyz: {-x:.3f} {-y:.3f} {-z:.3f}'{other})"
         )
+
+
+def _late_s(estimate: Trajectory, lever: NDArray[np.float64]) -> float | None:
+    """What has to be added to the stamps to move the poses as this lever (3,) does; None where it does not lie along the way."""
+    if estimate.time_ns is None:
+        return None
+    v = np.gradient(estimate.p, (estimate.times - estimate.times[0]) * 1e-9, axis=0)
+    forward = np.median(np.einsum("nji,nj->ni", estimate.R, v), axis=0)
+    speed, length = float(np.linalg.norm(forward)), float(np.linalg.norm(lever))
+    if not (speed > 0.0 and abs(float(lever @ forward)) > _ALONG * speed * length):
+        return None
+    return -float(lever @ forward) / speed**2
 
 
 def _world_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:

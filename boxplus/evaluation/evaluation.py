@@ -22,6 +22,7 @@ from boxplus.evaluation.clock_rate import ClockRate
 from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.incidents import incident_doubts, jump_doubts
+from boxplus.evaluation.rounded_positions import rounded_position_doubts
 from boxplus.evaluation.rounded_stamps import rounding_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
@@ -269,6 +270,7 @@ def evaluate(
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
         *incident_doubts(aligned, truth, translation),
+        *rounded_position_doubts(estimate, ground_truth, rms(translation)),
     ]
     if association.method != "index":
         on_clock = replace(estimate, time_ns=estimate.times + round(offset_s * 1e9), lines=None)

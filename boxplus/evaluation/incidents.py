@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import counted
 from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 
-_FAR, _FEW, _LOAD = 10.0, 0.03, 0.5  # times the median error, share of the poses, and of the squared error, of poses far off
+_FAR, _FEW, _LOAD = 10.0, 0.25, 0.5  # times the median error, share of the poses, and of the squared error, of poses far off
 _JUMP, _USUAL, _OF_ERROR = 20.0, 0.95, 0.5  # times the usual error of a step, its quantile, and of the whole error
 _LEAST, _ROUNDING = 30, 1e-9  # poses, and error as a share of the largest coordinate, for any of that to be told
 _STILL, _LEAST_STILL, _WENT = 1e-6, 10, 0.1  # of the path, poses, and of the spread, for a pose that is repeated
@@ -63,7 +64,7 @@ def _jumps(aligned: Trajectory, truth: Trajectory, translation: NDArray[np.float
     if len(far):
         worst = far[np.argmax(off[far])]
         yield (
-            f"the estimate jumps {len(far)} times against the ground truth, by {off[worst]:.4g} m at "
+            f"the estimate jumps {counted(len(far), 'time')} against the ground truth, by {off[worst]:.4g} m at "
             f"{_when(aligned, int(worst) + 1)}: what is before and after may be better than the errors say"
         )
 

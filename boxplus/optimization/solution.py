@@ -218,8 +218,8 @@ class Solution:
     def remainder(self, *, apart_from: VariableRows | None = None) -> Remainder | None:
         """How far from the minimum a limit, or steps that led no further down, left every variable and what the residuals see.
 
-        Costs a linearisation, a factorisation (two with `apart_from`), and some fifty to two hundred solves with it; what was
-        asked last is kept.
+        Costs a linearisation, a factorisation (two with `apart_from`), and some twenty to two hundred solves with it, the fewest
+        where much is far off; what was asked last is kept.
 
         Args:
             apart_from: variables that are not asked, nor what residuals see of them. They stay where they are along what their

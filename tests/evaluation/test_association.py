@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from boxplus.errors import InputError
 from boxplus.evaluation.association import associate
 from boxplus.evaluation.clock_fit import MotionPair
-from boxplus.formats.trajectory import Trajectory
+from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion, so3
 from tests.evaluation.smooth_paths import SmoothPath, disturbed
 
@@ -21,6 +23,14 @@ stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=40, unique=True).
 def still(times: list[int]) -> Trajectory:
     count = len(times)
     return Trajectory(np.array(times, dtype=np.int64), np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)))
+
+
+def test_too_few_matches_say_which_poses_were_left_out_before(tmp_path: Path) -> None:
+    """Stamps with six digits, as programs write numbers by themselves, are all the same."""
+    truth = still([1_700_000_000_000_000_000 + 100_000_000 * k for k in range(50)])
+    (tmp_path / "short.txt").write_text("".join(f"{time_ns * 1e-9:g} 0 0 0 0 0 0 1\n" for time_ns in truth.times))
+    with pytest.raises(InputError, match=r"got 1 of 1 .*; 49 poses of \S+ repeat the time stamp before them and were left out"):
+        associate(read_trajectory(tmp_path / "short.txt"), truth)
 
 
 @settings(max_examples=200, deadline=None)

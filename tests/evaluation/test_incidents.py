@@ -23,12 +23,24 @@ def test_poses_far_off_are_counted(alignment: str) -> None:
     assert "3 of the 600 poses are off by more than 10 times the median error" in told(moved(estimate, p), alignment=alignment)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.2])
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_many_poses_far_off_are_counted_as_well(share: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    estimate = path(seed, 0.03)
+    p = estimate.p.copy()
+    bad = rng.random(len(p)) < share
+    p[bad] += rng.choice([-100.0, 100.0], (np.count_nonzero(bad), 3))
+    said = told(moved(estimate, p), alignment="none")
+    assert f"{np.count_nonzero(bad)} of the 600 poses are off by more than 10 times the median error" in said
+
+
 @pytest.mark.parametrize("alignment", KINDS)
 def test_a_jump_is_told_with_its_time(alignment: str) -> None:
     estimate = path(1, 0.02)
     p = estimate.p.copy()
     p[300:] += [3.0, 2.0, 0.0]
-    assert "the estimate jumps 1 times against the ground truth, by 3.6" in told(moved(estimate, p), alignment=alignment)
+    assert "the estimate jumps 1 time against the ground truth, by 3.6" in told(moved(estimate, p), alignment=alignment)
     assert "at 30.00 s" in told(moved(estimate, p), alignment=alignment)
 
 

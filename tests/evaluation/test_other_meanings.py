@@ -79,6 +79,34 @@ def test_another_point_of_the_body_is_told(alignment):
     np.testing.assert_allclose(numbers, -point, atol=0.05)
 
 
+@pytest.mark.parametrize("offset_s", [-2.5, 3.0])
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_a_lever_along_the_way_may_be_stamps_that_are_off(seed, offset_s):
+    """Even speed on winding roads does not show where in time it is, as no motion correlates."""
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(1200)
+    p = np.stack([12.0 * t, 30.0 * np.sin(t / 15.0 + rng.uniform(0.0, 6.0)), 0.0 * t], 1)
+    v = np.gradient(p, 0.1, axis=0)
+    R = so3.exp(np.stack([0.05 * np.sin(t), 0.05 * np.cos(0.7 * t), np.arctan2(v[:, 1], v[:, 0])], 1))
+    stamps = (1_700_000_000_000_000_000 + np.round(1e9 * t)).astype(np.int64)
+    truth = Trajectory(stamps, p, quaternion.from_matrix(R))
+    estimate = replace(moved(truth, p + 0.02 * rng.normal(size=p.shape)), time_ns=stamps + int(1e9 * offset_s))
+    (text,) = (text for text in evaluate(estimate, truth).warnings if "another point of the body" in text)
+    advised = float(text.split("stamps are off, as that lies along the way: with about --offset ")[1].rstrip(")"))
+    assert advised == pytest.approx(-offset_s, rel=0.15)  # the alignment takes the rest
+
+
+def test_an_estimate_without_orientations_is_told_where_the_ground_truth_hardly_turns():
+    truth = path()
+    slight = moved(
+        truth, truth.p, so3.exp(np.stack([np.zeros(600), np.zeros(600), 0.06 * np.sin(np.linspace(0.0, 9.0, 600))], 1))
+    )
+    still = moved(path(1, 0.03), path(1, 0.03).p, np.broadcast_to(np.eye(3), (600, 3, 3)))
+    assert not any("never change" in text for text in evaluate(still, slight).warnings)  # by three degrees
+    turns = moved(truth, truth.p, so3.exp(np.stack([np.zeros(600), np.zeros(600), 0.12 * np.sin(np.linspace(0.0, 9.0, 600))], 1)))
+    assert any("orientations of the estimate never change" in text for text in evaluate(still, turns).warnings)
+
+
 def _drive(seed: int, turned: np.ndarray) -> tuple[Trajectory, Trajectory]:
     """A minute on a nearly straight way, and an estimate in another world that drifts, of a body turned by a rotation vector."""
     rng = np.random.default_rng(seed)

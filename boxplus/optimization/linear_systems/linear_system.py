@@ -49,6 +49,10 @@ class LinearSystem(ABC):
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """x (dof,) with (H + diag(damping)) x = right, for the matrix factorised last."""
 
+    def solve_many(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solve for several right-hand sides (dof, k) at once: where the factor is large that takes less than one by one."""
+        return np.stack([self.solve(np.ascontiguousarray(side)) for side in right.T], axis=1)
+
     @abstractmethod
     def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
         """Blocks (dof of first[k], dof of second[k]) of H⁻¹ for pairs of free variables, after `factorize(None)`.
@@ -123,6 +127,10 @@ class SparseSystem(LinearSystem):
 
     def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `LinearSystem.solve`."""
+        return self._cholesky.solve(right)
+
+    def solve_many(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `LinearSystem.solve_many`."""
         return self._cholesky.solve(right)
 
     def inverse_values(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:

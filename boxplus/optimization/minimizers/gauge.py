@@ -29,11 +29,17 @@ class Gauge:
 
     def remove(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """S x (dof,): without what the poses have in common."""
-        return np.asarray(x - (self.motions * (self.share * x).sum(axis=1)).sum(axis=1))
+        return np.asarray(x - np.einsum("km,m->k", self.motions, np.einsum("mk,k->m", self.share, x)))
 
     def transposed(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sᵀ e (dof,)."""
-        return np.asarray(e - (self.share * (self.motions * e[:, None]).sum(axis=0)[:, None]).sum(axis=0))
+        return np.asarray(e - np.einsum("mk,m->k", self.share, np.einsum("km,k->m", self.motions, e)))
+
+    def kept(self, places: slice, dof: int) -> NDArray[np.float64]:
+        """(n, dof, dof) blocks of S on its diagonal, of the variables of `dof` degrees of freedom at these places."""
+        n, m = (places.stop - places.start) // dof, len(self.share)
+        motions, share = self.motions[places].reshape(n, dof, m), self.share[:, places].reshape(m, n, dof)
+        return np.asarray(np.eye(dof) - np.einsum("nim,mnj->nij", motions, share))
 
 
 def find_gauge(problem: LeastSquares, curvatures: list[NDArray[np.float64]]) -> Gauge:

@@ -42,11 +42,12 @@ class Remainder:
         cost: by how much the cost would still fall; infinite where no step could be computed.
         total: distance in standard deviations, all variables together: it grows with their number.
         variables: for every block (n,) the distance of each in standard deviations of its own, with the noise that the errors
-            have; zero where fixed. The farthest are exact, the others scatter by a tenth, and none is farther than `total`.
-            Where nothing holds the world, without the motion that all poses have in common.
+            have; zero where fixed. Some of the farthest are exact; the others scatter by a tenth, or by a fifth where one is
+            known to be farther than one, and none is farther than `total`. Where nothing holds the world, without the motion
+            that all poses have in common.
         residuals: for every group (N,) the same of what each residual sees.
-        worst_variable: block and row of the farthest, which is exact; None where that is within one.
-        worst_residual: group and residual of the farthest, where no variable is farther than one.
+        worst_variable: block and row of the farthest that is exact; None where none is farther than one.
+        worst_residual: group and residual likewise, where no variable is farther than one.
     """
 
     cost: float

@@ -20,15 +20,14 @@ from boxplus.optimization.outliers.convex_start import solve_from_convex
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.terms.variables import Variables
-from boxplus.systems.bundle_adjustment.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.cheirality import Cheirality, count_behind, make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
-from boxplus.systems.bundle_adjustment.ending import unconverged_findings
-from boxplus.systems.bundle_adjustment.examination import Watch
-from boxplus.systems.bundle_adjustment.lens import lens_finding, lens_of_start
-from boxplus.systems.bundle_adjustment.pixel_origin import pixel_origin
-from boxplus.systems.bundle_adjustment.plausibility import (
+from boxplus.systems.bundle_adjustment.doubts.bent import bent_doubt
+from boxplus.systems.bundle_adjustment.doubts.ending import unconverged_findings
+from boxplus.systems.bundle_adjustment.doubts.lens import lens_finding, lens_of_start
+from boxplus.systems.bundle_adjustment.doubts.pixel_origin import pixel_origin
+from boxplus.systems.bundle_adjustment.doubts.plausibility import (
     coarse_doubt,
     input_notes,
     mirror_doubt,
@@ -38,8 +37,10 @@ from boxplus.systems.bundle_adjustment.plausibility import (
     sigma_doubt,
     sigma_notes,
     structure_notes,
+    unit_doubt,
 )
-from boxplus.systems.bundle_adjustment.readings import reading_doubt, refuse_other_columns
+from boxplus.systems.bundle_adjustment.doubts.readings import reading_doubt, refuse_other_columns
+from boxplus.systems.bundle_adjustment.examination import Watch
 from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     add_reconstruction,
     adjusted_reconstruction,
@@ -137,9 +138,8 @@ def adjust_bundle(
     if isinstance(reconstruction, BalProblem):
         refuse_other_columns(reconstruction)
     refuse_focal_lengths(reconstruction)
-    other_axes = reading_doubt(
-        reconstruction, is_lens_held=not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
-    )
+    is_lens_held = not isinstance(reconstruction, BalProblem) and config.intrinsics == "held"
+    other_axes = reading_doubt(reconstruction, is_lens_held=is_lens_held)
     problem = Problem()
     sound = make_sound(reconstruction)
     cameras, points = add_reconstruction(problem, reconstruction, sound.used, config, loss)
@@ -154,28 +154,26 @@ def adjust_bundle(
     _refuse_turned_lenses(reconstruction, solution.values[cameras.number])
     watch = Watch(callback)
     strayed: list[NDArray[np.int64]] = []
-    astray = np.zeros(0, dtype=np.int64)
+    are_late = False  # the last ones, for which no steps are left
     while True:
         errors = pixel_errors(problem, list(solution.values))
         adjusted = adjusted_reconstruction(reconstruction, config, problem, solution, cameras, points, errors, point_of)
         depth = depth_uncertainty(problem, solution, points, adjusted, sound.used, config, loss, watch)
         is_out = solution.limit == "steps"
         left = 0 if is_out else config.solver.max_iterations - solution.iterations
-        if len(strayed) == _ROUNDS or (solution.status == "stopped" and not is_out):  # by somebody, who does not wait for more
+        is_stopped = solution.status == "stopped" and not is_out  # by somebody, who does not wait for more
+        if len(strayed) == _ROUNDS or are_late or is_stopped:
             break
         numbers, places = stray_points(adjusted, sound.used, depth.ratio, config, loss, watch)
-        if left <= 0:
-            astray = numbers
-            break
-        if watch.is_stopped:
+        if watch.is_stopped or not len(numbers):
             break
         values = [array.copy() for array in solution.values]
         values[points.number][numbers] = places
-        again = _continued(problem, solution, config, values, left, callback) if len(numbers) else solution
+        again = _continued(problem, solution, config, values, left, callback)
         if not again.cost < solution.cost:
             break
         _refuse_turned_lenses(reconstruction, again.values[cameras.number])
-        solution = again
+        solution, are_late = again, left <= 0
         strayed.append(numbers)
     cheirality = count_behind(sound, adjusted)
     left = _redundancy(problem, points, point_of)
@@ -184,7 +182,7 @@ def adjust_bundle(
     by_start = None if other_axes else lens_of_start(sound.reconstruction, sound.used, config, solution, watch)
     if by_start is not None:
         notes.append(by_start)
-    notes += stray_notes(strayed, astray, ids)
+    notes += stray_notes(strayed, ids, are_late=are_late)
     notes += point_notes(errors, point_of, _weights(problem, solution, loss), ids)
     is_given = "sigma_px" in config.model_fields_set
     gross = outlier_notes(errors, loss)
@@ -201,6 +199,7 @@ def adjust_bundle(
     notes += late
     said = [
         other_axes,
+        unit_doubt(reconstruction) if is_lens_held and other_axes is None else None,
         bent_doubt(adjusted, sound.used, sound.cheirality.dropped, config, errors, solution, watch) if gross else None,
         sigma_doubt(solution.cost, left, config.sigma_px, loss, is_given=is_given),
         coarse_doubt(errors, left, adjusted, config.sigma_px, is_given=is_given),
@@ -256,11 +255,13 @@ def _continued(
     def watch(iteration: Iteration) -> bool:
         return callback is not None and bool(callback(replace(iteration, number=count + iteration.number)))
 
-    found = problem.solve(config.solver.model_copy(update={"max_iterations": left}), start=values, callback=watch)
+    found = problem.solve(config.solver.model_copy(update={"max_iterations": max(left, 0)}), start=values, callback=watch)
+    limit = config.solver.max_iterations
+    reason = f"iteration limit of {limit} reached" if found.limit == "steps" else found.reason  # of both together
     time_s = before.history[-1].time_s
     later = (replace(step, number=count + step.number, time_s=time_s + step.time_s) for step in found.history[1:])
     history = (*before.history, replace(found.history[0], number=count, time_s=time_s), *later)
-    return replace(found, cost_initial=before.cost_initial, history=history, descent=len(before.history))
+    return replace(found, cost_initial=before.cost_initial, reason=reason, history=history, descent=len(before.history))
 
 
 def _weights(problem: Problem, solution: Solution, loss: Loss | None) -> NDArray[np.float64] | None:

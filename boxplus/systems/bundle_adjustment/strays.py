@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._words import counted, either
+from boxplus._words import counted
 from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Loss, loss_at
@@ -85,22 +85,20 @@ def stray_points(
     return tried[better].astype(np.int64), moved[tried[better]]
 
 
-def stray_notes(strayed: list[NDArray[np.int64]], astray: NDArray[np.int64], ids: NDArray[np.int64] | None) -> list[str]:
-    """Sentences on those that were found, round by round, and on those that stayed where they are."""
-    if len(astray):
-        return [
-            f"{counted(len(astray), 'point')} {either(len(astray), 'lies', 'lie')} at a wrong depth: where the rays meet the "
-            f"images agree better, but no steps were left to adjust {either(len(astray), 'it', 'them')} (--max-iterations): "
-            f"{names_text(astray, ids)}"
-        ]
+def stray_notes(strayed: list[NDArray[np.int64]], ids: NDArray[np.int64] | None, *, are_late: bool) -> list[str]:
+    """A sentence on those that were found, round by round.
+
+    Args:
+        are_late: whether no steps were left to adjust all again after the last round.
+    """
     if not strayed:
         return []
     numbers = np.unique(np.concatenate(strayed))
-    return [
-        f"{counted(len(numbers), 'point')} had converged to {either(len(numbers), 'a minimum of its', 'minima of their')} own, "
-        f"at a wrong depth; {either(len(numbers), 'it was put where its', 'they were put where their')} rays meet, "
-        f"and all was adjusted again: {names_text(numbers, ids)}"
-    ]
+    one = len(numbers) == 1
+    put = "it was put where its" if one else "they were put where their"
+    lay = "lay" if are_late else f"had converged to {'a minimum of its' if one else 'minima of their'} own,"
+    then = "but no steps were left to adjust all again (--max-iterations)" if are_late else "and all was adjusted again"
+    return [f"{counted(len(numbers), 'point')} {lay} at a wrong depth; {put} rays meet, {then}: {names_text(numbers, ids)}"]
 
 
 def _settled(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_quantile
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
+from boxplus.systems.pose_graph.problem import edge_parts
 
 _KEEP = 0.999  # of pairs of true loop closures that agree
 _TRIED = 300  # loop closures that are believed in turn at most, spread evenly
@@ -94,9 +95,8 @@ class Crossings:
 
 def _variances(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """(m, 2) variances of rotation and translation, the inverse of the mean information over the axes."""
-    split = 3 if information.shape[1] == 6 else 1
     diagonal = np.einsum("nii->ni", information)
-    precision = np.stack([diagonal[:, :split].mean(axis=1), diagonal[:, split:].mean(axis=1)], axis=1)
+    precision = np.stack([diagonal[:, part].mean(axis=1) for part in edge_parts(information.shape[1])], axis=1)
     return np.asarray(1.0 / np.maximum(precision, 1e-12 * max(float(precision.max(initial=0.0)), 1e-300)))
 
 

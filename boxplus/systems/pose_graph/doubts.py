@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_cdf, chi_square_exceeded, chi_square_quantile
 from boxplus._jit import kernel
+from boxplus._words import counted, either
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import se2, se3
 from boxplus.optimization.solution import Solution
@@ -192,7 +193,10 @@ def structure_notes(graph: PoseGraph, held: NDArray[np.int64]) -> list[str]:
         )
     alone = np.flatnonzero(sizes[label] == 1)
     if len(alone):
-        notes.append(f"{len(alone)} poses have no edge and stay where they are: {pose_names(graph, alone)}")
+        notes.append(
+            f"{counted(len(alone), 'pose')} {either(len(alone), 'has', 'have')} no edge and "
+            f"{either(len(alone), 'stays where it is', 'stay where they are')}: {pose_names(graph, alone)}"
+        )
     return notes
 
 

@@ -42,7 +42,7 @@ from boxplus.systems.pose_graph.doubts import (
     undetermined_notes,
     without_information,
 )
-from boxplus.systems.pose_graph.information_readings import information_doubt
+from boxplus.systems.pose_graph.information_readings import information_doubt, slack_part_notes
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
 from boxplus.systems.pose_graph.problem import (
     Objective,
@@ -249,10 +249,13 @@ def optimize_pose_graph(
             reliability = Reliability.of(with_edges(graph, kept), solution, poses)
             if reliability is not None:
                 found = suspicions(reliability, solution, poses, consecutive_edges(graph)[kept])
-    if config.examine and verdict is None and loss is None and config.objective == "logarithm" and solution.status == "converged":
+    is_at_end = solution.status == "converged" or solution.limit == "steps"  # a small χ² is none of a start
+    if config.examine and verdict is None and loss is None and config.objective == "logarithm" and is_at_end:
         meant = information_doubt(graph, poses_end, held, options, callback)
         if meant is not None:
             reasons.append(meant)
+        else:
+            notes += slack_part_notes(graph, poses_end, len(held))
     for one in found:
         (reasons if one.is_grave else notes).append(one.sentence)
     examination = time.perf_counter() - examined

@@ -25,6 +25,12 @@ ODOMETRY, LOOPS = "odometry", "loops"
 """Names of the groups of a problem with loops apart."""
 
 
+def edge_parts(dim: int) -> tuple[slice, slice]:
+    """Where rotation and translation stand in the errors of edges, 6 in space and 3 in the plane, and in their information."""
+    split = 3 if dim == 6 else 1
+    return slice(0, split), slice(split, dim)
+
+
 def pose_graph_problem(
     graph: PoseGraph,
     *,

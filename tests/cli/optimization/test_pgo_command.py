@@ -121,8 +121,8 @@ def test_pieces_and_poses_without_edges_are_told(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     told = words(result)
     assert f"warning: the graph falls into 3 pieces without edges between them; poses {count}, {2 * count}, the first" in told
-    assert f"warning: 1 poses have no edge and stay where they are: {2 * count}" in told
-    assert "1 poses have no edge" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"warning: 1 pose has no edge and stays where it is: {2 * count}" in told
+    assert "1 pose has no edge" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_singular_problem_explains_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import boxplus as bp
+from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.minimizers.remainder import _trend
 from tests.small_problems import loop_graph
 
@@ -171,6 +172,27 @@ def test_one_among_many_that_are_nearly_as_far_is_found(seed: int) -> None:
     start[777] = best[777] + 1.5 / 0.97 * (start[777] - best[777])
     solution = problem.solve(start=[start], max_iterations=0)
     assert "x[777] is 1.5 standard deviations of its own away from there" in (solution.unconverged() or "")
+
+
+def test_what_others_do_not_tell_is_not_sampled() -> None:
+    """Places that nothing joins are all as far off as they are, without the scatter of samples."""
+    problem, start = many_places(2_000, off=0.9)
+    away = problem.solve(start=[start], max_iterations=0).remainder().variables[0]
+    assert np.ptp(away) < 1e-6 * away.max()
+
+
+@pytest.mark.parametrize("lone", [False, True])
+def test_what_is_plainly_far_takes_few_solves(lone: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is seen by a product with the Jacobian; all 2,000 are three standard deviations off, or one is."""
+    problem, start = many_places(2_000, off=3.0)
+    if lone:
+        best = problem.solve(start=[start]).values[0]
+        start[:1999] = best[:1999] + 0.05 * (start[:1999] - best[:1999])
+    solution = problem.solve(start=[start], max_iterations=0)
+    seen, product = [], LeastSquares.product
+    monkeypatch.setattr(LeastSquares, "product", lambda self, x: (seen.append(1), product(self, x))[1])
+    assert "standard deviations of its own away" in (solution.unconverged() or "")
+    assert len(seen) < 30
 
 
 @pytest.mark.parametrize("dof", [3, 28, 31, 40])

@@ -13,7 +13,9 @@ from boxplus.cli import app
 from boxplus.formats.reconstructions.gbp import write_gbp
 from boxplus.manifolds import quaternion
 from boxplus.optimization.losses import Huber
+from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.systems.bundle_adjustment.scenes import FORMATS, reconstruction, turning
 
@@ -62,12 +64,13 @@ def test_points_too_far_for_their_cameras_are_counted_and_named():
     start = replace(start, image_of=start.image_of[keep], point_of=start.point_of[keep], pixels=pixels[keep], points=points)
     result = adjust_bundle(start)
     assert result.depth.cameras_move_apart
-    # Such points creep on, and leave it short of the minimum after a hundred steps: 270.4, where 248.7 is reached after 237.
-    # That condemns no camera, and is said of them.
-    assert result.solution.limit == "steps" and result.doubt is None
-    moving = next(note for note in result.notes if "were still moving when the adjustment ended" in note)
-    assert "points whose depth is not determined" in moving and "a matter of their distance alone" in moving
-    assert set(result.depth.undetermined) <= set(far) and len(result.depth.undetermined) >= 5
+    # Such points creep on, and leave it short of the minimum after a hundred steps: 264.7, where 248.7 is reached after more, and
+    # cameras 0 and 1, which alone see them, nine standard deviations from there.
+    assert result.solution.limit == "steps" and "cameras[0] is" in (result.doubt or "")
+    long = adjust_bundle(start, BundleAdjustmentConfig(solver=SolverOptions(max_iterations=1000)))
+    assert long.solution.status == "converged" and long.doubt is None and long.solution.cost < 0.95 * result.solution.cost
+    assert not len(long.depth.undetermined)  # to a quarter of the distance
+    assert set(result.depth.undetermined) == {0, 9}
     note = next(note for note in result.notes if note.startswith("the depth along the viewing ray is not determined"))
     assert f"for {len(result.depth.undetermined)} of 150 points" in note and "100" in note.split(":")[1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,42 @@ def test_information_in_another_unit_or_inverted_is_named(dimension: int, seed: 
         (replace(graph, information=np.linalg.inv(graph.information)), "if they are covariances: give their inverses"),
     ):
         assert told in (optimize_pose_graph(wrong).doubt or "")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_units_of_both_and_of_covariances_are_named(dimension: int, seed: int) -> None:
+    graph = graph_of(dimension, seed)
+    both, degrees = scaled(graph, np.degrees(1.0), 1e3), scaled(graph, np.degrees(1.0), 1.0)
+    for wrong, told in (
+        (
+            both,
+            "rotations is per square degree and that of translations per square millimetre: give it per square radian and square",
+        ),
+        (scaled(graph, 1e3, 1.0), "if the information of rotations is per square milliradian: give it per square radian"),
+        (
+            replace(graph, information=np.linalg.inv(both.information)),
+            "if they are covariances, of rotations in square degrees, of translations in square millimetres: give their",
+        ),
+        (
+            replace(graph, information=np.linalg.inv(degrees.information)),
+            "if they are covariances, of rotations in square degrees:",
+        ),
+    ):
+        assert told in (optimize_pose_graph(wrong).doubt or "")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_translations_that_err_by_less_than_was_said_are_told_of(dimension: int, seed: int) -> None:
+    """All together errors are as promised, as rotations are."""
+    graph = graph_of(dimension, seed)
+    assert not [note for note in optimize_pose_graph(graph).notes if "promise" in note]
+    (note,) = [note for note in optimize_pose_graph(scaled(graph, 1.0, 100.0)).notes if "promise" in note]
+    told = re.search(
+        r"information of translations is too small, their standard deviations are too large by a factor of (\S+),", note
+    )
+    assert 70.0 < float(told[1]) < 140.0
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

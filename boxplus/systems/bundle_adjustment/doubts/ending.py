@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus._words import counted, either
 from boxplus.optimization.minimizers.distances import AWAY
 from boxplus.optimization.solution import Solution
-from boxplus.optimization.terms.variables import Variables
+from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.systems.bundle_adjustment.sightings import names_text
 
 _FEW = 0.005  # of the points, that may be on their way while the rest is to be trusted
@@ -33,11 +33,11 @@ def unconverged_findings(
     is_vague = np.zeros(len(points), dtype=np.bool_)
     is_vague[vague] = True
     creeping = np.flatnonzero((remainder.variables[points.number] > AWAY) & is_vague)
-    remainder = solution.remainder(apart_from=points[is_vague])
+    remainder = solution.remainder(apart_from=_some(points, is_vague))
     is_late = np.zeros(len(points), dtype=np.bool_) if remainder is None else remainder.variables[points.number] > AWAY
     late = np.flatnonzero(is_late)
     few = len(late) <= _FEW * len(points)
-    doubt = solution.unconverged(apart_from=points[is_vague | is_late if few else is_vague])
+    doubt = solution.unconverged(apart_from=_some(points, is_vague | is_late if few else is_vague))
     notes = []
     if len(creeping):
         notes.append(
@@ -50,3 +50,7 @@ def unconverged_findings(
             f"best ({solution.reason}): {names_text(late, ids)}"
         )
     return doubt, notes
+
+
+def _some(points: Variables, chosen: NDArray[np.bool_]) -> VariableRows | None:
+    return points[chosen] if chosen.any() else None

@@ -16,6 +16,7 @@ _GROSS, _LOAD = 5.5, 0.5  # typical errors beyond which is no noise, once in fou
 _LEAST = 100  # observations from which on shares mean something
 _LEAST_PIXEL = 1e-3  # [px] errors below are rounding
 _NARROW = 0.02  # spread of a camera's pixels, as a share of the others' or of the focal length, that asks for their unit
+_ONE_PIXEL = 1.0  # spread, below which pixels are none
 _FEW = 10  # observations from which on a spread means something
 _OFF, _OFF_GIVEN = 5.0, 2.0  # times the errors may differ from what sigma says: one that was assumed, and one that was given
 _FAR_OFF = 3.0  # the same, of a given sigma, from which on nothing is to be trusted; few wrong matches hardly move a median
@@ -36,20 +37,16 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
     repeated = len(pair) - len(np.unique(pair))
     if repeated:
         said.append(
-            f"{repeated} observations are of a point in a camera that has it already: they count again, as if measured "
-            "independently, and contradict each other where the pixels differ"
+            f"{counted(repeated, 'observation')} {either(repeated, 'is', 'are')} of a point in a camera that has it already: "
+            f"{either(repeated, 'it counts', 'they count')} again, as if measured independently, and "
+            f"{either(repeated, 'contradicts the other', 'contradict each other')} where the pixels differ"
         )
-    m = len(seen.t)
-    times = np.bincount(seen.camera_of, minlength=m)
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        mean = [np.bincount(seen.camera_of, x, m) / times for x in seen.pixels.T]
-        off = [(x - of[seen.camera_of]) ** 2 for x, of in zip(seen.pixels.T, mean, strict=True)]
-        spread = np.sqrt(np.bincount(seen.camera_of, off[0] + off[1], m) / times)
-    able = times >= _FEW
+    spread = _pixel_spreads(seen)
+    able = np.isfinite(spread)
     if not able.any():
         return said
     usual = float(np.median(spread[able]))
-    narrow = np.flatnonzero(able & (spread < _NARROW * usual)).astype(np.int64)
+    narrow = np.flatnonzero(spread < _NARROW * usual).astype(np.int64)
     if len(narrow):
         said.append(
             f"the pixels of cameras {names_text(narrow, getattr(reconstruction, 'image_ids', None))} spread over "
@@ -61,6 +58,30 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
             "same unit?"
         )
     return said
+
+
+def unit_doubt(reconstruction: Reconstruction) -> str | None:
+    """A sentence where the pixels of every camera lie within one of each other, at a focal length of far more of them."""
+    seen = Sightings.of(reconstruction)
+    spread = _pixel_spreads(seen)
+    widest = float(spread[np.isfinite(spread)].max(initial=0.0))
+    if not 0.0 < widest < min(_ONE_PIXEL, _NARROW * seen.focal_length):
+        return None
+    return (
+        f"the pixels of every camera spread over {widest:.3g} px at most, as those of no image do at a focal length of "
+        f"{seen.focal_length:.4g} px: give both in pixels"
+    )
+
+
+def _pixel_spreads(seen: Sightings) -> NDArray[np.float64]:
+    """(m,) root mean square distance of a camera's pixels from their mean [px]; NaN of too few."""
+    m = len(seen.t)
+    times = np.bincount(seen.camera_of, minlength=m)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        mean = [np.bincount(seen.camera_of, x, m) / times for x in seen.pixels.T]
+        off = [(x - of[seen.camera_of]) ** 2 for x, of in zip(seen.pixels.T, mean, strict=True)]
+        spread = np.sqrt(np.bincount(seen.camera_of, off[0] + off[1], m) / times)
+    return np.where(times >= _FEW, spread, np.nan)
 
 
 def mirror_doubt(before: NDArray[np.float64], after: NDArray[np.float64]) -> str | None:

@@ -24,8 +24,8 @@ from boxplus.optimization.losses import Huber, Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.doubts.lens_advice import NAMES, PARTS, lens_advice
 from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
-from boxplus.systems.bundle_adjustment.lens_advice import NAMES, PARTS, lens_advice
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 

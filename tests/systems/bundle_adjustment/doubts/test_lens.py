@@ -15,9 +15,9 @@ from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import quaternion, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.doubts.lens import lens_of_start
+from boxplus.systems.bundle_adjustment.doubts.lens_advice import lens_advice
 from boxplus.systems.bundle_adjustment.examination import Watch
-from boxplus.systems.bundle_adjustment.lens import lens_of_start
-from boxplus.systems.bundle_adjustment.lens_advice import lens_advice
 from boxplus.systems.bundle_adjustment.sightings import Sightings
 from tests.small_problems import in_camera
 from tests.systems.bundle_adjustment.scenes import FOCAL, note_of, perturbed, reconstruction, turning

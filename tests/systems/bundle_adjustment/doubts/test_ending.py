@@ -17,18 +17,18 @@ from tests.systems.bundle_adjustment.scenes import perturbed
 FAR = 30
 
 
-def with_far_points(seed: int, steps: int) -> BundleAdjustmentResult:
-    """120 points near eight cameras and 30 that are 100 km away, where the start has them at 100 m."""
+def with_far_points(seed: int, steps: int, start: float = 1e-3) -> BundleAdjustmentResult:
+    """120 points near eight cameras and 30 that are 100 km away, which the start has at so many times that, 100 m."""
     rng = np.random.default_rng([seed, 7])
     T, p, camera_of, point_of = scene(seed, 8, 150)
     look = quaternion.to_matrix(T[:, :4])[:, 2].mean(axis=0)
     p[:FAR] = 1e5 * (look + 0.15 * rng.normal(size=(FAR, 3)))
     P = in_camera(T[camera_of], p[point_of])
     seen = (P[:, 2] > 0.5) & (np.abs(P[:, :2] / P[:, 2:]) < 1.2).all(axis=1)
-    start = perturbed(rng, T, p, camera_of[seen], point_of[seen], "gbp", 0.005, 0.05)
-    points = start.points.copy()
-    points[:FAR] *= 1e-3
-    return adjust_bundle(replace(start, points=points), BundleAdjustmentConfig(solver=SolverOptions(max_iterations=steps)))
+    given = perturbed(rng, T, p, camera_of[seen], point_of[seen], "gbp", 0.005, 0.05)
+    points = given.points.copy()
+    points[:FAR] *= start
+    return adjust_bundle(replace(given, points=points), BundleAdjustmentConfig(solver=SolverOptions(max_iterations=steps)))
 
 
 def cameras_off(result: BundleAdjustmentResult, best: BundleAdjustmentResult) -> float:
@@ -108,15 +108,38 @@ def test_cameras_that_are_on_their_way_condemn_it() -> None:
     assert "no minimum was reached (iteration limit of 4 reached)" in (result.doubt or "") and "cameras" in (result.doubt or "")
 
 
-def test_few_points_that_are_late_are_named() -> None:
-    """One of 400 points starts far off and arrives last: cameras and all others are where they belong."""
+@pytest.mark.parametrize(
+    ("off", "told"),
+    [
+        (0.004, "1 point of 400 ended more than a standard deviation from where the images agree best (iteration limit of 1"),
+        (0.02, "1 point lay at a wrong depth; it was put where its rays meet, but no steps were left to adjust all again"),
+    ],
+)
+def test_few_points_that_are_late_are_named(off: float, told: str) -> None:
+    """One of 400 points starts off, and arrives last: cameras and all others are where they belong."""
     rng = np.random.default_rng(5)
     T, p, camera_of, point_of = scene(5, 8, 400)
     start = perturbed(rng, T, p, camera_of, point_of, "gbp", 0.0, 0.0)
     best = adjust_bundle(start).reconstruction
     points = best.points.copy()
-    points[17] += 0.02 * (points[17] - best.T_camera_world[0, 4:])
+    points[17] += off * (points[17] - best.T_camera_world[0, 4:])
     held = BundleAdjustmentConfig(solver=SolverOptions(max_iterations=1, initial_damping=30.0))
     result = adjust_bundle(replace(best, points=points), held)
     assert result.solution.limit == "steps" and result.doubt is None
-    assert any("1 point of 400 ended more than a standard deviation from where the images agree best" in n for n in result.notes)
+    assert [note for note in result.notes if told in note and note.endswith(": 17")]
+
+
+def beyond_infinity(seed: int, steps: int) -> BundleAdjustmentResult:
+    """The same scene with far points that start ten times too far, where nothing tells them to come back."""
+    return with_far_points(seed, steps, start=10.0)
+
+
+@pytest.mark.parametrize("seed", [101, 105, 109])
+def test_cameras_that_points_beyond_infinity_bend_are_doubted(seed: int) -> None:
+    """Steps leave such points where they are; put where their rays meet, they say how far the cameras are."""
+    best = beyond_infinity(seed, steps=300)
+    result = beyond_infinity(seed, steps=6)
+    off = cameras_off(result, best)
+    assert (result.doubt is not None) == (off > 1.0)
+    assert "iteration limit of 6 reached" in result.solution.reason
+    assert any("no steps were left to adjust all again" in note for note in result.notes)

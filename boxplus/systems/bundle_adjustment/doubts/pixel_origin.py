@@ -20,8 +20,8 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Solution
 from boxplus.systems.bundle_adjustment.cheirality import make_sound
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.doubts.plausibility import typical_error
 from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
-from boxplus.systems.bundle_adjustment.plausibility import typical_error
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, pixel_errors, start_values
 
 _SIDE = 0.97  # share of the pixels on one side of the principal point that asks where they are counted from

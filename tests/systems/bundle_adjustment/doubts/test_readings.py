@@ -15,7 +15,7 @@ from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.manifolds import se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
-from boxplus.systems.bundle_adjustment.readings import reading_doubt
+from boxplus.systems.bundle_adjustment.doubts.readings import reading_doubt
 from tests.small_problems import scene
 from tests.systems.bundle_adjustment.scenes import FOCAL, FORMATS, perturbed, reconstruction, turning
 
@@ -77,6 +77,18 @@ def test_a_focal_length_that_contradicts_the_start_of_two_views_is_not_trusted(f
         found = re.search(r"with a focal length (\S+) times as large", told)
         assert float(found[1]) == pytest.approx(1.0 / wrong, rel=0.03)
         assert adjust_bundle(start).doubt is None
+
+
+@pytest.mark.parametrize("format", ["gbp", "colmap"])
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_pixels_in_units_of_the_focal_length_are_not_trusted(format, seed):
+    """Errors of a five-hundredth of a pixel are as large, for such pixels, as they would be without any start."""
+    start = reconstruction(seed, format)
+    told = adjust_bundle(replace(start, pixels=start.pixels / FOCAL)).doubt or ""
+    if seed == 3:  # cameras and points of the start are too rough to tell
+        assert "as those of no image do at a focal length of 500 px: give both in pixels" in told
+        return
+    assert float(re.search(r"with a focal length (\S+) times as large", told)[1]) == pytest.approx(1.0 / FOCAL, rel=0.05)
 
 
 def test_swapped_pixels_of_either_direction_of_y_are_named():

@@ -130,17 +130,24 @@ def _better(seen: Sightings, readings: Iterable[_Reading], nowhere: str = "") ->
         nowhere: where points lie as the file is read, where that is at no place.
     """
     off = np.inf if nowhere else _typical(seen)
-    spread = float(np.median(np.linalg.norm(seen.pixels - np.median(seen.pixels, axis=0), axis=1)))
-    if not off > _OFF * spread:
+    share = off / _spread(seen)
+    if not share > _OFF:
         return None
-    least, way = min(((_typical(way.sightings), way) for way in readings), key=lambda one: one[0], default=(np.inf, None))
-    if way is None or not (least < _FAR_BETTER * off and least < _NEAR * spread):
+    shares = ((_typical(way.sightings) / _spread(way.sightings), way) for way in readings)  # of pixels that another size has, too
+    near, way = min(shares, key=lambda one: one[0], default=(np.inf, None))
+    if way is None or not (near < _FAR_BETTER * share and near < _NEAR):
         return None
+    least = near * _spread(way.sightings)
     as_read = f"within {off:.3g} px" if np.isfinite(off) else nowhere or "behind their cameras"
     return (
         f"half of the points lie within {least:.3g} px of where they were seen {way.got}, and {as_read} as the file is read",
         way,
     )
+
+
+def _spread(seen: Sightings) -> float:
+    """Median distance of pixels from their middle [px]."""
+    return max(float(np.median(np.linalg.norm(seen.pixels - np.median(seen.pixels, axis=0), axis=1))), 1e-300)
 
 
 def _typical(seen: Sightings) -> float:
