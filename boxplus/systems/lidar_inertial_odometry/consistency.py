@@ -66,6 +66,7 @@ class Consistency:
     def __init__(self, config: LioConfig, *, live: bool = False) -> None:
         self._min_matched_share = config.min_matched_share
         self._max_imu_gap = config.max_imu_gap
+        self._mounting_given = config.T_declared is not None
         self._watch = Watch(config, config.T_declared, live=live)
         self._turned = 0.0
         self._corrected = 0.0
@@ -251,8 +252,11 @@ class Consistency:
         cov_prior: NDArray[np.float64],
         posterior: Posterior,
     ) -> list[str]:
-        """Whether the corrections of position and velocity are as white as noise is."""
-        if not posterior.valid or frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES:
+        """Whether the corrections of the velocity are as white as noise is."""
+        # A mounting that is still being found moves what the IMU predicts, and no correction is white.
+        sought = not self._mounting_given and not self.mounting_borne_out
+        gap = frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES
+        if sought or gap or not posterior.valid:
             self._corrections.clear()
             return []
         correction = np.zeros(TANGENT)

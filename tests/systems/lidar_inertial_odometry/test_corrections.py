@@ -28,9 +28,9 @@ def told_of(seed: int, *, factor: float = 1.0, amplitude: float = 1.0, seconds: 
         after = P - gain @ P[:1]
         full = [np.zeros((TANGENT, TANGENT)) for _ in range(2)]
         for matrix, small in zip(full, (P, after), strict=True):
-            matrix[3:9, 3:9] = np.kron(small, np.eye(3))
+            matrix[6:9, 6:9] = small[1, 1] * np.eye(3)
         delta = np.zeros(TANGENT)
-        delta[3:9] = correction.ravel()
+        delta[6:9] = correction[1]
         told += filter(None, [corrections.update(round((k + 1) * PERIOD_S * 1e9), delta, *full)])
         x, P = x + correction, after
     return told
