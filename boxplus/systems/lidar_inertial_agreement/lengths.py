@@ -13,7 +13,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 _SLOPE_OFF = 0.07
 _METRES = 0.15  # a scale is 1, where 3.28 is the other choice
 _SLOPE_WELL_KNOWN = 0.033
-_FEWEST_SLOPES = 2
+FEWEST_SLOPES = 2
 _EXPLAINED = 0.8
 SLOPE_FLOOR = 0.02  # of any slope: what no fit knows
 SLOPE_KNOWN = 0.3
@@ -34,12 +34,12 @@ def feet_finding(in_feet: TranslationFit) -> Finding | None:
 
 def lengths_of_many(slopes: Sequence[tuple[float, float]]) -> Finding | None:
     """What several stretches say of the lengths, each by `slope_of`, where none of them decides alone."""
-    return slope_finding(*_mean(slopes), deviations=2.7) if len(slopes) >= _FEWEST_SLOPES else None
+    return slope_finding(*_mean(slopes), deviations=2.7) if len(slopes) >= FEWEST_SLOPES else None
 
 
 def lengths_known(slopes: Sequence[tuple[float, float]]) -> bool:
     """Whether lengths that are wrong by a tenth would have shown in these stretches."""
-    return len(slopes) >= _FEWEST_SLOPES and _mean(slopes)[1] < _SLOPE_WELL_KNOWN
+    return len(slopes) >= FEWEST_SLOPES and _mean(slopes)[1] < _SLOPE_WELL_KNOWN
 
 
 def _mean(slopes: Sequence[tuple[float, float]]) -> tuple[float, float]:

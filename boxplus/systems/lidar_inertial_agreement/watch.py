@@ -28,7 +28,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     shows_mounting,
     slope_of,
 )
-from boxplus.systems.lidar_inertial_agreement.lengths import lengths_known, lengths_of_many
+from boxplus.systems.lidar_inertial_agreement.lengths import FEWEST_SLOPES, lengths_known, lengths_of_many
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.registration import thinned
@@ -164,9 +164,7 @@ class Watch:
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
-        lengths = self._lengths(agreement) if not findings else None
-        if lengths is not None:
-            findings.append(lengths)
+        findings = self._with_lengths(agreement, findings)
         if agreement.astray is not None:
             self._astray = agreement.astray
             findings.append(agreement.astray)
@@ -196,13 +194,22 @@ class Watch:
             return None
         return clock_drift(self._first_with_clocks, agreement)
 
-    def _lengths(self, agreement: Agreement) -> Finding | None:
-        """Lengths by all stretches so far: four seconds of a walk show a tenth hardly, many together do."""
+    def _with_lengths(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
+        """The findings, with what all stretches so far say of the lengths.
+
+        Four seconds of a walk show a tenth hardly, many stretches together do. And a factor is the same in all of them: one that
+        only the newest asks for, against the others, is a path that lags behind.
+        """
+        if agreement.in_feet is not None or any(finding.cause != "length_scale" for finding in findings):
+            return findings
         slope = slope_of(agreement)
         if slope is not None and int(agreement.path.time_ns[0]) > self._slopes_until_ns - _OVERLAP_NS:
             self._slopes.append(slope)
             self._slopes_until_ns = int(agreement.path.time_ns[-1])
-        return lengths_of_many(self._slopes)
+        if len(self._slopes) < FEWEST_SLOPES:
+            return findings
+        lengths = lengths_of_many(self._slopes)
+        return [] if lengths is None else [lengths]
 
 
 def _clears(finding: Finding, agreement: Agreement) -> bool:

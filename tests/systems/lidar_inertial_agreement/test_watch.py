@@ -21,6 +21,33 @@ from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, FINE,
 
 
 @pytest.mark.slow
+def test_a_length_that_one_stretch_asks_for_and_the_others_do_not_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=T)
+    assert seen.translation is not None
+    covariance = seen.translation.covariance.copy()
+    covariance[SLOPE, SLOPE] = 0.045**2
+    slopes = iter([0.99, 1.3, 1.0, 1.01, 0.98, 1.0])
+    single = replace(seen, translation=replace(seen.translation, slope=1.3, covariance=covariance))
+    assert [finding.cause for finding in contradictions(single, T)] == ["length_scale"]
+
+    def compare(scans: Sequence[Scan], *_: Any, **__: Any) -> Agreement:
+        assert seen.translation is not None
+        time_ns = np.linspace(scans[0].start_ns, scans[-1].end_ns, len(seen.path)).astype(np.int64)
+        fit = replace(seen.translation, slope=next(slopes), covariance=covariance, explained=0.9)
+        return replace(seen, path=replace(seen.path, time_ns=time_ns), translation=fit)
+
+    monkeypatch.setattr(watch, "compare_sensors", compare)
+    following = watch.Watch(CONFIG, T)
+    still = np.zeros(3), np.zeros(3)
+    assert not any(following.add(scans[0].shifted(k * 100_000_000), imu, T, still) for k in range(160))
+    following.finish()
+    assert following.contradiction is None and next(slopes) < 1.02
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
 def test_lengths_are_named_by_several_comparisons(monkeypatch: pytest.MonkeyPatch, slope: float, named: bool) -> None:
     simulation = handheld(4)
