@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
 from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import (
     MOUNTING,
     HeldMounting,
     mounting_known,

@@ -25,26 +25,26 @@ from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.lidar_inertial_agreement.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
-from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
-from boxplus.systems.lidar_inertial_odometry.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 from boxplus.systems.lidar_inertial_odometry.mounted_update import mounted_update
-from boxplus.systems.lidar_inertial_odometry.mounting_drift import MountingDrift
+from boxplus.systems.lidar_inertial_odometry.mounting.excitation import RotationExcitation
+from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import MOUNTING, UnknownMounting, mounting_known
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
-from boxplus.systems.lidar_inertial_odometry.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import MOUNTING, UnknownMounting, mounting_known
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
-from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
+from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
+from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
+from boxplus.systems.lidar_inertial_odometry.watches.saturation import Saturation
+from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 
 _LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS = 3, 8, 2

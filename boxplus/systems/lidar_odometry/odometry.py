@@ -29,7 +29,7 @@ from boxplus.sensors.sequencer import Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
-from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
+from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_odometry.alignment import Alignment, ScanPoints, align
 from boxplus.systems.lidar_odometry.motion import DOF, VELOCITY, MotionBetween, MotionState, joint_prior, nav_state
 from boxplus.systems.lidar_odometry.observed_density import ObservedDensity

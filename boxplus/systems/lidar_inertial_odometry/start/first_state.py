@@ -36,7 +36,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import (
     wide_prior,
 )
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import first_sensitivity, with_mounting
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity, with_mounting
 
 _SLOPE_STD = 0.01  # of the scale of an accelerometer in order
 _ACCEL_BIAS_STD = 0.15  # m/s²

@@ -18,8 +18,7 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounted_update import less_sure
-from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import (
     MOUNTING,
     HeldMounting,
     UnknownMounting,
@@ -29,6 +28,7 @@ from boxplus.systems.lidar_inertial_odometry.unknown_mounting import (
     moved_sensitivity,
     with_mounting,
 )
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 
 
 def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

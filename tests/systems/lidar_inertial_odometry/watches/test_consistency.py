@@ -10,7 +10,7 @@ import pytest
 
 from boxplus.filtering.nav_state import BA, BW, TANGENT, NavState, P
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.consistency import Consistency
+from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 
 PERIOD_NS = 100_000_000
 

@@ -7,7 +7,7 @@ import pytest
 
 from boxplus.filtering.propagation import N_TIME, N_W, NODE
 from boxplus.manifolds import so3
-from boxplus.systems.lidar_inertial_odometry.excitation import RotationExcitation
+from boxplus.systems.lidar_inertial_odometry.mounting.excitation import RotationExcitation
 
 
 def _nodes(rates: np.ndarray) -> np.ndarray:

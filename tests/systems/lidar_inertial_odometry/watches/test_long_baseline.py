@@ -9,7 +9,7 @@ from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.long_baseline import Drift, LongBaseline
+from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import Drift, LongBaseline
 
 PERIOD_NS, BASELINE_S = 100_000_000, 1.25
 SIGMA_M = 0.01

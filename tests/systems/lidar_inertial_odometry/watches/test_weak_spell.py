@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.systems.lidar_inertial_odometry.weak_spell import WeakSpell
+from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 
 PERIOD_NS = 100_000_000
 

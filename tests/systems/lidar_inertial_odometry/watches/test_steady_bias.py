@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.systems.lidar_inertial_odometry.steady_bias import SteadyBias
+from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
 
 WALK, RATE_HZ = 1e-4, 10
 

@@ -20,9 +20,9 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
-from boxplus.systems.lidar_inertial_odometry.steady_bias import SteadyBias
+from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
+from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
 
 _KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.filtering.nav_state import TANGENT
-from boxplus.systems.lidar_inertial_odometry.corrections import Corrections
+from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 
 PERIOD_S, ACCEL_NOISE, POINT_NOISE = 0.1, 0.02, 0.01
 

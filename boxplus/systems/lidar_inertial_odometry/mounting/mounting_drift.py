@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.map_datum import Correction
 from boxplus.filtering.nav_state import P, R
 from boxplus.manifolds import so3
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import first_sensitivity
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
 
 _POSE = slice(0, 6)
 

@@ -11,9 +11,9 @@ from boxplus.filtering.map_datum import Correction, MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.long_baseline import Drift, LongBaseline
-from boxplus.systems.lidar_inertial_odometry.mounting_drift import MountingDrift
-from boxplus.systems.lidar_inertial_odometry.unknown_mounting import first_sensitivity
+from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
+from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import Drift, LongBaseline
 
 IMU_KNOWN = np.zeros((18, 6))  # the IMU's pose does not move with the mounting: what is placed does
 POINTS, SIGMA_M = 900, 0.01
