@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.formats.output import earlier_folder, output_error, put_back, replaced_folder
+from boxplus.formats.output import output_error, replaced_folder
 from boxplus.runs.run_folder import RunFolder
-from boxplus.runs.storage.folder_lock import LOCK, locked_beside
+from boxplus.runs.storage.folder_lock import LOCK, locked_beside, put_back_left
 from boxplus.runs.storage.output_folder import output_folder, program_of, state_of
 
 PROGRAM = "boxplus refine"
@@ -68,9 +68,7 @@ def claim_refine_folder(folder: str | Path, run: str | Path, *, overwrite: bool 
     own = RefineFolder(Path(folder).resolve())  # what takes the place of a link would leave the folder that it leads to
     if own.path.is_relative_to(Path(run).resolve()):
         raise InputError("another folder than that of the run", f"{own.path}", "choose one beside it with --output")
-    if earlier_folder(own.path).is_dir():
-        with locked_beside(own.path, PROGRAM):
-            put_back(own.path)
+    put_back_left(own.path, PROGRAM)
     if overwrite and _is_finished(own):
         with locked_beside(own.path, PROGRAM), _replaced(own) as made:
             yield made
