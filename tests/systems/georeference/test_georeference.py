@@ -407,6 +407,15 @@ def test_bursts_too_small_to_be_gated_are_no_step(laps: Drive, seed: int) -> Non
     assert not any("fixes jump by" in text for text in [*result.warnings, result.contradiction or ""])
 
 
+def test_a_burst_that_a_fix_within_is_used_of_is_one() -> None:
+    """What lay beyond that fix was left out, and the end of the burst was a jump to another datum: of a map that was right."""
+    rounds = drive([[0, 0], [120, 0], [120, 90], [0, 90]] * 5 + [[0, 0], [60, 0]], seed=7)
+    fixes = rounds.fixes(USUAL.model_copy(update={"multipath": 8, "multipath_s": 10.0, "multipath_m": 2.0}), 7)
+    result = georeference(rounds.graph, fixes, rounds.time_ns, rounds.T_odo_imu, None, np.array(LEVER))
+    assert result.fit is not None and (rounds.off(result) / result.fit.sigma).max() < 3.0
+    assert not any("fixes jump by" in text for text in [*result.warnings, result.contradiction or ""])
+
+
 HILLS = np.column_stack([np.array(LAPS, float), [0.0, 12.0, -3.0, 9.0, 0.0, 12.0, 3.0]])
 
 
