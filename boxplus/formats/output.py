@@ -124,13 +124,20 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
             if leftover.exists():
                 shutil.rmtree(leftover)
         try:
-            yield make_folder(made)
+            make_folder(made)
+            if target.is_dir():
+                shutil.copystat(target, made)  # who may read and write there
+            yield made
         except BaseException:
             shutil.rmtree(made, ignore_errors=True)
             raise
         if target.exists():
             os.rename(target, earlier)
-        os.rename(made, target)
+        try:
+            os.rename(made, target)
+        except OSError:
+            put_back(target)
+            raise
         if earlier.exists():
             shutil.rmtree(earlier)
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,14 +18,6 @@ PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
 
 _SCAN_FILE = re.compile(r"-?\d+\.(pcd|ply|las|laz|e57)")
-
-
-def doubts_of_map(tiles: Path) -> list[str]:
-    """Why a map folder is not to be trusted, as the run that it lies in says, in sentences; none where it lies in none."""
-    run = RunFolder(tiles.absolute().parent)
-    if run.tiles != tiles.absolute() or not run.summary.is_file():
-        return []
-    return [f"not to be trusted, as the run that wrote it says: {text}" for text in doubts_of(run.summary)[0]]
 
 
 def is_map_file(inside: Path) -> bool:
@@ -158,6 +151,20 @@ class RunFolder(OdometryFolder):
         """The folders in it that a run creates, inner ones first."""
         yield from self.tiles.glob("tiles/*")
         yield from (self.tiles / "tiles", self.tiles, self.scan_clouds, self.plots)
+
+
+def run_of_map(path: Path) -> RunFolder | None:
+    """The run that a folder of tiles or a file is the map of; None where it lies in none, or is another one there."""
+    own = Path(os.path.abspath(path))
+    run = RunFolder(own.parent)
+    return run if own in (run.tiles, run.map_ply, run.map_pcd) and run.summary.is_file() else None
+
+
+def doubts_of_map(tiles: Path) -> list[str]:
+    """Why a map folder is not to be trusted, as the run that it lies in says, in sentences; none where it lies in none."""
+    run = run_of_map(tiles)
+    doubts = [] if run is None else doubts_of(run.summary)[0]
+    return [f"not to be trusted, as the run that wrote it says: {text}" for text in doubts]
 
 
 @contextmanager

@@ -37,6 +37,29 @@ def test_the_old_folder_stays_whole_where_the_disk_is_full(folder: Path) -> None
     assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="modes are of POSIX")
+def test_the_new_folder_is_readable_to_the_same(folder: Path) -> None:
+    """A folder that nobody else might read was open to all after it had been replaced, and a shared one shut."""
+    folder.chmod(0o2750)
+    with replaced_folder(folder) as made:
+        assert made.stat().st_mode & 0o7777 == 0o2750
+    assert folder.stat().st_mode & 0o7777 == 0o2750
+
+
+def test_a_folder_that_cannot_take_its_place_leaves_the_old_one_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rename = os.rename
+
+    def fails(source: Path, target: Path) -> None:
+        if source.name.endswith("-tmp"):
+            raise PermissionError(13, "somebody has a file of it open")
+        rename(source, target)
+
+    with monkeypatch.context() as patched, pytest.raises(OutputError, match="no permission"), replaced_folder(folder) as made:
+        (made / "two").write_text("new")
+        patched.setattr(os, "rename", fails)
+    assert content(folder) == {"tiles/one": "old"}
+
+
 class Killed(BaseException):
     pass
 

@@ -104,7 +104,10 @@ def refine_command(
                     from boxplus.report.refinement_page import write_refinement_report
 
                     write_refinement_report(claimed.path, summary, result)
-        _print(terminal, summary, comparison, folder)
+        if summary.state != "finished" and (earlier := claimed.takes_place_of) is not None:
+            terminal.alarms.print(Text(f"{summary.verdict()}; the earlier refinement in {earlier} stays as it was", "yellow"))
+        else:
+            _print(terminal, summary, comparison, claimed.takes_place_of or folder)  # "." may be gone
         outcome.end(summary, summary.state, untrusted=summary.doubt is not None)
         outcome.compare(comparison)
 

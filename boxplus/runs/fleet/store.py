@@ -18,7 +18,7 @@ from boxplus._extras import require
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
 from boxplus.runs.sessions.folder import claim_merge_folder
-from boxplus.runs.storage.folder_lock import locked_folder
+from boxplus.runs.storage.folder_lock import locked_folder, put_back_left
 from boxplus.runs.storage.output_folder import SUMMARY
 
 MERGED = "merged"
@@ -110,6 +110,7 @@ class SharedFolder(Store):
         """See `Store`."""
         make_folder(self.path)
         with locked_folder(self.path, _PROGRAM):
+            put_back_left(self.path / MERGED, _PROGRAM)
             yield
 
     @contextmanager

@@ -19,7 +19,7 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
-from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.run_folder import RunFolder, run_of_map
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
 from boxplus.runs.storage.output_folder import doubts_of, program_of
@@ -88,6 +88,8 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     kind, trajectory, origin = "point cloud", None, np.zeros(3)
     if base.is_file():
         points, origin = _of_file(base, config.voxel)
+        if (run := run_of_map(base)) is not None:
+            doubts, accepted = doubts_of(run.summary)
         if origin.any():
             report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
@@ -112,26 +114,25 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
 def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list[str]) -> tuple[Path, str, Trajectory | None]:
     """The folder with the tiles, what wrote it, and the trajectory they were made on."""
     is_bare = (base / MANIFEST).is_file()
-    run = base.parent if is_bare else base
-    folder = RunFolder(run)
+    folder = run_of_map(base) if is_bare else RunFolder(base)
+    if folder is None:
+        return base, "map folder", None
     if not is_bare and not (folder.tiles / MANIFEST).is_file():
         advice = advice_to_put_back(folder.tiles) or "run without --no-map"
         raise InputError(_WHAT, f"a folder without map tiles, {base}", advice)
     program = program_of(folder.summary) if folder.summary.is_file() else None
     has_trajectory = folder.trajectory.is_file()
-    if is_bare and (not folder.summary.is_file() or folder.tiles != base):
-        return base, "map folder", None
     if program is not None:
         for kept, texts in zip((doubts, accepted), doubts_of(folder.summary), strict=True):
             kept.extend(texts)
     if is_bare and has_trajectory:
-        report.append(f"the map belongs to the run in {run}, whose trajectory is used")
+        report.append(f"the map belongs to the run in {folder.path}, whose trajectory is used")
     kind = "map folder" if is_bare and not has_trajectory else program or "map folder"
-    return folder.tiles, kind, _trajectory(run, report) if has_trajectory else None
+    return folder.tiles, kind, _trajectory(folder, report) if has_trajectory else None
 
 
-def _trajectory(run: Path, report: list[str]) -> Trajectory:
-    trajectory = read_trajectory(RunFolder(run).trajectory)
+def _trajectory(folder: RunFolder, report: list[str]) -> Trajectory:
+    trajectory = read_trajectory(folder.trajectory)
     report.extend(trajectory.warnings)
     trajectory.times  # noqa: B018 - refuses one without times
     return trajectory

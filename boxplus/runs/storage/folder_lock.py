@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.formats.output import make_folder, output_error
+from boxplus.formats.output import earlier_folder, make_folder, output_error, put_back
 
 LOCK = "run.lock"
 BESIDE = ".boxplus-lock"
@@ -62,6 +62,18 @@ def locked_beside(folder: Path, program: str) -> Iterator[FolderLock]:
     with _locked(folder.with_name(folder.name + BESIDE), folder, program) as lock:
         lock.keep_file = False  # what a killed process left beside the folder goes with the next one
         yield lock
+
+
+def put_back_left(folder: Path, program: str) -> None:
+    """Put back what a process left beside `folder` which was killed as it replaced it; nothing where there is none.
+
+    Raises:
+        InputError: another process holds the lock beside it, and may be replacing it just now.
+        OutputError: it cannot be renamed.
+    """
+    if earlier_folder(folder).is_dir():
+        with locked_beside(folder, program):
+            put_back(folder)
 
 
 @contextmanager

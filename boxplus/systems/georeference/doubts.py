@@ -41,12 +41,16 @@ def of_gated(attached: AttachedFixes, found: Fit) -> Counter[str]:
 def contradiction_of(jump: Jump | None, plateau: Plateau | None, found: Fit) -> str | None:
     """Why the result is not to be trusted: it lies between two datums, or in one of them."""
     said = [_of_jump(jump)] if jump is not None and jump.contradicts(found) else []
-    if plateau is not None:
-        said.append(
-            f"fixes lie {plateau.metres:.1f} m off for {plateau.duration:.0f} s from {plateau.begin:.0f} s on, all by the same "
-            "and longer than multipath lasts: another datum or base station there, which is not used; nobody knows which is right"
-        )
+    if plateau is not None and not plateau.is_short:
+        said.append(f"{_of_plateau(plateau)}; nobody knows which is right")
     return "; ".join(said) or None
+
+
+def _of_plateau(plateau: Plateau) -> str:
+    return (
+        f"fixes lie {plateau.metres:.1f} m off for {plateau.duration:.0f} s from {plateau.begin:.0f} s on, all by the same and "
+        "longer than multipath lasts: another datum or base station there, which is not used"
+    )
 
 
 def _of_jump(jump: Jump) -> str:
@@ -92,6 +96,8 @@ def doubts_of(
                 f"fixes lie {metres:.1f} m off for {duration:.0f} s from {begin:.0f} s on, longer than multipath lasts: "
                 "another datum or base station, or the odometry is wrong there"
             )
+    if plateau is not None and plateau.is_short:
+        warnings.append(_of_plateau(plateau))
     if jump is not None and not jump.contradicts(found):
         warnings.append(_of_jump(jump))
     if found.noise_scale > NOISY:

@@ -140,12 +140,19 @@ def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:
     """The step at a fix or one beside it: means of a few fixes do not tell which.
 
     Bursts of multipath elsewhere, which the map does not rest on, say nothing of it, and a large one would be half of the step.
+    But of a burst some fixes are used by chance, and what lies beyond these is a part of it: where all fixes together make a
+    burst of it, it is one.
     """
     inside = range(max(at - _BESIDE, 1), min(at + _BESIDE + 1, len(seconds)))
-    kept = found.is_used.copy()
+    near = found.is_used.copy()
     for begin, end in found.gated:
-        kept[begin:end] = begin <= inside[-1] and end >= inside[0]
-    row, e = np.cumsum(kept) - 1, found.errors[kept, :2]
+        near[begin:end] = begin <= inside[-1] and end >= inside[0]
+    of_all, of_near = (_largest(seconds, found.errors, kept, inside, sigma) for kept in (np.ones_like(near), near))
+    return of_all if of_all.is_burst else of_near
+
+
+def _largest(seconds: Floats, errors: Floats, kept: NDArray[np.bool_], inside: range, sigma: float) -> Step:
+    row, e = np.cumsum(kept) - 1, errors[kept, :2]
     return max((step_at(seconds[kept], e, int(row[k]), sigma) for k in inside if row[k] > 0), key=lambda step: step.gain)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -192,13 +193,16 @@ def test_results_are_replaced_on_demand_only(folders: tuple[Path, Path], refined
     assert code == 2 and "the results of an earlier run" in err
 
 
-def test_a_second_refinement_replaces_the_first_when_it_is_whole(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_second_refinement_replaces_the_first_when_it_is_whole(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Once `--overwrite` cleared the folder before anything was computed, and a full disk left neither of the two."""
     run, out = folders[0], tmp_path / "out"
     once = ("-o", out, "--no-report", "--no-map", "--set", "refinement.rounds=1")
     assert call("refine", run, *once)[0] == 0
     (out / "plots").mkdir(exist_ok=True)
     (out / "plots" / "notes.txt").write_text("mine")
+    open_log = (out / "log.txt").open("w")
 
     def there() -> dict[str, bytes]:
         return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -210,12 +214,21 @@ def test_a_second_refinement_replaces_the_first_when_it_is_whole(folders: tuple[
         stopped = refine_run.refine_run(refine_run.read_odometry_run(run), claimed, should_stop=lambda: True)
         assert there() == before
     assert stopped.summary.state == "interrupted" and there() == before
+    with monkeypatch.context() as patched:
+        patched.setattr(refine_run._RefineRun, "_tell", lambda self, stage, share: (_ for _ in ()).throw(refine_run._Stopped))
+        code, printed, _ = call("refine", run, *once, "--overwrite")
+    assert code == 130 and there() == before
+    assert f"nothing was refined; the earlier refinement in {out} stays as it was" in printed and "trajectory.csv" not in printed
 
     # A process that is killed leaves what it had begun beside the folder, and the next one takes it away.
     (tmp_path / "out.boxplus-tmp").mkdir()
     (tmp_path / "out.boxplus-tmp" / "run.json").write_text("{")
     code, _, err = call("refine", run, *once, "--overwrite")
     assert code == 0, err
+    with open_log:
+        open_log.write("still written to")  # as by `tee`
+    assert (out / "log.txt").read_text() == "still written to"
+    (out / "log.txt").write_text("")
     after = there()
     assert after.keys() == before.keys() and after["plots/notes.txt"] == b"mine" and after["run.json"] != before["run.json"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -224,6 +237,12 @@ def test_a_second_refinement_replaces_the_first_when_it_is_whole(folders: tuple[
     out.rename(tmp_path / "out.boxplus-earlier")
     code, _, err = call("refine", run, *once)
     assert code == 2 and "the results of an earlier run" in err and there() == after
+
+    # What could not be kept is named before anything is computed.
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(out / "pipe")
+        code, _, err = call("refine", run, *once, "--overwrite")
+        assert code == 2 and f"can be read – got {out / 'pipe'} – move it away" in err and there() == after
 
 
 def test_stopping_leaves_no_half_results(folders: tuple[Path, Path], tmp_path: Path) -> None:

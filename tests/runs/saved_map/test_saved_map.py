@@ -169,9 +169,13 @@ def test_a_map_that_was_recovered_is_not_damaged(tmp_path: Path) -> None:
         assert any(text in line for line in saved.report), text
 
 
-def test_what_its_run_says_against_a_map_is_read(tmp_path: Path) -> None:
+def test_what_its_run_says_against_a_map_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the map in one file nothing was, nor of a folder that one stood in."""
     write_run(tmp_path / "run", two_rooms())
-    summary = tmp_path / "run" / "run.json"
+    summary, file = tmp_path / "run" / "run.json", tmp_path / "run" / "map.ply"
+    write_ply(file, two_rooms())
+    write_ply(tmp_path / "run" / "mine.ply", two_rooms())
+    monkeypatch.chdir(tmp_path / "run" / "map")
     assert open_saved_map(tmp_path / "run", CONFIG).doubts == []
     for found, expected in (
         ({"program": "boxplus map merge", "doubts": ["two places of a kind", "a burst"]}, ["two places of a kind", "a burst"]),
@@ -183,8 +187,10 @@ def test_what_its_run_says_against_a_map_is_read(tmp_path: Path) -> None:
     ):
         summary.write_text(json.dumps(found))
         assert open_saved_map(tmp_path / "run", CONFIG).doubts == expected
-        bare = open_saved_map(tmp_path / "run" / "map", CONFIG)
-        assert bare.doubts == expected and bare.accepted == (["a burst"] if "accepted" in found else [])
+        for path in (tmp_path / "run" / "map", Path("."), file, Path("../map.ply")):
+            bare = open_saved_map(path, CONFIG)
+            assert bare.doubts == expected and bare.accepted == (["a burst"] if "accepted" in found else [])
+        assert open_saved_map(tmp_path / "run" / "mine.ply", CONFIG).doubts == []
 
 
 @pytest.mark.parametrize(("missing", "opened"), [("run/map", "run"), ("run/map", "run/map"), ("run", "run"), ("run", "run/map")])
