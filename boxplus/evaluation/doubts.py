@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -24,7 +25,8 @@ _SCALED, _SCALE = 0.5, 0.01  # times the error, and difference of the scale from
 _LEAST, _ROUNDS, _TURNS = 50, 10, 0.05  # poses; repetitions; turning in rad, about every axis, for another point to show
 _FITS = 0.1  # of the size of the path: an error up to which the positions are of the same path
 _CONSTANT_DEG, _LOOSE = 2.0, 2.0  # rotation between body frames that is told, and times what the alignment may be off by
-_STILL_DEG, _TURNED_DEG = 0.1, 5.0  # turns from the first orientation of a file that has none, and of one that has
+_STILL_DEG, _TURNED_DEG = 0.1, 5.0  # turns from the mean orientation of a file that has none, and of one that has
+_BUT_FEW = 0.95  # quantile of these of the one that has
 _ALONG = 0.99  # cosine between a lever and the way, where stamps that are off do the same
 _UNLIKE = 0.6  # of the size of the path, that an alignment leaves of one with which it has nothing in common
 _OVER_NOISE = 1.5  # times the noise of the estimate, which alone leaves a median of 0.9, and no other path shows up to
@@ -110,7 +112,7 @@ def reading_doubts(association: Association, alignment: Alignment, translation: 
         *_orientation_doubts(estimate, truth, alignment, rmse),
         *_inversion_doubts(estimate, truth, alignment, rmse),
         *_scale_doubts(estimate, truth, alignment),
-        *_lever_doubts(estimate, truth, alignment),
+        *_lever_doubts(estimate, truth, alignment, association.offset_s),
         *_world_doubts(estimate, truth, alignment, rmse),
         *_unrelated_doubts(estimate, truth),
     ]
@@ -120,7 +122,7 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
     R = alignment.R_world_estimate
     scatter = _scatter_deg(R @ estimate.R, truth.R)
     for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
-        if _turned_deg(one) < _STILL_DEG and _turned_deg(other) > _TURNED_DEG:
+        if _turned_deg(one).max() < _STILL_DEG and np.quantile(_turned_deg(other), _BUT_FEW) > _TURNED_DEG:
             yield (
                 f"the orientations of the {name} never change: it has none, and the rotation error and the relative errors mean "
                 "nothing"
@@ -223,8 +225,12 @@ def _scale_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
         )
 
 
-def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment) -> Iterator[str]:
-    """Whether the ground truth is that of another point of the body: p_truth = s R (p + R_estimate l) + t, with l sought."""
+def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, offset_s: float) -> Iterator[str]:
+    """Whether the ground truth is that of another point of the body: p_truth = s R (p + R_estimate l) + t, with l sought.
+
+    Args:
+        offset_s: what was added to the stamps of the estimate before.
+    """
     kind: PositionAlignment = "sim3" if alignment.kind == "sim3" else "se3"
     if len(estimate) < _LEAST:
         return
@@ -249,7 +255,10 @@ def _lever_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment)
     if error < min(_SCALED * rmse, _FITS * found.spread_m[0]) and np.linalg.norm(lever) > error:
         x, y, z = lever
         late_s = _late_s(estimate, lever)
-        other = "" if late_s is None else f"; or stamps are off, as that lies along the way: with about --offset {late_s:.2g}"
+        other = ""
+        if late_s is not None:
+            digits = max(1 - math.floor(math.log10(abs(late_s))), 0)  # two of what is missing
+            other = f"; or stamps are off, as that lies along the way: with about --offset {offset_s + late_s:.{digits}f}"
         yield (
             f"the ground truth seems to be that of another point of the body, at ({x:.3f}, {y:.3f}, {z:.3f}) m in the frame of "
             f"the estimate's: of that point the ATE is {error:.4g} m instead of {rmse:.4g} m (where the axes of both bodies are "
@@ -365,7 +374,7 @@ def _mean_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt)
 
 
-def _turned_deg(trajectory: Trajectory) -> float:
-    """The largest turn from the first orientation [degrees]."""
+def _turned_deg(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Turns (M,) from the mean orientation [degrees]."""
     R = trajectory.R
-    return float(np.degrees(np.linalg.norm(so3.log(R[0].T @ R), axis=1).max()))
+    return np.asarray(np.degrees(np.linalg.norm(so3.log(_mean_rotation(R).T @ R), axis=1)))

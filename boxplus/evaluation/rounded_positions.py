@@ -13,6 +13,7 @@ _UNITS_M = (100.0, 10.0, 1.0, 0.1, 0.01, 0.001)
 _EXACT = 1e-6  # of the unit, by which multiples of it are off
 _OF_ERROR, _MOST = 0.3, 1.2  # times the whole error, that rounding makes at least to be told, and at most to have made it
 _LEAST = 30  # poses
+_EVEN = 0.9  # share of the steps, of those along an axis, that are as long as one beside them where they were driven so
 
 
 def rounded_position_doubts(estimate: Trajectory, ground_truth: Trajectory, rmse: float) -> Iterator[str]:
@@ -36,7 +37,16 @@ def rounded_position_doubts(estimate: Trajectory, ground_truth: Trajectory, rmse
 
 
 def _unit(values: NDArray[np.float64]) -> float | None:
-    """The largest unit of which all values (n,) are multiples; None where they are of none, or all the same."""
+    """The largest unit of which all values (n,) are multiples; None where they are of none, all the same, or go on evenly.
+
+    Rounding makes even steps uneven, or, of short ones, single steps of a unit.
+    """
     if not np.ptp(values) > 0.0:
         return None
-    return next((unit for unit in _UNITS_M if (np.abs(values / unit - np.round(values / unit)) < _EXACT).all()), None)
+    unit = next((unit for unit in _UNITS_M if (np.abs(values / unit - np.round(values / unit)) < _EXACT).all()), None)
+    if unit is None:
+        return None
+    steps = np.round(np.diff(values) / unit)
+    alike = steps[1:] == steps[:-1]
+    is_even = np.append(alike, False) | np.append(False, alike)
+    return None if is_even[steps != 0.0].mean() > _EVEN else unit

@@ -49,3 +49,25 @@ def test_even_speed_along_one_axis_was_not_rounded() -> None:
     truth = moved(truth, p)
     estimate = moved(truth, p + 0.3 * np.random.default_rng(3).normal(size=p.shape))
     assert evaluate(estimate, truth, alignment="none").warnings == ()
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_a_square_at_even_speed_was_not_rounded(seed: int) -> None:
+    """A decimetre between two poses, and an estimate that errs by about as much as rounding to that would."""
+    side = 0.1 * np.arange(150)
+    ends = [(side, 0.0 * side), (0.0 * side + 15.0, side), (15.0 - side, 0.0 * side + 15.0), (0.0 * side, 15.0 - side)]
+    x, y = np.concatenate(ends, axis=1)
+    truth = moved(path(), np.round(np.stack([x, y, 0.0 * x], axis=1), 3))
+    estimate = moved(truth, truth.p + 0.04 * np.random.default_rng(seed).normal(size=truth.p.shape))
+    assert evaluate(estimate, truth, alignment="none").warnings == ()
+
+
+@pytest.mark.parametrize("speed", [0.004, 0.03, 0.11])
+def test_positions_of_a_slow_walk_that_were_rounded_are_told(speed: float) -> None:
+    """Most steps of the file are none at all."""
+    angle = np.linspace(0.0, 5.0, 600)
+    size = speed * 600 / 5.0
+    truth = moved(path(), size * np.stack([np.sin(angle), np.cos(angle), 0.0 * angle], axis=1))
+    estimate = moved(truth, np.round(truth.p, 1))
+    said = " // ".join(evaluate(estimate, truth, alignment="none").warnings)
+    assert "all positions of the estimate are multiples, x of 0.1 m, y of 0.1 m" in said

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_quantile
 from boxplus.optimization.linear_systems.least_squares import LeastSquares
 from boxplus.optimization.minimizers.gauge import find_gauge
 
@@ -28,6 +29,7 @@ AWAY = 1.0  # standard deviations
 _SAMPLES = (10, 20, 30, 30, 30)  # of C, round by round; the first, beyond the degrees of freedom of the largest variable
 _AT_ONCE = 8  # samples that are solved for together
 _SURE = 3.0  # standard deviations of an estimate, by which it has to be beyond one
+_CHANCE = 1e-4  # that an estimate scatters by as much, for one that is counted
 _GLANCES, _LOOKS = 2, 16  # variables that are looked at exactly in a round; variables, and residuals, at the end
 _SEEN = 3  # that are looked at once one is known to be far, to name one that is among the farthest
 _FLAT = 1e-12  # share of the variances, for a direction without any
@@ -46,7 +48,7 @@ class _Part:
         damping: (n, dof); of rows zero.
         is_asked: (n,).
         sums: (n, dof, dof) of the products of what is left of samples.
-        away: (n,) distances. is_exact: (n,).
+        away: (n,) distances. is_exact: (n,). is_far: (n,) which are farther than one whatever the samples scatter.
     """
 
     is_rows: bool
@@ -59,6 +61,7 @@ class _Part:
     sums: NDArray[np.float64]
     away: NDArray[np.float64]
     is_exact: NDArray[np.bool_]
+    is_far: NDArray[np.bool_]
 
     @property
     def places(self) -> slice:
@@ -77,6 +80,7 @@ class Distances:
     Attributes:
         variables: for every block (n,); zero where fixed or left out.
         residuals: for every group (N,); each row of a residual by itself, and the farthest.
+        far_variables, far_residuals: how many of each are farther than one whatever the samples scatter.
         worst_variable: block and row of the farthest that was looked at, whose distance is exact; None where that is within one.
         worst_residual: group and residual likewise, where no variable is farther than one.
     """
@@ -116,6 +120,11 @@ class Distances:
         self.variables = tuple(np.zeros(len(number)) for number in layout.number)
         for away, number, part in zip(self.variables, layout.number, blocks, strict=True):
             away[number >= 0] = part.away
+        self.far_variables = tuple(int(np.count_nonzero(part.is_far)) for part in blocks)
+        self.far_residuals = tuple(
+            int(np.count_nonzero(part.is_far.reshape(group.r.shape).any(axis=1)))
+            for group, part in zip(problem.groups, groups, strict=True)
+        )
         self.residuals = tuple(
             part.away.reshape(group.r.shape).max(axis=1, initial=0.0) for group, part in zip(problem.groups, groups, strict=True)
         )
@@ -155,6 +164,8 @@ class Distances:
         freedom = drawn - part.u.shape[1] + 1
         away = np.minimum(_distance(part.sums / freedom + part.alone, part.u, _least(part)), self._total)
         part.away[:] = np.where(part.is_exact, part.away, np.where(part.is_asked, away, 0.0))
+        most = math.sqrt(freedom / chi_square_quantile(_CHANCE, freedom))
+        part.is_far[:] = part.away > AWAY * np.where(part.is_exact, 1.0, most)
         sure = part.is_exact | (part.away / (1.0 + _SURE / math.sqrt(2.0 * freedom)) > AWAY)
         return int(np.count_nonzero((part.away > AWAY) & ~sure))
 
@@ -171,6 +182,7 @@ class Distances:
                 return known
             part, number = parts[seems[0]], seems[1]
             part.away[number], part.is_exact[number] = min(self._exact(part, number), self._total), True
+            part.is_far[number] = part.away[number] > AWAY
         return _farthest([np.where(part.is_exact, part.away, 0.0) for part in parts])
 
     def _exact(self, part: _Part, number: int) -> float:
@@ -194,7 +206,7 @@ def _part(
     damping: NDArray[np.float64],
     is_asked: NDArray[np.bool_],
 ) -> _Part:
-    known = np.zeros(len(u)), np.zeros(len(u), dtype=np.bool_)
+    known = np.zeros(len(u)), np.zeros(len(u), dtype=np.bool_), np.zeros(len(u), dtype=np.bool_)
     return _Part(is_rows, first, u, gain, alone, damping, is_asked, np.zeros_like(alone), *known)
 
 

@@ -46,6 +46,7 @@ class Remainder:
             known to be farther than one, and none is farther than `total`. Where nothing holds the world, without the motion
             that all poses have in common.
         residuals: for every group (N,) the same of what each residual sees.
+        far_variables, far_residuals: for every block and group, how many are farther than one whatever the estimates scatter.
         worst_variable: block and row of the farthest that is exact; None where none is farther than one.
         worst_residual: group and residual likewise, where no variable is farther than one.
     """
@@ -54,6 +55,8 @@ class Remainder:
     total: float
     variables: tuple[NDArray[np.float64], ...]
     residuals: tuple[NDArray[np.float64], ...]
+    far_variables: tuple[int, ...]
+    far_residuals: tuple[int, ...]
     worst_variable: tuple[int, int] | None
     worst_residual: tuple[int, int] | None
 
@@ -81,9 +84,11 @@ def find_remainder(problem: LeastSquares, costs: Sequence[float], apart_from: Va
     if remaining == math.inf:
         everywhere = [np.where(number >= 0, total, 0.0) for number in problem.layout.number]
         nowhere = tuple(np.zeros(len(group.r)) for group in problem.groups)
-        return Remainder(remaining, total, tuple(everywhere), nowhere, _first_free(problem), None)
+        far = tuple(int(np.count_nonzero(one)) for one in everywhere), tuple(0 for _ in nowhere)
+        return Remainder(remaining, total, tuple(everywhere), nowhere, *far, _first_free(problem), None)
     found = Distances(problem, step.delta * math.sqrt(slow / variance), step.damping, total, left_out)
-    return Remainder(remaining, total, found.variables, found.residuals, found.worst_variable, found.worst_residual)
+    far = found.far_variables, found.far_residuals
+    return Remainder(remaining, total, found.variables, found.residuals, *far, found.worst_variable, found.worst_residual)
 
 
 def _first_free(problem: LeastSquares) -> tuple[int, int] | None:
@@ -107,12 +112,13 @@ def unconverged_sentence(problem: LeastSquares, reason: str, cost: float, remain
     if remainder.worst_variable is not None:
         number, row = remainder.worst_variable
         what, away = f"{layout.blocks[number].name}[{layout.ids[number][row]}]", remainder.variables
-        others = _others(away, number, [block.name for block in layout.blocks])
+        others = _others(remainder.far_variables, away, number, [block.name for block in layout.blocks])
     elif remainder.worst_residual is not None:
         number, row = remainder.worst_residual
         group, away = problem.groups[number], remainder.residuals
         ends = " and ".join(f"{c.block.name}[{c.ids[row]}]" for c in group.connections)
-        what, others = f"what {group.name}[{row}] sees of {ends}", _others(away, number, [one.name for one in problem.groups])
+        what = f"what {group.name}[{row}] sees of {ends}"
+        others = _others(remainder.far_residuals, away, number, [one.name for one in problem.groups])
     else:
         return None
     return (
@@ -121,14 +127,14 @@ def unconverged_sentence(problem: LeastSquares, reason: str, cost: float, remain
     )
 
 
-def _others(away: Sequence[NDArray[np.float64]], worst: int, names: Sequence[str]) -> str:
-    """How many more are farther than one; most of these are estimates."""
+def _others(far: Sequence[int], away: Sequence[NDArray[np.float64]], worst: int, names: Sequence[str]) -> str:
+    """How many more are farther than one, at least: what estimates scatter by is none of it."""
     told = []
-    for number, (one, name) in enumerate(zip(away, names, strict=True)):
-        count = int(np.count_nonzero(one > AWAY)) - (number == worst)
-        if count:
-            told.append(f"{count} {'more ' if number == worst else ''}of {len(one)} {name}")
-    return f", and {', '.join(told)} more than one" if told else ""
+    for number, (count, one, name) in enumerate(zip(far, away, names, strict=True)):
+        more = count - (number == worst)
+        if more:
+            told.append(f"{more} {'more ' if number == worst else ''}of {len(one)} {name}")
+    return f", and at least {', '.join(told)} more than one" if told else ""
 
 
 @dataclass(frozen=True, slots=True)

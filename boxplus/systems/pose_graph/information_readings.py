@@ -10,84 +10,157 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._chi_square import chi_square_cdf
 from boxplus.errors import BoxplusError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.minimizers.minimize import Callback
+from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of
+from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of, squared_errors
+from boxplus.systems.pose_graph.reliability import Reliability
 
 _SMALL, _LEAST = 0.7, 30  # χ² of what is promised, below which it is asked, and degrees of freedom for it to mean much
 _AS_PROMISED = (0.6, 1.6)  # χ² of rotations and of translations, where a reading is right
+_LEAST_SPARE = 10.0  # redundancy from which on either is judged on its own
 _LIKELY = (0.1, 3e4)  # the same before poses are found anew
 _STEPS = 20
 _SLACK, _UNLIKE = 0.25, 4.0  # χ² of rotations or translations that is told of, and how many times that the other has
+_SURE = 1e-6  # chance that noise as promised makes it as small
+_NO_ERROR = 1e-6  # standard deviations, up to which errors along an axis are none, as of a plane in space
 _ROTATIONS = {"": 1.0, "square degree": np.degrees(1.0), "square milliradian": 1e3}
 _TRANSLATIONS = {"": 1.0, "square millimetre": 1e3}
 """Units, and how many of their roots a radian or a metre has."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Fits:
+    """χ² of rotations and of translations, and the redundancy of each: what is promised of it."""
+
+    chi2: tuple[float, float]
+    spare: tuple[float, float]
+
+    @classmethod
+    def of(cls, known: Reliability) -> _Fits | None:
+        """None where either has too little redundancy to tell.
+
+        How much of it each has depends on the weights: precise translations say more of rotations than imprecise rotations do.
+        """
+        shares = known.factors.any(axis=2) - np.einsum("nii->ni", known.predicted)
+        is_told = np.abs(known.errors).max(axis=0) > _NO_ERROR
+        parts = [np.flatnonzero(is_told[part]) + part.start for part in edge_parts(len(is_told))]
+        chi2 = [float((known.errors[:, axes] ** 2).sum()) for axes in parts]
+        spare = [float(shares[:, axes].sum()) for axes in parts]
+        return cls((chi2[0], chi2[1]), (spare[0], spare[1])) if min(spare) >= _LEAST_SPARE else None
+
+    @property
+    def rotations(self) -> float:
+        """χ² over what is promised."""
+        return self.chi2[0] / self.spare[0]
+
+    @property
+    def translations(self) -> float:
+        """χ² over what is promised."""
+        return self.chi2[1] / self.spare[1]
+
+    @property
+    def off(self) -> float:
+        """How far the farther of both is from what is promised, as a logarithm."""
+        return max(abs(math.log(max(fit, 1e-300))) for fit in (self.rotations, self.translations))
+
+    @property
+    def is_as_promised(self) -> bool:
+        """Whether both are."""
+        return all(_AS_PROMISED[0] < fit < _AS_PROMISED[1] for fit in (self.rotations, self.translations))
+
+    def is_likely(self, graph: PoseGraph, poses: NDArray[np.float64]) -> bool:
+        """Whether it may be with other information, by its χ² at these poses."""
+        i, j = graph.edges.T
+        residual = residual_of(graph)
+        e = np.einsum("nab,nb->na", residual.whitening.factors, residual.evaluate(poses[i], poses[j]))
+        fits = [float((e[:, part] ** 2).sum()) / spare for part, spare in zip(edge_parts(e.shape[1]), self.spare, strict=True)]
+        return all(_LIKELY[0] < fit < _LIKELY[1] for fit in fits)
+
+    def __str__(self) -> str:
+        """χ² of both over what is promised, and of each."""
+        both = sum(self.chi2) / sum(self.spare)
+        return f"{both:.3g} times (rotations {self.rotations:.3g}, translations {self.translations:.3g})"
+
+
 def information_doubt(
     graph: PoseGraph,
-    poses: NDArray[np.float64],
+    solution: Solution,
+    variables: Variables,
     held: NDArray[np.int64],
     options: SolverOptions,
+    known: Reliability | None = None,
     callback: Callback | None = None,
 ) -> str | None:
-    """A sentence where the edges' information fits the errors at `poses` far better in another unit, or inverted.
+    """A sentence where the edges' information fits the errors at the result far better in another unit, or inverted.
+
+    Of several readings that fit, the one that fits best.
 
     Args:
-        held: the poses that are held. callback: may stop the search for poses of another reading, which then is not told.
+        variables: the poses. held: those that are held. known: of all edges, where that has been computed.
+        callback: may stop the search for poses of another reading, which then is not told.
     """
-    as_read = _fits(graph, poses, len(held))
-    if as_read is None or not as_read[2] < _SMALL:
+    poses = solution[variables]
+    dof = graph.information.shape[1] * (len(graph.edges) - len(graph.ids) + len(held))
+    if dof < _LEAST or not squared_errors(residual_of(graph), graph, poses).sum() < _SMALL * dof:
         return None
+    known = known if known is not None else Reliability.of(graph, solution, variables)
+    as_read = None if known is None else _Fits.of(known)
+    if as_read is None or as_read.is_as_promised:
+        return None
+    best: tuple[_Fits, str] | None = None
     for information, meant in _readings(graph.information):
         other = replace(graph, information=information)
-        before = _fits(other, poses, len(held))
-        if before is None or not all(_LIKELY[0] < fit < _LIKELY[1] for fit in before):
+        if not as_read.is_likely(other, poses):
             continue
         try:
-            problem, _ = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
+            problem, anew = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
             found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=callback)
+            if found.status == "stopped" and found.limit != "steps":
+                return None
+            is_near = _AS_PROMISED[0] < 2.0 * found.cost / dof < _AS_PROMISED[1]  # what is known of each part takes longest
+            reliability = Reliability.of(other, found, anew) if is_near else None
         except BoxplusError:
             continue
-        if found.status == "stopped" and found.limit != "steps":
-            return None
-        fits = _fits(other, found.values[0], len(held))
-        if fits is not None and all(_AS_PROMISED[0] < fit < _AS_PROMISED[1] for fit in fits):
-            return (
-                f"χ² is {as_read[2]:.3g} times what the information matrices promise (rotations {as_read[0]:.3g}, translations "
-                f"{as_read[1]:.3g}), and {fits[2]:.3g} times ({fits[0]:.3g}, {fits[1]:.3g}) if {meant}: edges weigh wrongly "
-                "against each other, and standard deviations are wrong"
-            )
-    return None
+        fits = None if reliability is None else _Fits.of(reliability)
+        if fits is not None and fits.is_as_promised and (best is None or fits.off < best[0].off):
+            best = fits, meant
+    if best is None:
+        return None
+    return (
+        f"χ² is {as_read} what the information matrices promise, and {best[0]} if {best[1]}: edges weigh wrongly against each "
+        "other, and standard deviations are wrong"
+    )
 
 
-def slack_part_notes(graph: PoseGraph, poses: NDArray[np.float64], held: int) -> list[str]:
+def slack_part_notes(known: Reliability) -> list[str]:
     """A sentence where rotations, or translations, err by far less than their information promises, and the others do not.
 
     All together they may well come to what is promised.
-
-    Args:
-        held: how many poses are held.
     """
-    fits = _fits(graph, poses, held)
+    fits = _Fits.of(known)
     if fits is None:
         return []
-    rotations, translations, _ = fits
-    less, more = sorted((rotations, translations))
-    if not (less < _SLACK and more > _UNLIKE * less):
+    is_slack = [
+        chi2 < _SLACK * spare and chi_square_cdf(chi2, spare) < _SURE and other > _UNLIKE * chi2 / spare
+        for chi2, spare, other in zip(fits.chi2, fits.spare, (fits.translations, fits.rotations), strict=True)
+    ]
+    if not any(is_slack):
         return []
-    name = "rotations" if rotations < translations else "translations"
+    name, less = ("rotations", fits.rotations) if is_slack[0] else ("translations", fits.translations)
     return [
-        f"χ² of rotations is {rotations:.3g} times what the information matrices promise, of translations {translations:.3g} "
-        f"times: the information of {name} is too small, their standard deviations are too large by a factor of "
-        f"{1.0 / math.sqrt(max(less, 1e-300)):.2g}, and they count for less than they could"
+        f"χ² of rotations is {fits.rotations:.3g} times what the information matrices promise, of translations "
+        f"{fits.translations:.3g} times: the information of {name} is too small, their standard deviations are too large by a "
+        f"factor of {1.0 / math.sqrt(max(less, 1e-300)):.2g}, and they count for less than they could"
     ]
 
 
@@ -121,20 +194,3 @@ def _units_text(rotation: str, translation: str) -> str:
 def _covariances_text(rotation: str, translation: str) -> str:
     named = "".join(f", of {part} in {unit}s" for part, unit in (("rotations", rotation), ("translations", translation)) if unit)
     return f"they are covariances{named}: give their inverses{', in radians and metres' if named else ''}"
-
-
-def _fits(graph: PoseGraph, poses: NDArray[np.float64], held: int) -> tuple[float, float, float] | None:
-    """χ² of rotations, of translations and of both over what is promised; None where either has too little redundancy to tell."""
-    i, j = graph.edges.T
-    e = residual_of(graph).evaluate(poses[i], poses[j])
-    free = len(graph.ids) - held
-    found, promised = [], []
-    for part in edge_parts(e.shape[1]):
-        own, information = e[:, part], graph.information[:, part, part]
-        dof = own.shape[1] * (int(np.count_nonzero(information.any(axis=(1, 2)))) - free)
-        if dof < _LEAST:
-            return None
-        found.append(float(np.einsum("ni,nij,nj->", own, information, own)))
-        promised.append(dof)
-    both = float(np.einsum("ni,nij,nj->", e, graph.information, e))
-    return found[0] / promised[0], found[1] / promised[1], both / sum(promised)

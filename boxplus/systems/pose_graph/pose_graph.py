@@ -251,11 +251,11 @@ def optimize_pose_graph(
                 found = suspicions(reliability, solution, poses, consecutive_edges(graph)[kept])
     is_at_end = solution.status == "converged" or solution.limit == "steps"  # a small χ² is none of a start
     if config.examine and verdict is None and loss is None and config.objective == "logarithm" and is_at_end:
-        meant = information_doubt(graph, poses_end, held, options, callback)
+        meant = information_doubt(graph, solution, poses, held, options, reliability, callback)
         if meant is not None:
             reasons.append(meant)
-        else:
-            notes += slack_part_notes(graph, poses_end, len(held))
+        elif reliability is not None:
+            notes += slack_part_notes(reliability)
     for one in found:
         (reasons if one.is_grave else notes).append(one.sentence)
     examination = time.perf_counter() - examined

@@ -166,7 +166,7 @@ def test_one_of_many_that_is_far_is_named_with_how_far() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_one_among_many_that_are_nearly_as_far_is_found(seed: int) -> None:
-    """Estimates of 20,000 places at 0.97 scatter beyond one, and few of them can be looked at."""
+    """20,000 places at 0.97, one of which is beyond."""
     problem, start = many_places(20_000, off=0.97, seed=seed)
     best = problem.solve(start=[start]).values[0]
     start[777] = best[777] + 1.5 / 0.97 * (start[777] - best[777])
@@ -179,6 +179,36 @@ def test_what_others_do_not_tell_is_not_sampled() -> None:
     problem, start = many_places(2_000, off=0.9)
     away = problem.solve(start=[start], max_iterations=0).remainder().variables[0]
     assert np.ptp(away) < 1e-6 * away.max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("off", "farthest"), [(0.85, 0.85), (0.6, 1.2), (0.85, 1.5)])
+def test_places_that_tell_each_other_where_they_are_are_not_counted_for_their_scatter(
+    off: float, farthest: float, seed: int
+) -> None:
+    """Each is known by its neighbours alone, so that samples scatter, and alike for a hundred of them at once."""
+    rng, plane, count = np.random.default_rng(seed), bp.Euclidean(2), 3_000
+    problem = bp.Problem()
+    x = problem.add_variables(plane, np.zeros((count, 2)), name="x")
+    steps = bp.residuals.UserResidual(
+        lambda a, b, d: (b - a - d) / 0.01,
+        dim=2,
+        manifolds=(plane, plane),
+        data=(0.01 * rng.normal(size=(count - 1, 2)),),
+        is_batch=True,
+    )
+    problem.add_residuals(steps, x[np.arange(count - 1)], x[np.arange(1, count)], name="steps")
+    problem.add_residuals(bp.residuals.Prior(plane, rng.normal(size=(count, 2)), sigma=1.0), x, name="seen")
+    best = problem.solve()
+    away = np.full(count, off)
+    away[77] = farthest
+    start = best.values[0] + 0.5**0.5 * away[:, None] * best.standard_deviations(x)
+    told = problem.solve(start=[start], max_iterations=0).unconverged()
+    if farthest == off:
+        assert told is None
+        return
+    claimed = re.search(r"x\[77\] is (\S+) standard deviations of its own away from there(.*): allow", told or "")
+    assert float(claimed[1]) == pytest.approx(farthest, rel=0.1) and claimed[2] == ""
 
 
 @pytest.mark.parametrize("lone", [False, True])

@@ -76,6 +76,58 @@ def test_translations_that_err_by_less_than_was_said_are_told_of(dimension: int,
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+def test_translations_that_stand_in_for_imprecise_rotations_are_as_promised(dimension: int) -> None:
+    """Positions of a few loops are all that holds such headings: hardly any redundancy of translations is left."""
+    graph = simulate_pose_graph(
+        dimension=dimension, poses=200, loops=40, seed=11, sigma_rotation=0.3, sigma_translation=0.01
+    ).graph
+    assert not [note for note in optimize_pose_graph(graph).notes if "promise" in note]
+
+
+@pytest.mark.parametrize("loops", [20, 50])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_of_several_readings_the_best_is_named(dimension: int, loops: int) -> None:
+    """Where rotations are imprecise, information and its inverse are alike but for units."""
+    graph = simulate_pose_graph(
+        dimension=dimension, poses=200, loops=loops, seed=12, sigma_rotation=0.1, sigma_translation=0.05
+    ).graph
+    degrees = scaled(graph, np.degrees(1.0), 1.0)
+    for wrong, told in (
+        (scaled(graph, 1.0, 1e3), "if the information of translations is per square millimetre: give it per square metre"),
+        (replace(graph, information=np.linalg.inv(graph.information)), "if they are covariances: give their inverses"),
+        (
+            replace(graph, information=np.linalg.inv(degrees.information)),
+            "if they are covariances, of rotations in square degrees:",
+        ),
+    ):
+        assert told in (optimize_pose_graph(wrong).doubt or "")
+
+
+def test_axes_without_any_error_say_nothing_of_the_others() -> None:
+    """A graph of a plane in space, whose heights and tilts are exact: its headings are somewhat better than was said."""
+    plane = simulate_pose_graph(dimension=2, poses=200, loops=100, seed=4).graph
+
+    def lifted(poses: np.ndarray) -> np.ndarray:
+        q = np.column_stack([np.cos(poses[:, 0] / 2.0), np.zeros((len(poses), 2)), np.sin(poses[:, 0] / 2.0)])
+        return np.column_stack([q, poses[:, 1:], np.zeros(len(poses))])
+
+    information = np.zeros((len(plane.edges), 6, 6))
+    for own, there in enumerate((2, 3, 4)):
+        information[:, there, there] = plane.information[:, own, own]
+    information[:, [0, 1, 5], [0, 1, 5]] = 1e4
+    information[:, 2, 2] /= 1.8**2
+    graph = replace(
+        plane,
+        dimension=3,
+        poses=lifted(plane.poses),
+        measurements=lifted(plane.measurements),
+        information=information,
+    )
+    result = optimize_pose_graph(graph)
+    assert result.doubt is None and not [note for note in result.notes if "χ² of rotations" in note]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(
     ("rotation", "translation"), [(3.0, 3.0), (10.0, 10.0), (3.0, 1.0), (1.0, 5.0), (10.0, 1.0), (1.0, 100.0)]
 )

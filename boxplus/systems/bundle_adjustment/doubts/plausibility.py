@@ -61,11 +61,14 @@ def input_notes(reconstruction: Reconstruction) -> list[str]:
 
 
 def unit_doubt(reconstruction: Reconstruction) -> str | None:
-    """A sentence where the pixels of every camera lie within one of each other, at a focal length of far more of them."""
+    """A sentence where the pixels of every camera lie within one of each other, at a focal length of far more of them.
+
+    Where the focal length itself is one or a few, as of normalised coordinates, both may well be in the same unit.
+    """
     seen = Sightings.of(reconstruction)
     spread = _pixel_spreads(seen)
     widest = float(spread[np.isfinite(spread)].max(initial=0.0))
-    if not 0.0 < widest < min(_ONE_PIXEL, _NARROW * seen.focal_length):
+    if not 0.0 < widest < _ONE_PIXEL <= _NARROW * seen.focal_length:
         return None
     return (
         f"the pixels of every camera spread over {widest:.3g} px at most, as those of no image do at a focal length of "

@@ -13,8 +13,9 @@ import boxplus as bp
 from boxplus.errors import InputError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
-from boxplus.manifolds import se3, so3
+from boxplus.manifolds import quaternion, se3, so3
 from boxplus.systems.bundle_adjustment.bundle_adjustment import adjust_bundle
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.doubts.readings import reading_doubt
 from tests.small_problems import scene
 from tests.systems.bundle_adjustment.scenes import FOCAL, FORMATS, perturbed, reconstruction, turning
@@ -89,6 +90,20 @@ def test_pixels_in_units_of_the_focal_length_are_not_trusted(format, seed):
         assert "as those of no image do at a focal length of 500 px: give both in pixels" in told
         return
     assert float(re.search(r"with a focal length (\S+) times as large", told)[1]) == pytest.approx(1.0 / FOCAL, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_a_narrow_view_in_normalised_coordinates_is_in_one_unit(seed):
+    """Eight cameras around something 20 m wide, 1 km away: a hundredth of their focal length of one."""
+    rng = np.random.default_rng(seed)
+    p, angle = rng.uniform(-10.0, 10.0, (100, 3)), np.linspace(-0.4, 0.4, 8)
+    R = so3.exp(np.column_stack([np.zeros(8), angle, np.zeros(8)]))
+    T = np.hstack([quaternion.from_matrix(R), np.tile([0.0, 0.0, 1000.0], (8, 1))])
+    camera_of, point_of = (grid.ravel() for grid in np.mgrid[:8, :100])
+    start = perturbed(rng, T, p, camera_of, point_of, "gbp", 1e-4, 0.05, sigma := 0.01)
+    start = replace(start, intrinsics=np.array([1.0, 1.0, 0.0, 0.0]), pixels=start.pixels / FOCAL)
+    result = adjust_bundle(start, BundleAdjustmentConfig(sigma_px=sigma / FOCAL))
+    assert result.solution.status == "converged" and result.doubt is None
 
 
 def test_swapped_pixels_of_either_direction_of_y_are_named():
