@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from boxplus.filtering.nav_state import TANGENT
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation import Simulation, faults, write_recording
+from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 PARTS = ("draws", "judge", "places", "real", "report", "run", "spoil")
@@ -173,6 +175,23 @@ def test_that_nothing_shows_the_speed_is_no_false_alarm_where_the_run_behaves_li
     ):
         errors = judge.errors_of(estimate, simulation)
         assert judge.judge(judge.Outcome(0, None, summary, estimate), errors, place).false_alarm == alarm
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        *((fault, True) for fault in ("accel_sign", "clock_offset", "other_imu", "other_lidar", "point_scale", "extrinsic_off")),
+        *((fault, False) for fault in ("gyro_sign", "gyro_unit", "accel_unit", "time_unit", "mirrored", "imu_gap")),
+    ],
+)
+def test_corrections_to_one_side_name_what_may_push(campaign: SimpleNamespace, fault: str, named: bool) -> None:
+    none, gained = np.zeros((18, 6)), 1e-6 * np.eye(TANGENT)
+    update: Any = SimpleNamespace(cov_prior=2.0 * gained, cov=gained, B_prior=none, B=none)
+    corrections, found = Corrections(), None
+    for k in range(11):
+        found = corrections.update(k * 10**8, np.full(TANGENT, 0.05), update) or found
+    assert found is not None
+    assert campaign.judge.names_cause([found], SimpleNamespace(kinds=SimpleNamespace(fault=fault))) == named
 
 
 def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: SimpleNamespace) -> None:

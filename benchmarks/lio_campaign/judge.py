@@ -48,7 +48,8 @@ CAUSES: dict[str, str] = {
     "accel_sign": r"accel\w*\b.*(sign|negat|invert|opposite|gravity instead)|(sign|negat|invert|opposite).*accel|upside down",
     "clock_offset": _CLOCKS,
     "clock_drift": _CLOCKS + r"|drift",
-    "other_imu": r"imu.topic|another (body|imu|platform)|other imu|different bod|same body|unrelated|no rotation fits",
+    "other_imu": r"imu.topic|another (body|imu|platform)|other imu|different bod|same body|unrelated|no rotation fits|"
+    r"not the one of this lidar",
     "other_lidar": _MOUNTING + r"|lidar.topic|another lidar",
     "point_scale": r"\bscale\b|feet|metres|unit of the (points|coordinates|ranges)",
     "mirrored": r"mirror|handed|reflect|sign of",

@@ -23,6 +23,7 @@ from boxplus.systems.lidar_inertial_agreement.registration import Turning, nodes
 _MAP_SCANS = 5
 _TRIED = 4  # of the last scans: not every one shows enough of the same place
 _STEP_VARIANCE = np.repeat([3e-4, 3e-3], 3) ** 2  # rad², m² of a scan against the one before it
+_OPEN_VARIANCE = np.repeat([0.1, 1.0], 3) ** 2  # rad², m² of a scan along what the scene does not determine
 _TOLD = 4.0  # standard deviations: 1.4 at most on sound paths, 10 and 17 on two that had gone astray
 
 
@@ -58,6 +59,19 @@ def path_drift(
         x = NavState.identity().pack()
         x[R : R + 9], x[P : P + 3] = path.R_path_lidar[k].ravel(), path.p_path_lidar[k]
         found = register_to(old, x, point_filter(undistorted_at(k))[0], config)
-        if found is not None and deviations_of(found[0], found[1] + np.diag(_STEP_VARIANCE) * k) > _TOLD:
+        if found is not None and deviations_of(found[0], found[1] + _covariance_at(path, k)) > _TOLD:
             return found[0]
     return None
+
+
+def _covariance_at(path: LidarPath, k: int) -> NDArray[np.float64]:
+    """(6, 6) that a path may come to in k scans, [θ about its axes there, p along the path's].
+
+    Where a scan was weak the path went on as before along what nothing showed: nobody takes it for known there.
+    """
+    covariance = k * np.diag(_STEP_VARIANCE)
+    for weak in np.flatnonzero(path.weak[: k + 1]):
+        turn = np.eye(6)
+        turn[:3, :3] = path.R_path_lidar[k].T @ path.R_path_lidar[weak]
+        covariance += turn @ np.linalg.inv(path.information[weak] + np.diag(1.0 / _OPEN_VARIANCE)) @ turn.T
+    return covariance

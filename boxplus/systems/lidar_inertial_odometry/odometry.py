@@ -241,7 +241,7 @@ class LidarInertialOdometry(Snapshots):
         on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
         clock.lap("update")
-        self._warnings += self._consistency.update(frame, self._x_before, x_prior, cov_prior, posterior, on_map, fitting)
+        self._warnings += self._consistency.update(frame, self._x_before, x_prior, update, on_map, fitting)
         clock.lap(WAITED)
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,20 @@ def test_a_drift_is_what_the_last_scans_are_off_by(axis: int) -> None:
     assert found is not None
     seconds = (COUNT - 4) * PERIOD_S
     assert found[axis] == pytest.approx(-drift[axis] * seconds, rel=0.35)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_path_does_not_drift_along_what_its_scans_did_not_show(axis: int) -> None:
+    """A weak scan goes on as the ones before it: the batch over path and accelerometer takes nothing from it there."""
+    drift = np.zeros(6)
+    drift[axis] = np.deg2rad(1.0) if axis < 3 else 0.08
+    path, scans = drifting(drift, axis)
+    known = np.tile(np.diag(np.repeat([1e6, 1e5], 3)), (COUNT, 1, 1))
+    known[6:9, axis] = 0.0
+    shown = replace(path, information=known)
+    weak = replace(shown, weak=np.isin(np.arange(COUNT), (6, 7, 8)))
+    assert path_drift(shown, scans, CONFIG, still) is not None
+    assert path_drift(weak, scans, CONFIG, still) is None
 
 
 def test_scans_of_another_place_tell_nothing() -> None:

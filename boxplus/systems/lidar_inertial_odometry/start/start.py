@@ -244,7 +244,7 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
     drift = path_drift(path, scans, seen.registration, guesses[0])
     if drift is not None:
         raise seen.not_moving(
-            f"the path of the LiDAR drifts: its last scan lies {np.linalg.norm(drift[3:]) * 100:.0f} cm and "
+            f"the path of the LiDAR drifts: one of its last scans lies {np.linalg.norm(drift[3:]) * 100:.0f} cm and "
             f"{np.degrees(np.linalg.norm(drift[:3])):.1f} deg off where its first ones want it (few rings, a repeating pattern, "
             "foliage, or moving things)"
         )

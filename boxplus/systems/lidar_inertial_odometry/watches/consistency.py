@@ -20,6 +20,7 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
@@ -100,8 +101,7 @@ class Consistency:
         frame: Frame,
         x_before: NDArray[np.float64],
         x_prior: NDArray[np.float64],
-        cov_prior: NDArray[np.float64],
-        posterior: Posterior,
+        update: MountedUpdate,
         matched_share: float,
         fitting_share: float,
     ) -> list[str]:
@@ -110,11 +110,11 @@ class Consistency:
         Args:
             frame: the scan and its IMU samples.
             x_before, x_prior: (36,) state at the end of the scan before, and predicted.
-            cov_prior: (24, 24) of the prediction.
-            posterior: the update.
+            update: what the scan has made of the prediction.
             matched_share: points that lie on the map over points filtered.
             fitting_share: of the points with a plane, those that lie on it.
         """
+        posterior, cov_prior = update.posterior, update.cov_prior
         x = posterior.x
         self._unmatched = self._unmatched + 1 if matched_share < self._min_matched_share else 0
         before = x_before[R : R + 9].reshape(3, 3)
@@ -129,7 +129,7 @@ class Consistency:
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
         warnings += self._steadiness(frame.scan.end_ns, posterior)
-        warnings += self._pushes(frame, x_prior, cov_prior, posterior)
+        warnings += self._pushes(frame, x_prior, update)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -245,23 +245,18 @@ class Consistency:
             self._innovation_text = text
         return [text]
 
-    def _pushes(
-        self,
-        frame: Frame,
-        x_prior: NDArray[np.float64],
-        cov_prior: NDArray[np.float64],
-        posterior: Posterior,
-    ) -> list[str]:
+    def _pushes(self, frame: Frame, x_prior: NDArray[np.float64], update: MountedUpdate) -> list[str]:
         """Whether the corrections of the velocity are as white as noise is."""
         # A mounting that is still being found moves what the IMU predicts, and no correction is white.
         sought = not self._mounting_given and not self.mounting_borne_out
         gap = frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES
-        if sought or gap or not posterior.valid:
+        # Of a scan off the map nothing is taken up, and the next one wants the same again.
+        if sought or gap or self.lost or not update.posterior.valid:
             self._corrections.clear()
             return []
         correction = np.zeros(TANGENT)
-        boxminus_into(posterior.x, x_prior, correction)
-        text = self._corrections.update(frame.scan.end_ns, correction, cov_prior, posterior.cov)
+        boxminus_into(update.posterior.x, x_prior, correction)
+        text = self._corrections.update(frame.scan.end_ns, correction, update)
         if text is None or not self._once("pushes"):
             return []
         if self._innovation_text is None:

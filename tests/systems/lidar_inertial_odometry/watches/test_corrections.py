@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from boxplus.filtering.nav_state import TANGENT
+from boxplus.filtering.nav_state import TANGENT, NavState, V
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 
 PERIOD_S, ACCEL_NOISE, POINT_NOISE = 0.1, 0.02, 0.01
+
+
+ONE_WAY = np.zeros(TANGENT)
+ONE_WAY[6] = 0.03
+
+
+def an_update(before: np.ndarray, after: np.ndarray, *, moved: float = 0.0, lever_m: float = 0.0) -> Any:
+    """Covariances (24, 24) before and after a scan, which takes `moved` [1/s] of a lever known to `lever_m` off the velocity."""
+    before, B_prior, B = before.copy(), np.zeros((18, 6)), np.zeros((18, 6))
+    before[18:, 18:] = np.diag(np.repeat([1e-6, lever_m**2], 3))
+    B_prior[6:9, 3:] = 0.5 * np.eye(3)
+    B[6:9, 3:] = (0.5 - moved) * np.eye(3)
+    x = NavState.identity().pack()
+    x[V] = ONE_WAY[6]
+    whole = after.copy()
+    whole[:18, :18] += B @ before[18:, 18:] @ B.T
+    return SimpleNamespace(
+        cov_prior=before, cov=after, B_prior=B_prior, B=B, posterior=SimpleNamespace(x=x, cov=whole, valid=True)
+    )
 
 
 def told_of(seed: int, *, factor: float = 1.0, amplitude: float = 1.0, seconds: float = 20.0) -> list[str]:
@@ -31,7 +55,7 @@ def told_of(seed: int, *, factor: float = 1.0, amplitude: float = 1.0, seconds: 
             matrix[6:9, 6:9] = small[1, 1] * np.eye(3)
         delta = np.zeros(TANGENT)
         delta[6:9] = correction[1]
-        told += filter(None, [corrections.update(round((k + 1) * PERIOD_S * 1e9), delta, *full)])
+        told += filter(None, [corrections.update(round((k + 1) * PERIOD_S * 1e9), delta, an_update(*full))])
         x, P = x + correction, after
     return told
 
@@ -50,11 +74,43 @@ def test_an_accelerometer_of_another_sign_or_scale_is_told(seed: int, factor: fl
 
 
 def test_what_was_corrected_before_a_gap_is_forgotten() -> None:
-    corrections = Corrections()
-    one_way = np.zeros(TANGENT)
-    one_way[6] = 0.1
-    known = np.diag(np.full(TANGENT, 1e-6))
+    corrections, known = Corrections(), 1e-6 * np.eye(TANGENT)
     for k in range(9):
-        assert corrections.update(k * 10**8, one_way, 1.01 * known, known) is None
+        assert corrections.update(k * 10**8, ONE_WAY, an_update(1.01 * known, known)) is None
     corrections.clear()
-    assert corrections.update(9 * 10**8, one_way, 1.01 * known, known) is None
+    assert corrections.update(9 * 10**8, ONE_WAY, an_update(1.01 * known, known)) is None
+
+
+@pytest.mark.parametrize(("moved", "lever_m", "told"), [(0.0, 0.1, True), (0.1, 0.1, False), (0.1, 0.005, True)])
+def test_a_lever_that_is_hardly_known_pushes_to_one_side_too(moved: float, lever_m: float, told: bool) -> None:
+    """33 cm/s within a second, of which the lever may have made 11 (1 sigma)."""
+    corrections, known = Corrections(), 1e-6 * np.eye(TANGENT)
+    found = [
+        corrections.update(k * 10**8, ONE_WAY, an_update(1.01 * known, known, moved=moved, lever_m=lever_m)) for k in range(11)
+    ]
+    assert any(found) == told
+
+
+@pytest.mark.parametrize(("unmatched", "told"), [(0, 1), (2, 1), (3, 0)])
+def test_corrections_that_are_not_taken_up_do_not_add_up(unmatched: int, told: int) -> None:
+    """Off the map the estimate stays where the IMU predicts it, and every scan asks for the same correction anew."""
+    consistency, known, found = Consistency(LioConfig()), 1e-6 * np.eye(TANGENT), []
+    consistency._unmatched = unmatched
+    for k in range(20):
+        frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=k * 10**8), imu=range(10), largest_gap_s=0.01)
+        found += consistency._pushes(frame, NavState.identity().pack(), an_update(1.01 * known, known))
+    assert len(found) == told and (consistency.contradiction is not None) == bool(told)
+
+
+def test_what_an_uncertain_mounting_adds_to_the_covariance_is_no_loss_of_it() -> None:
+    """The prior with the mounting known, less the posterior with it unknown, would leave nothing of what noise adds up to."""
+    consistency = Consistency(LioConfig(extrinsic_estimation="gated"))
+    consistency._watch.mounting_borne_out = True
+    after = 1e-6 * np.eye(TANGENT)
+    after[6:9, 6:9] = 0.02**2 * np.eye(3)
+    before, found = after.copy(), []
+    before[6:9, 6:9] = 2.0 * after[6:9, 6:9]
+    for k in range(20):
+        frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=k * 10**8), imu=range(10), largest_gap_s=0.01)
+        found += consistency._pushes(frame, NavState.identity().pack(), an_update(before, after, lever_m=0.1))
+    assert not found
