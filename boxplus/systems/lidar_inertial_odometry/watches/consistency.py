@@ -114,7 +114,7 @@ class Consistency:
             matched_share: points that lie on the map over points filtered.
             fitting_share: of the points with a plane, those that lie on it.
         """
-        posterior, cov_prior = update.posterior, update.cov_prior
+        posterior = update.posterior
         x = posterior.x
         self._unmatched = self._unmatched + 1 if matched_share < self._min_matched_share else 0
         before = x_before[R : R + 9].reshape(3, 3)
@@ -124,12 +124,14 @@ class Consistency:
         # Of whichever sensor turned more: a gyroscope that claims not to turn is wrong as well.
         self._turned = _KEEP * self._turned + max(float(predicted @ predicted), float(measured @ measured))
         self._corrected = _KEEP * self._corrected + float(corrected @ corrected)
+        correction = np.zeros(TANGENT)
+        boxminus_into(x, x_prior, correction)
         warnings = self._span(frame)
-        warnings += self._innovate(frame, x_prior, cov_prior, posterior)
+        warnings += self._innovate(frame, correction, update.cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
         warnings += self._steadiness(frame.scan.end_ns, posterior)
-        warnings += self._pushes(frame, x_prior, update)
+        warnings += self._pushes(frame, correction, update)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
             or self._innovation > _SUSPICIOUS_INNOVATION
@@ -157,11 +159,7 @@ class Consistency:
         return self._watch.finish()
 
     def _innovate(
-        self,
-        frame: Frame,
-        x_prior: NDArray[np.float64],
-        cov_prior: NDArray[np.float64],
-        posterior: Posterior,
+        self, frame: Frame, correction: NDArray[np.float64], cov_prior: NDArray[np.float64], posterior: Posterior
     ) -> list[str]:
         """The correction of the pose against what the prediction's covariance allows, along the directions that were measured."""
         x, directions = posterior.x, posterior.last.directions
@@ -172,11 +170,9 @@ class Consistency:
         if not posterior.valid or directions.weak.all():
             self._contradicted, self._doubted = _Streak(), _Streak()
             return []
-        delta = np.zeros(TANGENT)
-        boxminus_into(x, x_prior, delta)
         scale = np.array([directions.lever_arm] * 3 + [1.0] * 3)
         strong = directions.vectors[:, ~directions.weak].T * scale
-        off = strong @ delta[:6]
+        off = strong @ correction[:6]
         variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
         now = float(np.max(off**2 / variance))
         self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, _ONE_SCAN)
@@ -238,14 +234,9 @@ class Consistency:
         if not posterior.valid:
             return []
         variance = np.diagonal(posterior.cov)[T_BW : T_BW + 3]
-        text = self._steady.update(end_ns, posterior.x[BW : BW + 3], variance)
-        if text is None or not self._once("steady"):
-            return []
-        if self._innovation_text is None:
-            self._innovation_text = text
-        return [text]
+        return self._contradicting("steady", self._steady.update(end_ns, posterior.x[BW : BW + 3], variance))
 
-    def _pushes(self, frame: Frame, x_prior: NDArray[np.float64], update: MountedUpdate) -> list[str]:
+    def _pushes(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
         """Whether the corrections of the velocity are as white as noise is."""
         # A mounting that is still being found moves what the IMU predicts, and no correction is white.
         sought = not self._mounting_given and not self.mounting_borne_out
@@ -254,10 +245,11 @@ class Consistency:
         if sought or gap or self.lost or not update.posterior.valid:
             self._corrections.clear()
             return []
-        correction = np.zeros(TANGENT)
-        boxminus_into(update.posterior.x, x_prior, correction)
-        text = self._corrections.update(frame.scan.end_ns, correction, update)
-        if text is None or not self._once("pushes"):
+        return self._contradicting("pushes", self._corrections.update(frame.scan.end_ns, correction, update))
+
+    def _contradicting(self, key: str, text: str | None) -> list[str]:
+        """A sentence that contradicts the run, told once."""
+        if text is None or not self._once(key):
             return []
         if self._innovation_text is None:
             self._innovation_text = text

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from boxplus.filtering.nav_state import BA, BW, TANGENT, NavState, P
+from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 
@@ -66,13 +66,14 @@ def test_a_bias_that_changes_by_more_than_any_sensor_does_is_a_contradiction(
 @pytest.mark.parametrize(("off_m", "samples", "told"), [(0.02, 10, 1), (0.005, 10, 0), (0.02, 1, 0)])
 def test_corrections_beyond_noise_are_named_once_after_two_seconds(off_m: float, samples: int, told: int) -> None:
     """2 cm a scan, where the prediction and a registration are good for 1 cm; with one IMU sample a scan nobody knows."""
-    prior, x = NavState.identity().pack(), NavState.identity().pack()
+    x, correction = NavState.identity().pack(), np.zeros(TANGENT)
     x[P] += off_m
+    correction[T_P] = off_m
     directions = SimpleNamespace(weak=np.zeros(6, bool), vectors=np.eye(6), lever_arm=1.0)
     posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
     consistency, found = Consistency(LioConfig()), []
     for number in range(40):
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
-        found.append(consistency._innovate(frame, prior, 1e-8 * np.eye(TANGENT), posterior))
+        found.append(consistency._innovate(frame, correction, 1e-8 * np.eye(TANGENT), posterior))
     assert sum(map(len, found)) == told and consistency.contradiction is None
     assert not any(found[:20])

@@ -98,7 +98,7 @@ def test_corrections_that_are_not_taken_up_do_not_add_up(unmatched: int, told: i
     consistency._unmatched = unmatched
     for k in range(20):
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=k * 10**8), imu=range(10), largest_gap_s=0.01)
-        found += consistency._pushes(frame, NavState.identity().pack(), an_update(1.01 * known, known))
+        found += consistency._pushes(frame, ONE_WAY, an_update(1.01 * known, known))
     assert len(found) == told and (consistency.contradiction is not None) == bool(told)
 
 
@@ -112,5 +112,5 @@ def test_what_an_uncertain_mounting_adds_to_the_covariance_is_no_loss_of_it() ->
     before[6:9, 6:9] = 2.0 * after[6:9, 6:9]
     for k in range(20):
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=k * 10**8), imu=range(10), largest_gap_s=0.01)
-        found += consistency._pushes(frame, NavState.identity().pack(), an_update(before, after, lever_m=0.1))
+        found += consistency._pushes(frame, ONE_WAY, an_update(before, after, lever_m=0.1))
     assert not found
