@@ -93,6 +93,12 @@ class LidarPath:
         """Times, attitudes and positions."""
         return self.time_ns, self.R_path_lidar, self.p_path_lidar
 
+    def packed(self, k: int) -> NDArray[np.float64]:
+        """The packed state (36,) of a LiDAR at the k-th pose."""
+        x = NavState.identity().pack()
+        x[R : R + 9], x[P : P + 3] = self.R_path_lidar[k].ravel(), self.p_path_lidar[k]
+        return x
+
     def part(self, chosen: NDArray[np.bool_]) -> LidarPath:
         """The poses that are chosen (K,)."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_POSES})

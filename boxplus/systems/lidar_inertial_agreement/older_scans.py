@@ -27,13 +27,20 @@ _LEAST_FITTING = 0.9  # of the points with a plane
 _LARGEST_SIGMA_M = 0.05  # of the registration, or it says nothing
 
 
+def map_of(old_world: Sequence[NDArray[np.float64]], config: RegistrationConfig) -> IkdTree:
+    """The map that older scans make, of the points (m, 3) of each of them, in the world."""
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    tree.insert(np.concatenate(old_world), downsample=True)
+    return tree
+
+
 def register_to(
-    old_world: Sequence[NDArray[np.float64]], x: NDArray[np.float64], p_lidar: NDArray[np.float32], config: RegistrationConfig
+    old: IkdTree, x: NDArray[np.float64], p_lidar: NDArray[np.float32], config: RegistrationConfig
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Where a scan would lie if only some older scans were known.
 
     Args:
-        old_world: the points (m, 3) of each of them, in the world.
+        old: the map of them.
         x: (36,) packed state to begin at; p_lidar: (n, 3) the scan, LiDAR frame.
         config: of the registration.
 
@@ -41,10 +48,8 @@ def register_to(
         The motion (6,) from x, [θ about the IMU's axes, p along the world's], and its covariance (6, 6), both without the
         directions that the older scans do not determine; None where they fit too little of the scan.
     """
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-    tree.insert(np.concatenate(old_world), downsample=True)
     at = x.copy()
-    measurement = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False, confirm=True)
+    measurement = PlaneMeasurement(p_lidar, old, config, with_extrinsic=False, confirm=True)
     directions = align(at, measurement, config, steps=_STEPS)
     if directions is None or directions.weak.all() or measurement.fitting_share < _LEAST_FITTING:
         return None

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_motion import MOST_MAP_POINTS, MOST_POINTS, MOST_RAW, LidarPath
-from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, register_to
+from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, map_of, register_to
 from boxplus.systems.lidar_inertial_agreement.registration import Turning, nodes_within, thinned, undistorted
 
 _MAP_SCANS = 5
@@ -51,14 +50,16 @@ def path_drift(
         return undistorted(scan, nodes, at_ns)
 
     map_filter = VoxelFilter(config.map_cell, MOST_MAP_POINTS)
-    old = [
-        map_filter(undistorted_at(k))[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k] for k in range(first)
-    ]
+    first_scans = map_of(
+        [
+            map_filter(undistorted_at(k))[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k]
+            for k in range(first)
+        ],
+        config,
+    )
     point_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)
     for k in range(max(len(path) - _TRIED, first), len(path)):
-        x = NavState.identity().pack()
-        x[R : R + 9], x[P : P + 3] = path.R_path_lidar[k].ravel(), path.p_path_lidar[k]
-        found = register_to(old, x, point_filter(undistorted_at(k))[0], config)
+        found = register_to(first_scans, path.packed(k), point_filter(undistorted_at(k))[0], config)
         if found is not None and deviations_of(found[0], found[1] + _covariance_at(path, k)) > _TOLD:
             return found[0]
     return None

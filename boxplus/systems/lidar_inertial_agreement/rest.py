@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import NavState, P, R
+from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
@@ -100,17 +100,10 @@ def _faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, a
         placed = voxel_filter(scan.p_lidar)[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k]
         tree.insert(placed, downsample=True)
     p_lidar = voxel_filter(scans[-1].p_lidar)[0]
-    x = _pose(path, -1)
+    x = path.packed(-1)
     information = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False).at(x, rematch=True)
     points = p_lidar.astype(np.float64) @ path.R_path_lidar[-1].T + path.p_path_lidar[-1]
     return surfaces_across(tree, points, path.p_path_lidar[-1], axis, information.directions.ratio_along(axis))
-
-
-def _pose(path: LidarPath, k: int) -> NDArray[np.float64]:
-    """The packed state (36,) of a LiDAR at the k-th pose."""
-    x = NavState.identity().pack()
-    x[R : R + 9], x[P : P + 3] = path.R_path_lidar[k].ravel(), path.p_path_lidar[k]
-    return x
 
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:
@@ -123,7 +116,7 @@ def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationCo
     for k in range(1, min(_COMPARED, len(scans) - 1) + 1):
         points = voxel_filter(scans[-k].p_lidar)[0]
         for found in (False, True):
-            x = _pose(path, -k) if found else NavState.identity().pack()
+            x = path.packed(-k) if found else NavState.identity().pack()
             measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
             fit = measurement.at(x, rematch=True)
             # A point that matches nothing counts as far off: a scan that has moved away fits what is left of it.

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.map_datum import MapDatum, positive_part
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, register_to
+from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, map_of, register_to
 from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift
 
 _BASELINE_NS = 1_250_000_000
@@ -100,7 +100,7 @@ class LongBaseline:
     def _compare(
         self, x: NDArray[np.float64], between: NDArray[np.float64], p_lidar: NDArray[np.float32], seconds: float
     ) -> Drift | None:
-        found = register_to(self._old, x, p_lidar, self._config)
+        found = register_to(map_of(self._old, self._config), x, p_lidar, self._config)
         if found is None:
             return None
         delta, registration = found
