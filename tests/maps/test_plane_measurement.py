@@ -15,7 +15,7 @@ from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.registration import align
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 
 seeds = st.integers(0, 2**32 - 1)
 

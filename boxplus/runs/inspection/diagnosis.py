@@ -30,7 +30,7 @@ from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stre
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import judges_clocks, judges_rotation
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 

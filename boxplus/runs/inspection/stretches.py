@@ -9,7 +9,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.inspection.imu_checks import liveliest_stretch
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.registration import thinned
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 
 _MARGIN_NS = 900_000_000
 """Of IMU samples around a stretch: as far as the clocks may be apart, and a bit."""

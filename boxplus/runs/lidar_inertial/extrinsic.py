@@ -17,7 +17,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation
-from boxplus.systems.lidar_inertial_agreement.registration import thinned
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.translation import ARM
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 

@@ -24,12 +24,12 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.backwards import surer_path
-from boxplus.systems.lidar_inertial_agreement.explained_scans import explained_scans
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
-from boxplus.systems.lidar_inertial_agreement.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
 

@@ -20,7 +20,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 _SCANS, _MOST_MAP_POINTS, _MOST_POINTS = 12, 5000, 4000
 _NEIGHBOURS = 15

@@ -19,9 +19,9 @@ from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
-from boxplus.systems.lidar_inertial_agreement.surfaces import surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01

@@ -29,9 +29,9 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     slope_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lengths import FEWEST_SLOPES, lengths_known, lengths_of_many
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
-from boxplus.systems.lidar_inertial_agreement.registration import thinned
 
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _WINDOW_S = 4.0

@@ -23,7 +23,7 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
-from boxplus.systems.lidar_inertial_agreement.registration import align
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
 from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate

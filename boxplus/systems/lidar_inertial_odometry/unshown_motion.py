@@ -18,7 +18,7 @@ from boxplus.filtering.degeneracy import PoseDirections, with_weak_axis
 from boxplus.filtering.iterated_update import Posterior
 from boxplus.filtering.nav_state import T_P, T_V
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.systems.lidar_inertial_agreement.surfaces import surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 
 _SPEED_M_S = 10.0  # standard deviation: what carries a LiDAR does 30 m/s at most
 _SCANS_BETWEEN_LOOKS = 5

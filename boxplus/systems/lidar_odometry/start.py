@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_odometry.motion import MotionBetween, MotionState
 
 _LEAST_SCANS = 4

@@ -14,7 +14,7 @@ from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLi
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]

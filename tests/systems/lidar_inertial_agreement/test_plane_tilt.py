@@ -15,7 +15,7 @@ from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 

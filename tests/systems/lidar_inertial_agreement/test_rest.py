@@ -9,9 +9,9 @@ from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
-from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, LIDAR, data
 
 ROOM = (24.0, 20.0, 5.0)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.sensors.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
+from tests.systems.lidar_inertial_agreement.lidar_path.test_explained_scans import true_path
 from tests.systems.lidar_inertial_agreement.small_platforms import data, handheld
-from tests.systems.lidar_inertial_agreement.test_explained_scans import true_path
 
 
 def fit(seed: int, bend_m: float = 0.0, at: float = 0.5, length: float = 1.0) -> TranslationFit:

@@ -22,8 +22,8 @@ from boxplus.filtering.nav_state import (
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_agreement.shown_turns import shown_turns
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.translation import (
     ARM,
     BIAS,

@@ -16,10 +16,10 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
-from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
-from boxplus.systems.lidar_inertial_agreement.path_drift import path_drift
-from boxplus.systems.lidar_inertial_agreement.registration import with_cells_for
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

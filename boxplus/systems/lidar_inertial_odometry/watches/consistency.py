@@ -17,7 +17,7 @@ from boxplus.filtering.iterated_update import Posterior
 from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, TANGENT, P, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate

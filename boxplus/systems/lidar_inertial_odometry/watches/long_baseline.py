@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.map_datum import MapDatum, positive_part
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.older_scans import deviations_of, map_of, register_to
+from boxplus.systems.lidar_inertial_agreement.lidar_path.older_scans import deviations_of, map_of, register_to
 from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift
 
 _BASELINE_NS = 1_250_000_000

@@ -23,7 +23,7 @@ from boxplus.maps.plane_measurement import REASONS, PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.registration import (
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,
     Turning,

@@ -10,8 +10,8 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import lidar_path
-from boxplus.systems.lidar_inertial_agreement.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 SPEED = 2.4

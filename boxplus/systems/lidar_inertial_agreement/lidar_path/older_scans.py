@@ -17,7 +17,7 @@ from boxplus.filtering.nav_state import TANGENT, boxminus_into
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.registration import align
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 
 _STEPS = 6  # of the registration, which begins close by
 _FLOOR = np.repeat([3e-4, 3e-3], 3) ** 2  # rad², m²: surfaces are no planes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 KNOWN_RAD = 0.02  # standard deviation of an attitude that is known
 _FORETOLD_M = 0.5  # standard deviation: what says less of a position is noise, and would take attitudes with it

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
-from boxplus.systems.lidar_inertial_agreement.registration import Turning
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 
 _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no other minimum is looked for
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least

@@ -9,8 +9,8 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_agreement.path_drift import path_drift
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG
 
 COUNT, PERIOD_S, SIGMA_M = 15, 0.1, 0.01

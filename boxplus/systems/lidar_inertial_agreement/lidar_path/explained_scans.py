@@ -21,8 +21,8 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, Poses, Twist
-from boxplus.systems.lidar_inertial_agreement.surfaces import surface_distances
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Poses, Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface_distances
 
 _WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, paths that ride with a pattern 1.6 to 6
 # An estimate is called astray where it ends this far from a path that the scene shows in all but a few scans, and so much more of

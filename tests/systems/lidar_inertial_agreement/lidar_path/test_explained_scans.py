@@ -14,9 +14,9 @@ from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.backwards import lidar_path_backwards, surer_path
-from boxplus.systems.lidar_inertial_agreement.explained_scans import explained_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import lidar_path_backwards, surer_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_poses, true_twists
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
@@ -86,7 +86,7 @@ def test_of_a_path_forwards_and_one_backwards_the_better_one_is_taken() -> None:
 def test_where_two_paths_differ_and_scans_do_not_decide_neither_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = handheld(0)
     scans = data(simulation)[0][:25]
-    monkeypatch.setattr("boxplus.systems.lidar_inertial_agreement.backwards.other_explains_better", lambda *_: False)
+    monkeypatch.setattr("boxplus.systems.lidar_inertial_agreement.lidar_path.backwards.other_explains_better", lambda *_: False)
     assert surer_path(frozen(true_path(simulation, scans)), scans, CONFIG, ()) is None
 
 
