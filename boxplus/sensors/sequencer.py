@@ -42,6 +42,10 @@ class Frame:
         return (self.scan.end_ns - self.begin_ns) * 1e-9
 
 
+BEFORE_START = "scan before a start could be found"
+"""Why an odometry that could not begin gave up a scan, among what was rejected."""
+
+
 class Sequencer:
     """Pairs scans with IMU samples.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -178,7 +179,9 @@ def run(
         if standing != "finished":
             own = stack.enter_context(claim_run_folder(folder, overwrite=overwrite, resume=resume))
         with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
+            began = time.perf_counter()
             extrinsic = choose_extrinsic(opened, config.odometry, should_stop=asked)
+            mounting_s = time.perf_counter() - began
         if standing == "finished":
             summary = finished_run(own, opened, config, extrinsic)
             terminal.say(f"{folder.name}: finished before, and left as it is")
@@ -204,7 +207,7 @@ def run(
                     from boxplus.report import write_report
 
                     write_report(folder)
-        comparison, rows = None, _rows(summary)
+        comparison, rows = None, _rows(summary, mounting_s)
         if ground_truth is not None and summary.scans:
             comparison = compare_with(ground_truth, own.trajectory, own.evaluation, "se3")
             rows.append(comparison.row)
@@ -213,14 +216,21 @@ def run(
     return summary, comparison
 
 
-def _rows(summary: RunSummary) -> list[tuple[str, str]]:
-    """What the terminal shows of a run of LiDAR and IMU."""
+def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
+    """What the terminal shows of a run of LiDAR and IMU, before which `mounting_s` seconds went into its mounting."""
+    from boxplus._words import counted
     from boxplus.cli.run_terminal import speed_text
+    from boxplus.sensors.sequencer import BEFORE_START
 
     timing, rows = summary.timing, []
+    if unstarted := summary.rejected["odometry"].get(BEFORE_START):
+        rows.append(("before the start", f"{counted(unstarted, 'scan')} without a pose"))
     if timing.scan_ms is not None:
         rows.append(("per scan", f"median {timing.scan_ms.median:.1f} ms, 99th percentile {timing.scan_ms.p99:.1f} ms"))
-    rows.append(("speed", speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)))
+    speed = speed_text(timing.real_time_factor, timing.total_s, timing.compiled_kernels)
+    if summary.extrinsic.source == "estimated":
+        speed += f", after {mounting_s:.1f} s for the mounting"
+    rows.append(("speed", speed))
     for lidar in summary.lidars[1:]:
         rows.append((f"LiDAR {lidar.topic}", f"{lidar.merged_points:,} points merged; against the first: {lidar.checked}"))
     rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))

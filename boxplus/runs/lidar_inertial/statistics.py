@@ -22,6 +22,7 @@ class RunStatistics(EstimateStatistics):
     def __init__(self) -> None:
         super().__init__("scans")
         self.scans_read = 0
+        self._first_scan_ns: int | None = None
         self.first_points: tuple[str | None, ...] | None = None  # digests of those of the first scan that has any
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
@@ -33,6 +34,8 @@ class RunStatistics(EstimateStatistics):
         if isinstance(event, Scan):
             self.scans_read += 1
             if len(event):
+                if self._first_scan_ns is None:
+                    self._first_scan_ns = event.end_ns
                 if self.first_points is None:
                     # Of several LiDARs the first: the others may be left out of another run.
                     first = event.p_lidar if event.lidar is None else event.p_lidar[event.lidar == 0]
@@ -68,6 +71,21 @@ class RunStatistics(EstimateStatistics):
         text = (
             f"by its own covariance the run knows its last position to {_length(self._position_sigma_m)} (1 sigma) only, after a "
             f"way of {_length(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
+        )
+        return [WarningFacts(text=text, count=1)]
+
+    def late_start_warnings(self, unstarted: int) -> list[WarningFacts]:
+        """A warning where the path begins later than what was read.
+
+        Args:
+            unstarted: scans that were left without a pose, as no start could be found that early.
+        """
+        if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
+            return []
+        text = (
+            f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, path and map "
+            f"begin {(self.first_time_ns - self._first_scan_ns) * 1e-9:.1f} s after the first scan; a recording that begins at "
+            "rest, or --T-imu-lidar where it was estimated, lets them begin with it"
         )
         return [WarningFacts(text=text, count=1)]
 

@@ -13,6 +13,7 @@ from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
+from boxplus.sensors.scan import Scan
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status
@@ -74,6 +75,21 @@ def test_what_may_be_behind_it_is_said() -> None:
     (warning,) = straight(8.0, 12.0, np.ones(3)).vague_warnings(None)
     assert "to 12.0 m (1 sigma) only" in warning.text
     assert warning.text.endswith("its start, its IMU and what it saw tell no more")
+
+
+@pytest.mark.parametrize("unstarted", [0, 65])
+def test_scans_without_a_pose_are_told(unstarted: int) -> None:
+    """Of a recording whose first seconds showed no start, the run ended "finished: 15 scans (15 ok)" and said no more."""
+    statistics = straight(0.7, 0.01, np.ones(3), ("ok",) * 15)
+    origin = statistics.first_time_ns
+    assert origin is not None
+    statistics.add_event(Scan.from_arrays(np.ones((2, 3)), np.array([-10, 0]) + origin - unstarted * 100_000_000))
+    statistics.scans_read = 15 + unstarted
+    told = statistics.late_start_warnings(unstarted)
+    assert len(told) == (1 if unstarted else 0)
+    if told:
+        assert told[0].text.startswith("65 of the 80 scans that were read have no pose: no start was found sooner, ")
+        assert "begin 6.5 s after the first scan" in told[0].text
 
 
 @pytest.mark.slow
