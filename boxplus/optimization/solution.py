@@ -33,7 +33,7 @@ class Iteration:
         parameter: λ, radius or step length of the method when the step was chosen.
         accepted: whether the step was taken.
         time_s: since `solve` began.
-        purpose: what a solve that examines a result is for; empty of the steps that lead to it.
+        purpose: what a solve beside the one of the result is for: a question where it examines the result; else empty.
     """
 
     number: int

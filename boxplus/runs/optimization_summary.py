@@ -89,6 +89,9 @@ class OptimizationSummary(_Part):
     notes: list[str]
     doubt: str | None = Field(None, description="why the result is not to be trusted; the exit code is then 3")
     timing_s: dict[str, float]
+    is_last_of_several: bool = Field(
+        False, description="cost_initial, history and timing_s but for its `optimisation` are of the last of several solves"
+    )
     history: list[IterationFacts]
 
     def write(self, path: Path) -> None:

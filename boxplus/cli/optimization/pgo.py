@@ -270,7 +270,12 @@ def _summary(
         certificate=None if result.certificate is None else result.certificate.sentence,
         doubt=result.doubt,
         notes=[*graph.warnings, *result.notes],
-        timing_s={"start": result.timing_s["start"], **result.solution.timing_s},
+        timing_s={
+            "start": result.timing_s["start"],
+            "optimisation": result.timing_s["optimisation"],
+            **result.solution.timing_s,
+        },
+        is_last_of_several=result.loops is not None or len(result.minima) > 1,
     )
 
 

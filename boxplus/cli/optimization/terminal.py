@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from boxplus.runs.optimization_summary import OptimizationSummary
 
 _SOLVER = "Solver"
+_LAST = "of the last of several solves, which began where the others led"
 _WIDTHS = (4, 16, 10, 10, 10, 10, 9)
 # Scales at which a robust loss is 95 % as good as least squares where all errors are Gaussian.
 _LOSS_SCALE = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "geman_mcclure": 3.787, "welsch": 2.985}
@@ -188,17 +189,23 @@ class OptimizationTerminal(Terminal):
                 compiling = True
                 self.console.print("compiling kernels (first use only) …")
 
-        purpose = ""
+        purpose, number, solves, adjusted = "", -1, 0, False
         head: list[str] | None = ["step", "cost", "change", "gradient", "largest δ", parameter, "time [s]"]
 
         def show(iteration: Iteration) -> bool:
-            nonlocal head, purpose
+            nonlocal head, purpose, number, solves, adjusted
             if head is not None:
                 self._row(head, "bold")
                 head = None
             if iteration.purpose != purpose:
-                purpose, self._last = iteration.purpose, None
-                self.console.print(Text(f"examining the result: {purpose}" if purpose else "adjusting again", "bold"))
+                purpose, number, solves = iteration.purpose, -1, 0
+                self.console.print(Text(_title(purpose, adjusted), "bold"), soft_wrap=True)
+            if iteration.number <= number:  # the next of several solves for one purpose
+                solves += 1
+                self.console.print(Text(f"{_title(purpose, adjusted)}, solve {solves + 1}", "bold"), soft_wrap=True)
+            if iteration.number == 0:
+                self._last = None
+            number, adjusted = iteration.number, adjusted or not purpose
             change = "" if self._last is None else f"{iteration.cost - self._last:.2e}"
             style = ""
             if not iteration.accepted:
@@ -235,7 +242,8 @@ class OptimizationTerminal(Terminal):
             values = (errors.rms, errors.median, errors.p99, errors.largest)
             table.add_row(name, *(f"{value:.4g}" for value in values), str(errors.invalid))
         self.console.print(table)
-        rows = {"cost": f"{summary.cost_initial:.9e} → {summary.cost:.9e}"}
+        last = f" ({_LAST})" if summary.is_last_of_several else ""
+        rows = {"cost": f"{summary.cost_initial:.9e} → {summary.cost:.9e}{last}"}
         if summary.chi2 is not None and summary.chi2_initial is not None:
             rows["χ²"] = f"{summary.chi2_initial:.6f} → {summary.chi2:.6f} (without ½ and without robust loss)"
         rows |= {
@@ -253,6 +261,13 @@ class OptimizationTerminal(Terminal):
             self.doubt(summary.doubt)
         self.print_files(folder, [*files, "run.json"])
         outcome.end(summary, summary.state, untrusted=summary.doubt is not None)
+
+
+def _title(purpose: str, adjusted: bool) -> str:
+    """What stands above the steps of a solve, where there are several."""
+    if purpose:
+        return f"examining the result: {purpose}" if purpose.endswith("?") else purpose
+    return "adjusting again" if adjusted else "adjusting"
 
 
 def state_and_reason(solution: Solution, stopped: bool) -> tuple[Literal["finished", "interrupted"], str]:

@@ -11,6 +11,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from plotly.subplots import make_subplots
 
+from boxplus._words import either
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.report.optimization.bundle_scene import BundleScene, Viewpoint, frustum_lines, scene_of
 from boxplus.report.optimization.figures import FONT
@@ -45,7 +46,10 @@ def write_bundle_report(
         (f"{summary.errors.rms:.3g} px", f"reprojection error (rms), {summary.errors_initial.rms:.3g} px before"),
         (f"{summary.errors.median:.3g} px", f"median, {summary.errors_initial.median:.3g} px before"),
         (f"{summary.cost:.7g}", f"cost, {summary.cost_initial:.4g} before"),
-        (f"{summary.history[-1].number}", f"steps in {summary.timing_s['total']:.2f} s"),
+        (
+            f"{summary.history[-1].number}",
+            f"{either(summary.history[-1].number, 'step', 'steps')} in {summary.timing_s['total']:.2f} s",
+        ),
         (f"{sizes['cameras']:,}", "cameras"),
         (f"{sizes['points']:,}", f"points, seen {sizes['observations']:,} times"),
     ]

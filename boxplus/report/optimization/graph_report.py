@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from boxplus._words import either
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.report.optimization.figures import FONT
 from boxplus.report.optimization.page import write_optimization_page
@@ -45,11 +46,12 @@ def write_graph_report(folder: Path, summary: OptimizationSummary, graph: PoseGr
     errors = (result.errors_before, result.errors)
     where = "at the start" if graph.poses is None else "in the file"
     write_optimization_plots(folder / "plots", _picture(graph, panels, result.errors), errors, "σ", summary.history)
+    steps, last = summary.history[-1].number, " of the last solve, all" if summary.is_last_of_several else ""
     numbers = [
         (f"{result.chi2:.7g}", f"χ², {summary.chi2_initial:.5g} {where}"),
         (f"{summary.errors.median:.3g} σ", f"median edge error, {summary.errors_initial.median:.3g} σ {where}"),
         (result.start.replace("_", " "), "start taken"),
-        (f"{summary.history[-1].number}", f"steps in {summary.timing_s['total']:.2f} s"),
+        (f"{steps}", f"{either(steps, 'step', 'steps')}{last} in {summary.timing_s['optimisation']:.2f} s"),
         (f"{len(graph.ids):,}", "poses"),
         (f"{len(graph.edges):,}", "edges"),
     ]

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from boxplus._words import either
 from boxplus.formats.reconstructions.vgg_lines import VggLines
 from boxplus.manifolds import quaternion
 from boxplus.report.optimization.bundle_scene import BundleScene, Viewpoint, frustum_lines
@@ -53,7 +54,10 @@ def write_line_report(folder: Path, summary: OptimizationSummary, start: VggLine
             f"lines, seen {sizes['segments']:,} times; {int((~result.triangulation.found).sum())} not determined",
         ),
         (f"{sizes['cameras']:,}", "cameras"),
-        (f"{summary.history[-1].number}", f"steps in {summary.timing_s['total']:.2f} s"),
+        (
+            f"{summary.history[-1].number}",
+            f"{either(summary.history[-1].number, 'step', 'steps')} in {summary.timing_s['total']:.2f} s",
+        ),
     ]
     if len(result.point_errors):
         median = f"{np.nanmedian(result.point_errors):.3g} px"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import counted
 from boxplus.report.optimization import figures
 from boxplus.report.skeleton import figure_section, html_table, tiles, warnings_section, write_html
 from boxplus.runs.optimization_summary import OptimizationSummary
@@ -97,8 +98,8 @@ def _course(summary: OptimizationSummary) -> str:
     parameter = _PARAMETER.get(summary.method, "step length")
     heading = ("step", "cost", "tried", "largest gradient", "largest step", parameter, "", "time [s]")
     table = f"<details><summary>All steps: {len(rows) - 1}</summary>{html_table(rows, heading)}</details>"
-    text = f"From {summary.cost_initial:.6e} to {summary.cost:.6e} in {summary.history[-1].number} steps; {summary.status}: "
-    text += f"{summary.reason}."
+    text = f"From {summary.cost_initial:.6e} to {summary.cost:.6e} in {counted(summary.history[-1].number, 'step')}"
+    text += f"{' of the last of several solves' if summary.is_last_of_several else ''}; {summary.status}: {summary.reason}."
     return figure_section("Cost", text, figures.cost_over_iterations(summary.history, parameter), table)
 
 

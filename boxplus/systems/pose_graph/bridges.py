@@ -18,6 +18,7 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.consensus import Crossings
 from boxplus.systems.pose_graph.loops import judge_loops
+from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import odometry_order, with_edges
 from boxplus.systems.pose_graph.start import components, spanning_tree_start
 
@@ -77,7 +78,9 @@ def bridge_pieces(
     between = is_loop & (label[i] != label[j])
     poses = spanning_tree_start(odometry)
     if (is_loop & ~between).any():
-        poses = judge_loops(with_edges(graph, ~between), is_loop[~between], poses, options, callback).solution.values[0]
+        poses = judge_loops(
+            with_edges(graph, ~between), is_loop[~between], poses, options, named(callback, "joining pieces of odometry")
+        ).solution.values[0]
     rank = odometry_order(graph)
     first, second = np.minimum(label[i], label[j]), np.maximum(label[i], label[j])
     pair = first * pieces + second

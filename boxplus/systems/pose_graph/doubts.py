@@ -218,10 +218,12 @@ def repetition_notes(graph: PoseGraph) -> list[str]:
     if not len(repeated):
         return []
     turned = np.count_nonzero(is_back[order][1:][same] != is_back[order][:-1][same])
+    there, count_again = ("is", "counts") if len(repeated) == 1 else ("are", "count")
     return [
-        f"{len(repeated)} of {len(order)} edges are there before with the same measurement"
+        f"{len(repeated)} of {len(order)} edges {there} there before with the same measurement"
         + (f" ({turned} of them the other way round)" if turned else "")
-        + f" and count again, as if measured independently; standard deviations come out too small: {edge_names(graph, repeated)}"
+        + f" and {count_again} again, as if measured independently; standard deviations come out too small: "
+        + edge_names(graph, repeated)
     ]
 
 

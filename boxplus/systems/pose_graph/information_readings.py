@@ -22,6 +22,7 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of, squared_errors
 from boxplus.systems.pose_graph.reliability import Reliability
 
@@ -118,13 +119,14 @@ def information_doubt(
     if as_read is None or as_read.is_as_promised:
         return None
     best: tuple[_Fits, str] | None = None
+    watch = named(callback, "information in another unit?")
     for information, meant in _readings(graph.information):
         other = replace(graph, information=information)
         if not as_read.is_likely(other, poses):
             continue
         try:
             problem, anew = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
-            found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=callback)
+            found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=watch)
             if found.status == "stopped" and found.limit != "steps":
                 return None
             is_near = _AS_PROMISED[0] < 2.0 * found.cost / dof < _AS_PROMISED[1]  # what is known of each part takes longest

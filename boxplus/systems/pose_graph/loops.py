@@ -26,6 +26,7 @@ from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import LOOPS, problem_with_loops_apart, with_edges
 from boxplus.systems.pose_graph.start import components
 
@@ -88,7 +89,7 @@ def judge_loops(
         weights={LOOPS: np.zeros(group.residual.count)} if whole else None,
         options=options,
         start=[start],
-        callback=callback,
+        callback=named(callback, "telling false loop closures from true ones"),
     )
     group.set_loss(Squared())
     kept = found.inliers[LOOPS]

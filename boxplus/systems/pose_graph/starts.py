@@ -16,6 +16,7 @@ from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.bridges import Bridge, bridge_pieces
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
+from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
 
@@ -102,7 +103,8 @@ class Starts:
                     known[name] = self._make(name)
                 except InputError:
                     continue  # the chordal objective has no weights for edges that say nothing along some axis
-            tried = problem.solve(self._options, start=[known[name]], callback=self._watch)
+            watch = named(self._watch, f"from another start, {name.replace('_', ' ')}")
+            tried = problem.solve(self._options, start=[known[name]], callback=watch)
             minima[name] = 2.0 * tried.cost
             if tried.cost < best[1].cost:
                 best = (name, tried)
@@ -115,7 +117,8 @@ class Starts:
         if name == "chordal_objective":
             # Smooth where the logarithm jumps at half a turn, and with far fewer minima.
             smooth, _ = pose_graph_problem(self._graph, objective="chordal")
-            return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=self._watch).values[0]
+            watch = named(self._watch, "finding another start by the chordal objective")
+            return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=watch).values[0]
         return chordal_start(self._graph) if name == "chordal" else spanning_tree_start(self._graph)
 
     def _bridge(self) -> None:

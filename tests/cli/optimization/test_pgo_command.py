@@ -48,6 +48,7 @@ def test_g2o_goes_back_to_g2o(tmp_path: Path, dimension: int) -> None:
     assert summary["chi2"] == pytest.approx(expected.chi2, rel=1e-9) == pytest.approx(2.0 * summary["cost"], rel=1e-9)
     assert summary["start"] == expected.start_reason and "cheaper than" in summary["start"]
     told = words(result)
+    assert "adjusting" not in told and "several solves" not in told and not summary["is_last_of_several"]
     assert f"g2o, {dimension}D; 24 poses, 35 edges" in told and expected.start_reason in told
     assert "e = Log(Z⁻¹ Ti⁻¹ Tj), Ω in the order rotation, translation; cost ½ Σ of it, ½ χ²" in told
     assert ("taken for the full rotation vector" in told) == (dimension == 3)
@@ -176,7 +177,17 @@ def test_false_loop_closures_are_refused_and_listed(tmp_path: Path) -> None:
     write_g2o(tmp_path / "false.g2o", simulated.graph)
     result = call(tmp_path / "false.g2o", "-o", tmp_path / "out", "--robust", "gnc")
     assert result.exit_code == 0, result.output
-    assert "of 40 loop closures kept" in words(result)
+    told = words(result)
+    assert "of 40 loop closures kept" in told
+    # Each width of the loss is a solve of its own: their steps stood in one table, and the cost "before" was the last one's.
+    assert "telling false loop closures from true ones step" not in told
+    first, second = "telling false loop closures from true ones\n", "telling false loop closures from true ones, solve 2\n"
+    assert result.output.count(first) == 1 and result.output.count(second) == 1
+    assert "\nadjusting\n" in result.output and "adjusting again" not in told
+    assert "(of the last of several solves, which began where the others led)" in told
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "of the last of several solves" in page and "of the last solve, all in" in page
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["is_last_of_several"]
     rows = [line.split(",") for line in (tmp_path / "out" / "edges.csv").read_text().splitlines()]
     assert rows[0] == ["from", "to", "kind", "weight", "error_sigma"] and len(rows) == 1 + len(simulated.graph.edges)
     weights, errors = (np.array([float(row[column]) for row in rows[1:]]) for column in (3, 4))
