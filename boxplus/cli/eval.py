@@ -202,7 +202,7 @@ def _trajectory_file(path: Path) -> Path:
         raise InputError(
             "estimated trajectories first, the ground truth last",
             f"{path}, a {'folder without trajectory.tum' if path.is_dir() else 'recording'}, as an estimate",
-            "swap the two: boxplus eval TRAJECTORY RECORDING",
+            "give the trajectory itself; a recording with positions comes last: boxplus eval TRAJECTORY RECORDING",
         )
     return path
 

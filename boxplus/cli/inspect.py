@@ -33,7 +33,10 @@ def inspect(
         ),
     ] = None,
     camchain: Annotated[
-        Path | None, typer.Option("--camchain", help="Kalibr camchain of a recording of cameras; it overrules the recording's.")
+        Path | None,
+        typer.Option(
+            "--calibration", "--camchain", help="Kalibr camchain of a recording of cameras; it overrules the recording's."
+        ),
     ] = None,
     frame_rate: Annotated[
         float | None, typer.Option("--frame-rate", help="Images a second, where a recording of cameras has no times [Hz].")
@@ -57,7 +60,8 @@ def inspect(
     if not recording.exists():
         raise RecordingError("a recording", f"no file or folder {recording}", "check the path")
     T_given = None if T_imu_lidar is None else parse_transform(T_imu_lidar)
-    with Progress(console=make_console(stderr=True), transient=True) as progress:
+    console = make_console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(f"examining {recording.name}", total=1.0)
         diagnosis = diagnose(
             recording,

@@ -98,7 +98,11 @@ class _Progress:
     def __init__(self, name: str) -> None:
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-        self._bar = Progress(TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), transient=True)
+        from boxplus.cli.console import make_console
+
+        columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        console = make_console()
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task(name, total=1.0)
 
     def __enter__(self) -> _Progress:

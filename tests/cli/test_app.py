@@ -171,3 +171,12 @@ def test_the_threads_of_blas_that_a_user_asked_for_stay() -> None:
     assert threads() == "1"
     assert threads(OPENBLAS_NUM_THREADS="3") == "3"
     assert threads(OMP_NUM_THREADS="3") == "None"
+
+
+def test_a_bar_leaves_no_trace_in_a_pipe(tmp_path: Path) -> None:
+    """A bar that nobody sees left an empty line, on the standard error of one command and before the results of another."""
+    (tmp_path / "a.bag").write_bytes(b"")
+    result = CliRunner().invoke(app, ["inspect", str(tmp_path / "a.bag")])
+    assert (result.exit_code, result.stderr) == (1, "") and result.stdout.startswith("a.bag")
+    result = CliRunner().invoke(app, ["simulate", "at_rest", "--duration", "0.3", "-o", str(tmp_path)])
+    assert (result.exit_code, result.stderr) == (0, "") and result.stdout.startswith(str(tmp_path))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus._words import counted
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -112,6 +113,6 @@ def _rows(result: LocalizationResult) -> list[tuple[str, str]]:
     summary = result.summary
     counts = ", ".join(f"{count} {name}" for name, count in sorted(summary.status.items()))
     found = "never found" if summary.found_after_s is None else f"found after {summary.found_after_s:.1f} s"
-    rows = [("map", f"{summary.map}, {summary.places} places"), ("in the map", f"{found}; scans: {counts}")]
-    rows += [("map", text) for text in summary.map_report]
+    rows = [("map", f"{summary.map}, {counted(summary.places, 'place')}"), ("in the map", f"{found}; scans: {counts}")]
+    rows += [("of the map", text) for text in summary.map_report]
     return rows + [("lost", text) for text in summary.losses]

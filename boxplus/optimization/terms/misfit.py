@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_exceeded, chi_square_quantile
+from boxplus._words import either
 from boxplus.optimization.losses import SQUARED
 from boxplus.optimization.terms.group import Group
 
@@ -60,8 +61,9 @@ def _standing_out(name: str, dim: int, squared: NDArray[np.float64], counted: ND
     found = found[np.argsort(-squared[found], kind="stable")]
     listed = ", ".join(map(str, found[:_LISTED])) + (" …" if len(found) > _LISTED else "")
     times = float(np.sqrt(squared[found[0]] / scale / dim))
+    are = either(len(found), "is", "are up to")
     return [
-        f"{len(found)} of the {number} residuals of {name} ({listed}) are up to {times:.3g} times larger than usual ones, which "
-        "no noise explains; least squares bends everything to them: wrong measurements (a robust loss, `graduate`), or a wrong "
+        f"{len(found)} of the {number} residuals of {name} ({listed}) {are} {times:.3g} times larger than usual ones, which no "
+        "noise explains; least squares bends everything to them: wrong measurements (a robust loss, `graduate`), or a wrong "
         "minimum"
     ]

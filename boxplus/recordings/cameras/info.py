@@ -103,7 +103,7 @@ class CameraStream:
             raise RecordingError(
                 f"the calibration of {self.name}: model and T_body_camera",
                 "no " + " and no ".join(text for text, there in zip(unknown, known, strict=True) if not there),
-                "give a Kalibr camchain with CameraRecordingOptions(calibration=…)",
+                "give a Kalibr camchain: --calibration FILE, or CameraRecordingOptions(calibration=…)",
             )
         return CalibratedCamera(model, T_body_camera, self.width, self.height, self.line_delay_s or 0.0)
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from boxplus._words import counted, either
 from boxplus.manifolds import se3
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
@@ -168,7 +169,7 @@ class _Meeting:
 
     def _nothing_found(self) -> str:
         if not self.loops:
-            alike = f"{self.proposed} pairs of local maps look alike, but no two at one alignment"
+            alike = f"{_pairs(self.proposed)} alike, but no two at one alignment"
             return alike if self.proposed else "no local map of one looks like one of the other"
         ambiguous = [(loop, rival) for loop in self.loops.values() if (rival := _rival_of(loop))]
         if len(ambiguous) >= _FIRST:
@@ -178,7 +179,8 @@ class _Meeting:
                 f"local map {loop.query} over {loop.place} {rival}"
             )
         passed = sum(loop.refusal is None for loop in self.loops.values())
-        return f"{len(self.loops)} pairs of local maps look alike at one alignment, and {passed or 'none'} of them fit"
+        fit = f"{passed or 'none'} of them {either(passed, 'fits', 'fit')}"
+        return f"{_pairs(len(self.loops))} alike at one alignment, and {fit}"
 
     def _look_for_encounters(self) -> None:
         """Step 1."""
@@ -325,12 +327,12 @@ class _Meeting:
         """Step 6."""
         c = self.config
         if confirmed < c.least_confirmed * predicted:
-            return f"if they met, {predicted} pairs of local maps would lie over each other; {confirmed} of them do"
+            return f"if they met, {counted(predicted, 'pair')} of local maps would lie over each other; {confirmed} of them do"
         queries, places = _queries(chosen), {loop.place for loop in chosen}
         if min(len(queries), len(places)) < c.least_encounters:
             return (
                 f"{len(chosen)} encounters agree, of {len(queries)} local maps of one session and {len(places)} of the other; "
-                f"{c.least_encounters} are asked for"
+                f"{c.least_encounters} of each are asked for"
             )
         spread = min(self.query.way(min(queries), max(queries)), self.place.way(min(places), max(places)))
         if spread < c.least_spread:
@@ -393,3 +395,7 @@ def _within(config: SessionsConfig) -> Floats:
 
 def _queries(loops: list[Loop]) -> set[int]:
     return {loop.query for loop in loops}
+
+
+def _pairs(count: int) -> str:
+    return f"{counted(count, 'pair')} of local maps {either(count, 'looks', 'look')}"

@@ -104,7 +104,7 @@ def test_kitti_projections_become_models_and_a_baseline(tmp_path: Path) -> None:
 def test_without_times_the_rate_has_to_be_given(tmp_path: Path) -> None:
     row = "700 0 600 0 0 700 180 0 0 0 1 0"
     path = write_kitti(tmp_path / "kitti", ("image_0",), row, None)
-    with pytest.raises(RecordingError, match="give frame_rate_hz"):
+    with pytest.raises(RecordingError, match="give their rate: --frame-rate"):
         open_camera_recording(path)
     with open_camera_recording(path, CameraRecordingOptions(frame_rate_hz=20.0)) as recording:
         assert [image.time_ns for image in images_of(recording)] == [0, 50_000_000, 100_000_000]

@@ -137,7 +137,9 @@ def _times(file: Path, options: CameraRecordingOptions, evidence: list[Evidence]
         evidence.append(Evidence("image_times", "by the rate", "ok", text))
         return _Times([], 1e9 / options.frame_rate_hz)
     if not file.is_file():
-        raise RecordingError("times of the images (times.txt)", f"none in {file.parent.name}", "give frame_rate_hz")
+        raise RecordingError(
+            "times of the images (times.txt)", f"none in {file.parent.name}", "give their rate: --frame-rate (frame_rate_hz)"
+        )
     times = [nanoseconds(line.strip()) for line in file.read_text(errors="replace").splitlines() if line.strip()]
     known = [time for time in times if time is not None]
     if not known or len(known) < len(times):
