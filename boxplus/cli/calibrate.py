@@ -75,7 +75,12 @@ def lidar_imu(
         if found.has_mounting:
             outcome.end(facts)
         else:
-            outcome.fall_short(facts, "the motion does not determine T_imu_lidar: not written")
+            rest = "" if output is None else f", which {output} leaves out"
+            outcome.fall_short(
+                facts,
+                f"expected a motion that determines T_imu_lidar – got one that leaves it open{rest} – record what "
+                "stands under advice",
+            )
 
 
 def _write(path: Path, text: str) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._arguments import as_path, require
 from boxplus._numbers import as_array, as_floats
+from boxplus._words import either
 from boxplus.errors import InputError
 from boxplus.formats.numbers.lines import refuse_binary
 from boxplus.formats.output import atomic_file
@@ -83,7 +84,8 @@ class Trajectory:
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if bad.size:
                 got = f"{values[bad[0]]} ({where(int(bad[0]))})"
-                raise InputError(f"a finite {name}", got, f"remove the {bad.size} rows with NaN or infinity")
+                rows = either(bad.size, "the row", f"the {bad.size} rows")
+                raise InputError(f"a finite {name}", got, f"remove {rows} with NaN or infinity")
         norm = np.linalg.norm(q, axis=1)
         bad = np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)
         if bad.size:

@@ -52,7 +52,8 @@ details { margin-top: 8px; } summary { cursor: pointer; color: var(--faint); }
   .figures { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px; }
   .figures div { padding: 9px 10px; overflow-wrap: anywhere; } table { display: block; overflow-x: auto; }
   .figures b { font-size: 18px; } td.key { white-space: normal; width: auto; padding-right: 12px; }
-  td { min-width: 64px; overflow-wrap: break-word; } td:nth-child(n + 5):last-child { min-width: 220px; }
+  td { min-width: 64px; overflow-wrap: break-word; } td.key + td:last-child { overflow-wrap: anywhere; }
+  td:nth-child(n + 5):last-child { min-width: 220px; }
   table.evidence tr { display: grid; grid-template-columns: 1fr 1fr auto; padding: 4px 0; border-bottom: 1px solid var(--line); }
   table.evidence td { border: 0; padding: 0 12px 0 0; overflow-wrap: anywhere; }
   table.evidence td:last-child { grid-column: 1 / -1; } table.evidence th { display: none; }

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -75,6 +77,22 @@ def test_what_the_motion_does_not_show_is_not_written() -> None:
     text = calibration_yaml(found, RecordingOptions(), "carried")
     assert "T_imu_lidar:" not in text.split("# found with")[0]
     assert "NOT DETERMINED: open" in text and "turn the platform" in text
+
+
+def test_a_mounting_left_open_is_told_as_every_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It said "not written" below the name of the file that was."""
+    file = tmp_path / "calibration.yaml"
+    found = SimpleNamespace(quantities=[], has_mounting=False)
+    monkeypatch.setattr("boxplus.recordings.open_recording", lambda *_: nullcontext())
+    monkeypatch.setattr("boxplus.runs.calibration.calibrate_lidar_imu", lambda *_: found)
+    monkeypatch.setattr("boxplus.runs.calibration.calibration_yaml", lambda *_: "recording:\n")
+    monkeypatch.setattr("boxplus.runs.calibration.calibration_facts", lambda *_: None)
+    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", "a.bag", "-o", str(file)])
+    assert result.exit_code == 1 and file.is_file()
+    assert " ".join(result.stderr.split()) == (
+        f"error: expected a motion that determines T_imu_lidar – got one that leaves it open, which {file} leaves out – record "
+        "what stands under advice"
+    )
 
 
 def test_contradictions_are_refused() -> None:

@@ -8,6 +8,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import either
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.formats.numbers.lines import NumberLines
@@ -133,7 +134,7 @@ class GraphBuilder:
                 "fixed poses that the file has", f"pose {name} ({self._source}, line {line})", "add its line, or remove this one"
             )
         left_out = tuple(
-            f"{times} lines {word} were left out (first: {self._source}, line {first})"
+            f"{times} {either(times, f'line {word} was', f'lines {word} were')} left out (first: {self._source}, line {first})"
             for word, (times, first) in self._unknown.items()
         )
         return PoseGraph(

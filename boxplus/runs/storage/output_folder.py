@@ -80,7 +80,7 @@ def _has_to_be_cleared(
     holds_results: Callable[[], bool],
 ) -> bool:
     """Whether there is something to remove, which may be removed; raises where it may not."""
-    found = {file for file in path.rglob("*") if not file.is_dir() and file != path / LOCK}
+    found = {file for file in path.rglob("*") if not file.is_dir() and file.name != LOCK}  # also that of a run within a run
     if not found and all(entry.name == LOCK for entry in path.iterdir()):
         return False
     if not (path / SUMMARY).is_file():

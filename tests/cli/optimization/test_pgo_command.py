@@ -161,7 +161,7 @@ def test_unknown_lines_are_left_out_on_request_and_counted(tmp_path: Path) -> No
         file.write("EDGE_XY 0 1 2 3\n")
     result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--ignore-unknown", "--no-report")
     assert result.exit_code == 0, result.output
-    assert "warning: 1 lines EDGE_XY were left out" in words(result)
+    assert "warning: 1 line EDGE_XY was left out" in words(result)
 
 
 def test_the_report_command_sends_back_to_the_page_that_is_there(tmp_path: Path) -> None:

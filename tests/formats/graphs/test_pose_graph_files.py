@@ -178,7 +178,7 @@ def test_unknown_words_are_refused_or_counted(tmp_path: Path) -> None:
     assert len(graph.edges) == 1
     assert graph.warnings == (
         f"2 lines VERTEX_XY were left out (first: {path}, line 2)",
-        f"1 lines EDGE_SE2_XY were left out (first: {path}, line 6)",
+        f"1 line EDGE_SE2_XY was left out (first: {path}, line 6)",
     )
 
 

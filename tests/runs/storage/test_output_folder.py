@@ -119,6 +119,16 @@ def test_what_a_failed_run_began_is_replaced(tmp_path: Path) -> None:
         raise AssertionError
 
 
+def test_a_run_killed_within_a_run_is_replaced(tmp_path: Path) -> None:
+    """A localisation that was killed before its odometry had begun blocked its folder, with and without --overwrite."""
+    (tmp_path / "odometry").mkdir()
+    for folder, program in ((tmp_path, "boxplus ba"), (tmp_path / "odometry", "boxplus lio")):
+        (folder / "run.lock").write_text(json.dumps({"program": program, "process": 1}))
+    (tmp_path / "adjusted.txt").write_text("half of it")
+    with _claimed(tmp_path) as path:
+        assert not (path / "adjusted.txt").exists()
+
+
 @pytest.mark.parametrize("began", [False, True])
 def test_files_of_others_are_never_replaced(tmp_path: Path, began: bool) -> None:
     """A file of a user's own may have a name that a run would use: without a sign of a run it is nobody's to remove."""
