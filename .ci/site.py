@@ -3,7 +3,7 @@
 The pages stay what they are on disk, and their links lead somewhere there as well. Here
 - the navigation is that of docs/index.md (and of docs/residuals/index.md), so that a page is listed in one place only;
 - the reference is one page a folder of the package, with every public name (those of the stubs) and its docstring;
-- CONTRIBUTING.md, CHANGELOG.md, sources, examples and the notebook become pages where a page links to them;
+- README.md, CONTRIBUTING.md, CHANGELOG.md, sources, examples and the notebook become pages where a page links to them;
 - nothing may be loaded from another server: a page that would is refused.
 """
 
@@ -41,6 +41,8 @@ ROOMS = {
     "errors": "Errors",
 }
 """Pages of the reference, in this order. A folder with public names that is not listed is refused."""
+ORIGIN: dict[str, str] = {}
+"""The file of the repository that a page is made from; of the others it is the one in docs/ of the same name."""
 
 
 def public_names() -> dict[str, str]:
@@ -105,13 +107,14 @@ def page_of(path: str) -> str | None:
         return None
     if path.startswith("docs/"):
         return path.removeprefix("docs/") + ".md"
+    if path == "README.md":
+        return "readme_page.md"  # mkdocs takes README.md for the first page, which is docs/index.md
     return path if path.endswith(".md") else f"source/{path}.md"
 
 
 def resolved(page: str, target: str) -> str:
     """The file of the repository that a link of a page leads to."""
-    outside = page in ("CONTRIBUTING.md", "CHANGELOG.md")
-    return posixpath.normpath(posixpath.join("" if outside else "docs", posixpath.dirname(page), target))
+    return posixpath.normpath(posixpath.join(posixpath.dirname(ORIGIN.get(page, f"docs/{page}")), target))
 
 
 def shown(path: str, pictures: dict[str, bytes]) -> str:
@@ -137,8 +140,8 @@ def on_files(files: Files, config: Any) -> Files:
             path = resolved(page, target)
             extra = page_of(path) if (ROOT / path).exists() and "://" not in target else None
             if extra is not None and extra not in made:
-                made[extra] = shown(path, pictures)
-                if path in ("CONTRIBUTING.md", "CHANGELOG.md"):
+                made[extra], ORIGIN[extra] = shown(path, pictures), path
+                if path.endswith(".md"):
                     waiting[extra] = made[extra]
     for name, content in {**made, **pictures}.items():
         files.append(File.generated(config, name, content=content))
