@@ -84,8 +84,8 @@ class RunStatistics(EstimateStatistics):
             return []
         text = (
             f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, path and map "
-            f"begin {(self.first_time_ns - self._first_scan_ns) * 1e-9:.1f} s after the first scan; a recording that begins at "
-            "rest, or --T-imu-lidar where it was estimated, may let them begin with it"
+            f"begin {(self.first_time_ns - self._first_scan_ns) * 1e-9:.1f} s after the first scan; let a recording start at "
+            "rest, or where walls are near"
         )
         return [WarningFacts(text=text, count=1)]
 

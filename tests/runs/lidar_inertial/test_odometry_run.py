@@ -34,8 +34,10 @@ from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import Progress
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import BEFORE_START
 from boxplus.simulation import Fault, SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 
 LIDAR = SpinningLidar(azimuth_steps=200)
 
@@ -378,6 +380,14 @@ def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
         r"the times of the LiDAR step back by 3599\.9\d* s after \d+\.\d+ s and go on from there: 1\.\d s of it", lidar
     )
     assert re.match(r"the times of the IMU step back by (3600\.0|3599\.9)\d* s after", imu)
+
+
+def test_a_path_that_begins_late_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counters = property(lambda self: {BEFORE_START: 12})
+    monkeypatch.setattr(LidarInertialOdometry, "counters", counters)
+    summary = run_odometry(walk(1.5), tmp_path / "out")
+    (told,) = [warning.text for warning in summary.warnings if "have no pose" in warning.text]
+    assert told.startswith("12 of the 14 scans that were read have no pose: no start was found sooner, path and map begin 0.0 s")
 
 
 def test_a_lidar_alone(tmp_path: Path) -> None:
