@@ -64,7 +64,7 @@ def alignment_doubts(
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
-    w_first = _w_first(association.estimate, association.ground_truth, alignment.R_world_estimate, scatter)
+    w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
     if w_first is not None:
         doubts.append(w_first)
     elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
@@ -145,19 +145,20 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
         )
         return
     # Where positions differ, too, what makes them differ turns them.
-    if _w_first(estimate, truth, R, scatter) is None and rmse < _FITS * alignment.spread_m[0]:
+    if _w_first(estimate, truth, alignment, scatter) is None and rmse < _FITS * alignment.spread_m[0]:
         yield (
             f"the orientations scatter by {scatter:.0f}° against the ground truth's: another convention, or none; "
             "look at the positions alone"
         )
 
 
-def _w_first(estimate: Trajectory, truth: Trajectory, R: NDArray[np.float64], scatter: float) -> str | None:
+def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scatter: float) -> str | None:
     """A sentence where orientations agree clearly better with other columns; of a body that turns little, they hardly scatter.
 
     Args:
-        R: (3, 3) R_world_estimate of the alignment. scatter: of the orientations as they were read [deg].
+        scatter: of the orientations as they were read [deg].
     """
+    R = alignment.R_world_estimate
     swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
     ways = {
         "the estimate": _scatter_deg(R @ swapped[0], truth.R),
@@ -165,6 +166,9 @@ def _w_first(estimate: Trajectory, truth: Trajectory, R: NDArray[np.float64], sc
         "both files": _scatter_deg(R @ swapped[0], swapped[1]),
     }
     way = min(ways, key=lambda name: ways[name])
+    if alignment.kind == "none":  # worlds that nobody laid over each other turn the differences: orientations may agree in one
+        world = _mean_rotation(truth.R @ estimate.R.transpose(0, 2, 1))
+        scatter = min(scatter, _scatter_deg(world @ estimate.R, truth.R))
     if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
         return None
     return (

@@ -46,8 +46,15 @@ class MapFromAbove:
         self.store = TileStore.open(run.tiles)
         self.frame = read_origin(run.path)
         p = read_trajectory(run.trajectory).p
-        if z is not None:
+        if z is not None and len(p):
+            lowest, highest = p[:, 2].min(), p[:, 2].max()
             p = p[(p[:, 2] >= z[0]) & (p[:, 2] <= z[1])]
+            if not len(p):
+                raise InputError(
+                    f"a storey (--z) on which the path runs, which lies between {lowest:.2f} and {highest:.2f} m",
+                    f"{z[0]:g} to {z[1]:g} m",
+                    "give heights of the path",
+                )
         if not len(p) or not self.store.counts:
             raise InputError(
                 "a path and a map", f"{len(p)} poses and {self.store.point_count} points in {run.path}", "see run.json"

@@ -89,6 +89,8 @@ def test_storeys_over_each_other_are_not_mixed(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", z_of_second_lap=4.0)
     code, out = call("map", "grid", folder)
     assert code == 2 and "a path that is on one storey" in out and "--z LOW HIGH" in out
+    code, out = call("map", "grid", folder, "--z", "100", "200")
+    assert code == 2 and "expected a storey (--z) on which the path runs, which lies between " in out
     assert call("map", "grid", folder, "--z", "1", "3")[0] == 0
 
 
