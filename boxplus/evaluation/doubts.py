@@ -65,8 +65,16 @@ def alignment_doubts(
     scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
     w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
+    world = _world_turn(association.estimate, association.ground_truth)
+    in_one_world = _scatter_deg(world @ association.estimate.R, association.ground_truth.R)
     if w_first is not None:
         doubts.append(w_first)
+    elif alignment.kind == "none" and scatter > _CONSTANT_DEG and in_one_world < _CLEARLY * scatter:
+        turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
+        doubts.append(
+            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same: "
+            "all errors but the relative ones contain that; --align lays one over the other"
+        )
     elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
@@ -167,8 +175,7 @@ def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scat
     }
     way = min(ways, key=lambda name: ways[name])
     if alignment.kind == "none":  # worlds that nobody laid over each other turn the differences: orientations may agree in one
-        world = _mean_rotation(truth.R @ estimate.R.transpose(0, 2, 1))
-        scatter = min(scatter, _scatter_deg(world @ estimate.R, truth.R))
+        scatter = min(scatter, _scatter_deg(_world_turn(estimate, truth) @ estimate.R, truth.R))
     if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
         return None
     return (
@@ -370,6 +377,11 @@ def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> fl
     """Root mean square of how far relative rotations are from their mean [degrees]."""
     between = np.swapaxes(R_other, 1, 2) @ R_one
     return float(np.degrees(rms(np.linalg.norm(so3.log(_mean_rotation(between).T @ between), axis=1))))
+
+
+def _world_turn(estimate: Trajectory, truth: Trajectory) -> NDArray[np.float64]:
+    """The rotation (3, 3) of the estimate's world to the true one, by orientations of the same body."""
+    return _mean_rotation(truth.R @ estimate.R.transpose(0, 2, 1))
 
 
 def _mean_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
