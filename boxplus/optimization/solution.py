@@ -295,7 +295,7 @@ class Solution:
             >>> prior = bp.residuals.Prior(bp.Euclidean(1), measured, sigma=0.1)
             >>> group = problem.add_residuals(prior, x[np.zeros(21, int)], name="x")
             >>> problem.solve().doubts()[0][:33]
-            '1 of the 21 residuals of x (20) a'
+            '1 of the 21 residuals of x (20) i'
         """
         self._problem.require_current()
         return misfit_notes(self._problem.groups, self.values, self._problem.layout.dof)
