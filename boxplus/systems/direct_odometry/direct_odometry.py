@@ -246,7 +246,7 @@ class DirectOdometry:
             start.problem = f"{found} patches are found where corners say that they moved to ({wanted} are needed)"
             return None
         alignment = track(first.tracker, views.second, T_21=views.T_21)
-        verdict = Watch(self.config).judge(alignment, first.tracker.median_depth)
+        verdict = Watch(self.config).judge(alignment, first.tracker)
         if verdict.status == "lost":
             start.problem = f"grey values do not confirm how corners moved: {'; '.join(verdict.reasons)}"
             return None
@@ -311,14 +311,14 @@ class DirectOdometry:
             offset = self._offset if keyframe is self._reference else 0.0
             light = keyframe.log_gain - self._log_gain, offset
             alignment = track(keyframe.tracker, image, T_21=starts, light=light, search_deg=search_deg)
-            verdict = self._watch.judge(alignment, keyframe.tracker.median_depth)
+            verdict = self._watch.judge(alignment, keyframe.tracker)
             tracked.append(Tracked(keyframe, alignment, verdict))
             if verdict.status != "lost":
                 self._reference = keyframe
                 break
         else:
             tracked = tracked[:1]
-        self._watch.keep(tracked[-1].alignment, tracked[-1].verdict)
+        self._watch.keep(tracked[-1])
         return tracked[-1]
 
     def _nearest(self, T_world_camera: Matrix) -> WindowKeyframe:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.focal_length import check_focal_length
+from boxplus.runs.inspection.cameras.known_turns import known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
@@ -76,12 +78,13 @@ class Comparison:
         return [check_calibration(self._pictures[:2], self._corners)] if len(self._pictures) > 1 else []
 
     def with_imu(self, imu: ImuSamples) -> list[Evidence]:
-        """Whether camera and IMU turn alike, and whether all rows of an image do; nothing without a camera."""
+        """Whether camera and IMU turn alike and as far, and whether all rows of an image do; nothing without a camera."""
         if not self._pictures:
             return []
         camera = self._pictures[0]
         aligned = align(self.turns, imu)
         found = check_rotation(camera, aligned)
         if not isinstance(aligned, str) and camera.model is not None and not any(e.value == "unlike" for e in found):
-            found += check_readout(camera, self.turns, imu, aligned)
+            turns = known_turns(camera, self.turns, imu, aligned)
+            found += [check_readout(camera, turns), check_focal_length(camera, turns)]
         return found

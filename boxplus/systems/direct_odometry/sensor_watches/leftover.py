@@ -6,14 +6,17 @@ At a frame that was tracked, e = I₁(p₁) − (eᵃ I₂(p₂) + b) with p₂ 
     ∂e/∂q ≈ −∇I₁ ∂p₂/∂q
 
 The pose takes what it can; what is left says q, with the covariance of the scatter between cells of the image (see
-`tracking.py`). Frames are combined by their information, and the standard deviation grows by how much they disagree.
+`tracking.py`). With weights w it is a single step, and one that is too short, as weights are small where q leaves residuals: w e
+grows with e by its slope, in the mean Σ (w e)'/Σ w, by which x is divided. Frames are combined by their information, and
+the standard deviation grows by how much they disagree.
 
 Where inverse depths err pixel by pixel, x = −(JᵀWJ)⁻¹ JᵀWe is biased however many pixels there are: errors of ρ are in e and in J
 alike, so that lengths come out too short by the share of the errors in how much ρ varies, and a cause that moves all pixels alike
 takes the rest. Instruments Z, the columns of J by a smooth surface through the ρ of all pixels, vary with them and know no single
 one: x = −(ZᵀWJ)⁻¹ ZᵀWe.
 
-Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, chapter 6.
+Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, chapter 6; single steps: Huber
+and Ronchetti, Robust Statistics, 2009, chapter 7.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 Matrix = NDArray[np.float64]
 _FEWEST, _MANY = 3, 5  # frames for a contradiction; from the latter on how much they disagree is known well enough
 _CUT = 4.685  # of Tukey's weights, in σ
+_LEAST_GROWTH = 0.1  # of weighted residuals, by the weights
 _CELLS = 6  # across and down
 _NOTHING = 1e-6  # information of what no frame was asked for
 _CONDITION = 1e10  # of the normal equations, from which on a frame says nothing
@@ -66,12 +70,15 @@ class Leftover:
         value, _, seen = sample(image, self.seen_at)
         gain, offset = np.exp(alignment.brightness[0]), alignment.brightness[1]
         self._e = np.where(seen, level.grey - gain * value - offset, 0.0)
-        weight = np.where(seen, np.clip(1.0 - (self._e / (_CUT * alignment.sigma)) ** 2, 0.0, 1.0) ** 2, 0.0)
+        share = np.where(seen, (self._e / (_CUT * alignment.sigma)) ** 2, 1.0)
+        weight = np.where(share < 1.0, (1.0 - share) ** 2, 0.0)
+        growth = np.where(share < 1.0, (1.0 - share) * (1.0 - 5.0 * share), 0.0)  # (w e)'
         grey = keyframe.grey.astype(np.float64)
         height, width = grey.shape
         u, v = level.pixels.astype(np.int64).T
         inside = (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
         self._weight = weight * inside
+        self._growth = growth * inside
         u, v = np.clip(u, 1, width - 2), np.clip(v, 1, height - 2)
         self._slope = 0.5 * np.stack([grey[v, u + 1] - grey[v, u - 1], grey[v + 1, u] - grey[v - 1, u]], axis=1)
         self._by_motion, self._by_light = level.J, np.column_stack([level.grey, np.ones(len(level.rays))])
@@ -133,7 +140,8 @@ class Leftover:
             share: (n,) of each pixel that counts; all by default.
             instruments: Z (n, 8 + k), `columns` that errors of the inverse depths are not in; J by default.
         """
-        weight = self._weight if share is None else self._weight * share
+        shares = np.ones(len(self._e)) if share is None else share
+        weight, growth = self._weight * shares, float(self._growth @ shares)
         J = self.columns(motions)
         scale = 1.0 / np.sqrt(np.maximum((weight[:, None] * J**2).sum(axis=0), 1e-300))
         Z = (J if instruments is None else instruments) * scale
@@ -145,6 +153,7 @@ class Leftover:
         inverse = np.linalg.inv(H)
         x = -inverse @ g
         left = self._e + J @ x
+        scale = scale / max(growth / float(weight.sum()), _LEAST_GROWTH)  # of a step that is not too short
         scores = np.zeros((_CELLS * _CELLS, J.shape[1]))
         np.add.at(scores, self._cell, rows * left[:, None])
         factor = _CELLS**2 / (_CELLS**2 - J.shape[1])

@@ -13,6 +13,8 @@ import pytest
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.cameras.examination import examine_cameras
+from boxplus.runs.inspection.cameras.focal_length import check_focal_length, estimate_focal_length
+from boxplus.runs.inspection.cameras.known_turns import known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout, estimate_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
@@ -85,17 +87,50 @@ def test_the_time_from_row_to_row_comes_back(seed: int, readout_s: float) -> Non
     camera = streams(simulation.scenario.rig)[0]
     aligned = align(turns, imu)
     assert not isinstance(aligned, str)
-    found = estimate_readout(camera, turns, imu, aligned)
+    known = known_turns(camera, turns, imu, aligned)
+    found = estimate_readout(camera, known)
     assert found is not None
     assert abs(found.time_s - readout_s) < 4.0 * found.std_s + 1e-3 and found.std_s < 3e-3
-    (said,) = check_readout(camera, turns, imu, aligned)
+    said = check_readout(camera, known)
     assert (said.verdict == "warning") == (readout_s != 0.0) and ("rolling shutter" in said.text) == (readout_s != 0.0)
     declared = dataclasses.replace(camera, line_delay_s=readout_s / (camera.height - 1))
-    assert check_readout(declared, turns, imu, aligned)[0].verdict == "ok"
-    (said,) = check_readout(dataclasses.replace(camera, line_delay_s=(readout_s + 0.03) / camera.height), turns, imu, aligned)
+    assert check_readout(declared, known).verdict == "ok"
+    said = check_readout(dataclasses.replace(camera, line_delay_s=(readout_s + 0.03) / camera.height), known)
     assert said.verdict == "warning" and "check line_delay" in said.text
     few = dataclasses.replace(camera, model=None)
-    assert check_readout(few, turns, imu, aligned)[0].value == "unchecked"
+    assert known_turns(few, turns, imu, aligned) == [] and check_readout(few, []).value == "unchecked"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "lens", "factor"), [(1, "radtan", 1.0), (3, "equidistant", 1.0), (5, "radtan", 1.06), (7, "equidistant", 0.9)]
+)
+def test_a_wrong_focal_length_is_told_from_how_far_the_gyroscope_turns(seed: int, lens: LensKind, factor: float) -> None:
+    simulation, turns, imu = turning(seed, 0.0, lens)
+    camera = streams(simulation.scenario.rig)[0]
+    assert camera.model is not None
+    stated = dataclasses.replace(camera.model, fx=factor * camera.model.fx, fy=factor * camera.model.fy)
+    camera = dataclasses.replace(camera, model=stated)
+    aligned = align(turns, imu)
+    assert not isinstance(aligned, str)
+    known = known_turns(camera, turns, imu, aligned)
+    found = estimate_focal_length(camera, known)
+    assert found is not None
+    epsilon, sigma = found
+    assert abs(epsilon - (1.0 / factor - 1.0)) < 4.0 * sigma + 0.005 and sigma < 0.01
+    said = check_focal_length(camera, known)
+    assert (said.verdict == "warning") == ("check the focal length" in said.text) == (factor != 1.0)
+    assert check_readout(camera, known).verdict == "ok"  # one is not taken for the other
+    assert check_focal_length(camera, known[:20]).value == "unchecked"
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_is_no_focal_length() -> None:
+    simulation, turns, imu = turning(5, 0.025)
+    camera = streams(simulation.scenario.rig)[0]
+    aligned = align(turns, imu)
+    assert not isinstance(aligned, str)
+    assert check_focal_length(camera, known_turns(camera, turns, imu, aligned)).verdict == "ok"
 
 
 def pairs(simulation: CameraSimulation) -> Corners:

@@ -138,7 +138,8 @@ def test_turns_of_both_senses_are_told_alike(seed: int) -> None:
     (to, *_), (fro, *_) = (
         watched(CAMERA, seed, depths="stereo", turn=sense * turn)._found.estimate()[0][1:] for sense in (1.0, -1.0)
     )
-    assert 0.4 * turn < to < turn and -turn < fro < -0.4 * turn
+    # Single steps of weighted least squares, taken as they are, came to 0.76 and 0.78 of it.
+    assert 0.85 * turn < (to - fro) / 2.0 < 1.1 * turn
     assert abs(to + fro) / 2.0 < np.radians(0.05)
 
 

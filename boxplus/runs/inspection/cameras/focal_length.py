@@ -1,0 +1,62 @@
+"""Is the focal length right? By how much a camera seems to turn, and by how much the gyroscope says that it does.
+
+With a focal length that is stated 1/(1 + ε) times as long as it is, corners lie 1 + ε times as far from the principal point as
+they should, and a turn about an axis in the image looks 1 + ε times as large; one about the optical axis looks the same. ε is
+where the directions of corners, drawn to the principal point by it, fit best to the gyroscope's turns (`known_turns.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from boxplus.recordings.cameras.info import CameraStream
+from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.known_turns import FEWEST_PAIRS, KnownTurn, best_of
+
+_SHORTEST, _LONGEST, _STEP = -0.28, 0.36, 0.04
+_FEWEST_CORNERS = 20
+_SMALL = 0.03
+_SURE = 5.0
+
+
+def estimate_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> tuple[float, float] | None:
+    """ε and its standard deviation; None where there are too few corners, nothing that turns, or it is beyond the search."""
+    if camera.model is None or not turns:
+        return None
+    model, centre = camera.model, np.array([camera.model.cx, camera.model.cy])
+    # Corners that the shortest focal length puts beyond the lens would be missing where it is tried, and nowhere else.
+    pairs = []
+    for turn in turns:
+        first, second = (model.bearings(centre + (p - centre) / (1.0 + _SHORTEST))[1] for p in (turn.pixels1, turn.pixels2))
+        if np.count_nonzero(first & second) >= _FEWEST_CORNERS:
+            pairs.append(turn.only(first & second))
+    if len(pairs) < FEWEST_PAIRS:
+        return None
+    pixels = np.concatenate([p for pair in pairs for p in (pair.pixels1, pair.pixels2)]) - centre
+    ends = np.cumsum([len(pair.pixels1) for pair in pairs for _ in range(2)])[:-1]
+    longer, costs = np.arange(_SHORTEST, _LONGEST + 0.5 * _STEP, _STEP), []
+    for epsilon in longer:
+        rays = np.split(model.bearings(centre + pixels / (1.0 + epsilon))[0], ends)
+        costs.append([pair.misfit(rays[2 * k], rays[2 * k + 1], camera.readout_s) for k, pair in enumerate(pairs)])
+    return best_of(longer, np.array(costs))
+
+
+def check_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> Evidence:
+    """A finding about the focal length of this camera."""
+    key, found = f"{camera.name}_focal_length", estimate_focal_length(camera, turns)
+    if found is None:
+        text = "the camera turns too little, or too few corners agree: its focal length is not compared with the gyroscope"
+        return Evidence(key, "unchecked", "ok", text)
+    epsilon, sigma = found
+    text = (
+        "share by which the focal length would have to be longer for corners to agree best with the gyroscope, standard "
+        f"deviation {100.0 * sigma:.1f} %"
+    )
+    if abs(epsilon) <= max(_SMALL, _SURE * sigma):
+        return Evidence(key, f"{100.0 * epsilon:+.1f} %", "ok", text)
+    text += (
+        ": check the focal length, whether images were scaled or cropped since it was calibrated, and the scale of the gyroscope"
+    )
+    return Evidence(key, f"{100.0 * epsilon:+.1f} %", "warning", text)
