@@ -130,7 +130,7 @@ class Consistency:
         warnings += self._innovate(frame, correction, update.cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
-        warnings += self._steadiness(frame.scan.end_ns, posterior)
+        warnings += self._steadiness(frame, update)
         warnings += self._pushes(frame, correction, update)
         suspicious = (
             (self._turned > _LEAST_TURN and self._corrected > _SUSPICIOUS_SHARE * self._turned)
@@ -229,12 +229,15 @@ class Consistency:
             self._innovation_text = text
         return [text]
 
-    def _steadiness(self, end_ns: int, posterior: Posterior) -> list[str]:
+    def _steadiness(self, frame: Frame, update: MountedUpdate) -> list[str]:
         """Whether the gyroscope's bias is where it was known to be."""
-        if not posterior.valid:
+        posterior = update.posterior
+        # Between few samples the turn is anybody's guess, and a bias takes it up.
+        if not posterior.valid or len(frame.imu) < _FEWEST_SAMPLES:
             return []
-        variance = np.diagonal(posterior.cov)[T_BW : T_BW + 3]
-        return self._contradicting("steady", self._steady.update(end_ns, posterior.x[BW : BW + 3], variance))
+        whole, known = (np.diagonal(P)[T_BW : T_BW + 3] for P in (posterior.cov, update.cov))
+        bias, by_mounting = posterior.x[BW : BW + 3], np.maximum(whole - known, 0.0)
+        return self._contradicting("steady", self._steady.update(frame.scan.end_ns, bias, known, by_mounting))
 
     def _pushes(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
         """Whether the corrections of the velocity are as white as noise is."""

@@ -4,6 +4,9 @@ What a filter knows of a constant shrinks: of the difference between two of its 
 what the constant walks in between. A bias that moves by many times as much was never known so well. So it is where a start took
 turns for a bias that the LiDAR alone did not see rightly, among trunks with few rings, say: the map of the first seconds is
 tilted then, and later scans only fit what lies there, surer of themselves from scan to scan.
+
+P is with the mounting known. Where it is not, the bias moves with what the mounting is taken for, and how it does changes with
+the motion: by no more than what both estimates owe to the mounting, and that shrinks with nothing the filter learns of the bias.
 """
 
 from __future__ import annotations
@@ -27,21 +30,25 @@ class SteadyBias:
 
     def __init__(self, walk: float) -> None:
         self._walk, self._apart_s = walk, _APART_S
-        self._time_s, self._bias, self._variance = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+        self._time_s, self._kept = np.zeros(0), np.zeros((0, 3, 3))
 
-    def update(self, time_ns: int, bias: NDArray[np.float64], variance: NDArray[np.float64]) -> str | None:
+    def update(
+        self, time_ns: int, bias: NDArray[np.float64], variance: NDArray[np.float64], by_mounting: NDArray[np.float64]
+    ) -> str | None:
         """Take the estimate after a scan in; a sentence where it has left an earlier one.
 
         Args:
-            bias: (3,) [rad/s]; variance: (3,) of it.
+            bias: (3,) [rad/s]; variance: (3,) of it with the mounting known; by_mounting: (3,) what an unknown one adds to it.
         """
         now = time_ns * 1e-9
         since = (now - self._time_s)[:, None]
-        moved = np.abs(bias - self._bias)
-        allowed = np.sqrt(np.maximum(self._variance * (1.0 + _ROUGHLY**2) - variance, 0.0) + self._walk**2 * since)
+        bias_before, variance_before, by_mounting_before = self._kept.swapaxes(0, 1)
+        moved = np.abs(bias - bias_before)
+        learnt = np.maximum(variance_before * (1.0 + _ROUGHLY**2) - variance, 0.0)
+        allowed = np.sqrt(learnt + self._walk**2 * since + by_mounting_before + by_mounting)
         off = np.where(moved > _LEAST, moved / np.maximum(allowed, 1e-12), 0.0)
         if not len(off) or now - self._time_s[-1] >= self._apart_s:
-            self._keep(now, bias, variance)
+            self._keep(now, np.stack([bias, variance, by_mounting]))
         if off.max(initial=0.0) < _SIGMAS:
             return None
         row, axis = np.unravel_index(np.argmax(off), off.shape)
@@ -51,9 +58,8 @@ class SteadyBias:
             "than right, at its start above all; poses may be off, and the map tilted, by far more than their covariance says"
         )
 
-    def _keep(self, now: float, bias: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+    def _keep(self, now: float, estimate: NDArray[np.float64]) -> None:
         if len(self._time_s) == _MOST:
-            self._time_s, self._bias, self._variance = self._time_s[::2], self._bias[::2], self._variance[::2]
+            self._time_s, self._kept = self._time_s[::2], self._kept[::2]
             self._apart_s *= 2.0
-        self._time_s = np.append(self._time_s, now)
-        self._bias, self._variance = np.vstack([self._bias, bias]), np.vstack([self._variance, variance])
+        self._time_s, self._kept = np.append(self._time_s, now), np.concatenate([self._kept, estimate[None]])

@@ -22,7 +22,7 @@ def followed(seed: int, sigma: float, off: float, seconds: float = 60.0) -> list
         P = P + WALK**2 / RATE_HZ
         gain = P / (P + noise**2)
         x, P = x + gain * (bias + noise * rng.standard_normal(3) - x), (1.0 - gain) * P
-        told += filter(None, [steady.update(k * 10**9 // RATE_HZ, x, P)])
+        told += filter(None, [steady.update(k * 10**9 // RATE_HZ, x, P, np.zeros(3))])
     return told
 
 
@@ -41,6 +41,18 @@ def test_estimates_of_hours_ago_are_remembered_and_few() -> None:
     steady = SteadyBias(1e-6)
     known = np.full(3, 1e-8)
     for k in range(20_000):
-        assert steady.update(k * 10**8, np.zeros(3), known) is None
+        assert steady.update(k * 10**8, np.zeros(3), known, np.zeros(3)) is None
     assert len(steady._time_s) <= 64 and steady._time_s[0] == 0.0
-    assert "about y has moved by 0.57 deg/s" in (steady.update(20_000 * 10**8, np.array([0.0, 0.01, 0.0]), known) or "")
+    assert "about y has moved by 0.57 deg/s" in (
+        steady.update(20_000 * 10**8, np.array([0.0, 0.01, 0.0]), known, np.zeros(3)) or ""
+    )
+
+
+def test_a_bias_that_moves_with_an_unknown_mounting_is_not_spoken_of_but_beyond_it() -> None:
+    # As the platform moves on, the bias owes more to the mounting: its whole variance grows, where that of the rest falls.
+    steady, told = SteadyBias(WALK), []
+    for k in range(20):
+        known, by_mounting = np.full(3, 0.004**2 / (1 + k)), np.full(3, (0.0005 * k) ** 2)
+        told.append(steady.update(k * 10**8, np.full(3, 0.0006 * k), known, by_mounting))
+    assert not any(told)
+    assert steady.update(2 * 10**9, np.full(3, 0.1), known, by_mounting)
