@@ -115,6 +115,15 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     )
     assert verdict(absent, unknown).verdict == "silent"
     assert verdict(absent, unknown, source="identity").verdict == "flagged"
+    vague = "by its own covariance the run knows its last position to 2.5 m (1 sigma) only, after a way of 80 m: {}"
+    of_it = vague.format("T_imu_lidar was known to 1.8 deg and 14 cm at first (better: --T-imu-lidar)")
+    assert verdict(absent, of_it).verdict == "silent" and verdict(faulty, of_it).verdict == "flagged"
+    assert verdict(absent, of_it + ", and 5 of 40 scans left directions open").verdict == "flagged"
+    unshown = replace(sound, kinds=replace(sound.kinds, extrinsic="absent"))
+    assumed = "nobody gave T_imu_lidar, and the motion did not show it: the identity was assumed"
+    assert verdict(unshown, contradiction=assumed, source="identity").false_alarm == ""
+    assert verdict(unshown, contradiction=assumed, source="estimated").false_alarm == "flagged"
+    assert verdict(sound, contradiction=assumed, source="identity").false_alarm == "flagged"
     assert judge.judge(judge.Outcome(2, "IMU stamps 100 ms apart"), None, faulty).verdict == "right cause"
     refused = judge.judge(judge.Outcome(2, "no start was found"), None, sound)
     assert (refused.verdict, refused.false_alarm) == ("flagged", "flagged")

@@ -16,6 +16,9 @@ That scans are `weak` or `lost` counts as a flag when at least half of the error
 Where a place is featureless, nothing tells rest from a constant speed. That a run says so is no false alarm as long as it says
 nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it. Nor is it one
 that a run refuses there because the surroundings do not show how the platform moves.
+
+Where nobody gave the mounting, it is no news that it is unknown, nor how much of the position is for that reason; and a run that
+takes the identity for it because no motion shows it, says so and is wrong for it, has not raised a false alarm.
 """
 
 from __future__ import annotations
@@ -65,7 +68,9 @@ _OPTION_CAUSES = {
     "point_time_unit": r"point.time|unit of the point times|points of a scan span",
     "point_time_reference": r"point.time|scan_end|scan_start|reference|" + _CLOCKS,
 }
-_UNKNOWN_MOUNTING = re.compile(r"^neither --T-imu-lidar")
+_UNKNOWN_MOUNTING = re.compile(
+    r"^neither --T-imu-lidar|^by its own covariance the run knows its last.*: T_imu_lidar was known to [^,]* at first \([^,]*\)$"
+)
 _WEAK = re.compile(r"scans are weak")
 _NOT_SHOWN = re.compile(
     r"^the surroundings do not show whether the platform moves along|^by its own covariance the run knows its last"
@@ -246,10 +251,11 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
     weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
     said = _NOT_SHOWN if outcome.error is None else _REFUSED_FOR_IT
     nothing_shown = draw.featureless and all(said.search(text) for text in flags) and (weak or "covariance" not in reasons)
-    false_alarm = "" if not sound else "flagged" if flags and not nothing_shown else "weak" if falsely_weak else ""
+    guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
+    with_reason = nothing_shown or (guessed and bool(reasons))
+    false_alarm = "" if not sound else "flagged" if flags and not with_reason else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
-    guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)
     if flags or weak or guessed:
