@@ -115,8 +115,8 @@ class Health:
             )
         if self._imu_ratio > _IMU_RATIO:
             sentences.append(
-                f"the IMU disagrees with the cameras by {self._imu_ratio:.1f} times what its noise explains: check its noise, "
-                "its clock, and how the cameras are mounted"
+                f"the IMU disagrees with the cameras: what is left between them is {self._imu_ratio:.2f} times what its noise "
+                f"explains, where {_IMU_RATIO:g} is the most: check its noise, its clock, and how the cameras are mounted"
             )
         if self._fit_ratio > _FIT_RATIO:
             sentences.append(
