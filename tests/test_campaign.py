@@ -106,6 +106,7 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
 
     assert verdict(faulty).verdict == "silent"
     assert verdict(faulty, "5 of 40 scans are weak; the longest stretch …").verdict == "silent"
+    assert verdict(faulty, "45 of the 125 scans that were read have no pose: …").verdict == "silent"
     assert verdict(faulty, estimate=estimate_of(simulation, 3.0, weak=True)).verdict == "flagged"
     assert verdict(faulty, "accelerometer x saturated").verdict == "flagged"
     assert verdict(faulty, contradiction="their clocks differ by 100 ms").verdict == "right cause"

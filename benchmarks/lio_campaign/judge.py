@@ -71,7 +71,7 @@ _OPTION_CAUSES = {
 _UNKNOWN_MOUNTING = re.compile(
     r"^neither --T-imu-lidar|^by its own covariance the run knows its last.*: T_imu_lidar was known to [^,]* at first \([^,]*\)$"
 )
-_WEAK = re.compile(r"scans are weak")
+_WEAK = re.compile(r"scans are weak|scans that were read have no pose")
 _NOT_SHOWN = re.compile(
     r"^the surroundings do not show whether the platform moves along|^by its own covariance the run knows its last"
 )
@@ -205,7 +205,7 @@ def _mahalanobis(e: NDArray[np.float64], P: NDArray[np.float64]) -> NDArray[np.f
 def flags_of(outcome: Outcome, draw: Drawn) -> list[str]:
     """What tells the user that something is wrong.
 
-    That the mounting is unknown is no news to one who did not give it; that some scans are weak says something about these only.
+    That the mounting is unknown is no news to one who did not give it; that some scans are weak or before a start says something about these only.
     """
     flags = [outcome.error] if outcome.error else []
     summary = outcome.summary

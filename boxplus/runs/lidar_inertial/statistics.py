@@ -15,6 +15,8 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 
+_LATE_S, _FEW_SCANS = 1.0, 10  # a start in motion may take as long, and a second without a path is not missed
+
 
 class RunStatistics(EstimateStatistics):
     """Counts of scans, beside those of any run."""
@@ -75,17 +77,23 @@ class RunStatistics(EstimateStatistics):
         return [WarningFacts(text=text, count=1)]
 
     def late_start_warnings(self, unstarted: int) -> list[WarningFacts]:
-        """A warning where the path begins later than what was read.
+        """A warning where the path begins more than a second later than what was read, or anew later than a gap of it ended.
 
         Args:
             unstarted: scans that were left without a pose, as no start could be found that early.
         """
-        if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
+        if self.first_time_ns is None or self._first_scan_ns is None:
+            return []
+        late_s = (self.first_time_ns - self._first_scan_ns) * 1e-9
+        if unstarted and late_s > _LATE_S:
+            where = f"path and map begin {late_s:.1f} s after the first scan"
+        elif unstarted > _FEW_SCANS:
+            where = "it took so long to begin anew after a gap"
+        else:
             return []
         text = (
-            f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, path and map "
-            f"begin {(self.first_time_ns - self._first_scan_ns) * 1e-9:.1f} s after the first scan; let a recording start at "
-            "rest, or where walls are near"
+            f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, {where}; let a "
+            "recording start at rest, or where walls are near"
         )
         return [WarningFacts(text=text, count=1)]
 
