@@ -205,7 +205,8 @@ def _mahalanobis(e: NDArray[np.float64], P: NDArray[np.float64]) -> NDArray[np.f
 def flags_of(outcome: Outcome, draw: Drawn) -> list[str]:
     """What tells the user that something is wrong.
 
-    That the mounting is unknown is no news to one who did not give it; that some scans are weak or before a start says something about these only.
+    That the mounting is unknown is no news to one who did not give it; that some scans are weak, or before a start, says
+    something about these only.
     """
     flags = [outcome.error] if outcome.error else []
     summary = outcome.summary
