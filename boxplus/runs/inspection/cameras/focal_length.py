@@ -2,7 +2,9 @@
 
 With a focal length that is stated 1/(1 + ε) times as long as it is, corners lie 1 + ε times as far from the principal point as
 they should, and a turn about an axis in the image looks 1 + ε times as large; one about the optical axis looks the same. ε is
-where the directions of corners, drawn to the principal point by it, fit best to the gyroscope's turns (`known_turns.py`).
+where the directions of corners, drawn to the principal point by it, fit best to the gyroscope's turns (`known_turns.py`). Their
+noise is one of pixels: directions drawn together have less of it, and would fit the better the longer the focal length, so that
+misfits are counted in pixels.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def estimate_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> t
     for epsilon in longer:
         rays = np.split(model.bearings(centre + pixels / (1.0 + epsilon))[0], ends)
         costs.append([pair.misfit(rays[2 * k], rays[2 * k + 1], camera.readout_s) for k, pair in enumerate(pairs)])
-    return best_of(longer, np.array(costs))
+    return best_of(longer, np.array(costs) * (1.0 + longer[:, None]) ** 2)
 
 
 def check_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> Evidence:
