@@ -15,7 +15,7 @@ import numpy as np
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
-from boxplus.runs.inspection.cameras.known_turns import FEWEST_PAIRS, KnownTurn, best_of
+from boxplus.runs.inspection.cameras.known_turns import FEWEST_PAIRS, KnownTurn, best_of, end_behind
 
 _SHORTEST, _LONGEST, _STEP = -0.28, 0.36, 0.04
 _FEWEST_CORNERS = 20
@@ -24,7 +24,10 @@ _SURE = 5.0
 
 
 def estimate_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> tuple[float, float] | None:
-    """ε and its standard deviation; None where there are too few corners, nothing that turns, or it is beyond the search."""
+    """ε and its standard deviation; None where there are too few corners, or nothing that turns.
+
+    Where ε is beyond what is looked at, that end of it, and an infinite standard deviation.
+    """
     if camera.model is None or not turns:
         return None
     model, centre = camera.model, np.array([camera.model.cx, camera.model.cy])
@@ -42,7 +45,10 @@ def estimate_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> t
     for epsilon in longer:
         rays = np.split(model.bearings(centre + pixels / (1.0 + epsilon))[0], ends)
         costs.append([pair.misfit(rays[2 * k], rays[2 * k + 1], camera.readout_s) for k, pair in enumerate(pairs)])
-    return best_of(longer, np.array(costs) * (1.0 + longer[:, None]) ** 2)
+    in_pixels = np.array(costs) * (1.0 + longer[:, None]) ** 2
+    if (end := end_behind(longer, in_pixels)) is not None:
+        return end, np.inf
+    return best_of(longer, in_pixels)
 
 
 def check_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> Evidence:
@@ -52,13 +58,15 @@ def check_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> Evid
         text = "the camera turns too little, or too few corners agree: its focal length is not compared with the gyroscope"
         return Evidence(key, "unchecked", "ok", text)
     epsilon, sigma = found
-    text = (
-        "share by which the focal length would have to be longer for corners to agree best with the gyroscope, standard "
-        f"deviation {100.0 * sigma:.1f} %"
+    text = "share by which the focal length would have to be longer for corners to agree best with the gyroscope"
+    value, advice = f"{100.0 * epsilon:+.1f} %", (
+        ": check focal length and distortion, whether images were scaled or cropped since the camera was calibrated, and the scale "
+        "of the gyroscope"
     )
+    if np.isinf(sigma):
+        beyond = f"beyond what is looked at, {100.0 * _SHORTEST:+.0f} to {100.0 * _LONGEST:+.0f} %"
+        return Evidence(key, f"beyond {100.0 * epsilon:+.0f} %", "warning", f"{text}, {beyond}{advice}")
+    text += f", standard deviation {100.0 * sigma:.1f} %"
     if abs(epsilon) <= max(_SMALL, _SURE * sigma):
-        return Evidence(key, f"{100.0 * epsilon:+.1f} %", "ok", text)
-    text += (
-        ": check the focal length, whether images were scaled or cropped since it was calibrated, and the scale of the gyroscope"
-    )
-    return Evidence(key, f"{100.0 * epsilon:+.1f} %", "warning", text)
+        return Evidence(key, value, "ok", text)
+    return Evidence(key, value, "warning", text + advice)
