@@ -72,8 +72,8 @@ def alignment_doubts(
         doubts.append(w_first)
     elif alignment.kind == "none" and turn > _CONSTANT_DEG and _are_worlds(association, world, scatter, in_one_world):
         doubts.append(
-            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same, and "
-            "all errors but the relative ones contain that; --align se3 lays one over the other"
+            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same, "
+            "and all errors but the relative ones contain that; --align se3 lays one over the other"
         )
     elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]

@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 
+from boxplus._words import either
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
@@ -82,8 +83,9 @@ class RunStatistics(EstimateStatistics):
         """
         if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
             return []
+        have = either(unstarted, "has", "have")
         text = (
-            f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, path and map "
+            f"{unstarted} of the {self.scans_read} scans that were read {have} no pose: no start was found sooner, path and map "
             f"begin {(self.first_time_ns - self._first_scan_ns) * 1e-9:.1f} s after the first scan; let a recording start at "
             "rest, or where walls are near"
         )

@@ -88,6 +88,7 @@ def test_scans_without_a_pose_are_told(unstarted: int) -> None:
     told = statistics.late_start_warnings(unstarted)
     assert len(told) == (1 if unstarted else 0)
     if told:
+        assert statistics.late_start_warnings(1)[0].text.startswith("1 of the 80 scans that were read has no pose: ")
         assert told[0].text.startswith("65 of the 80 scans that were read have no pose: no start was found sooner, ")
         assert "begin 6.5 s after the first scan" in told[0].text
 

@@ -59,14 +59,14 @@ def check_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> Evid
         return Evidence(key, "unchecked", "ok", text)
     epsilon, sigma = found
     text = "share by which the focal length would have to be longer for corners to agree best with the gyroscope"
-    value, advice = f"{100.0 * epsilon:+.1f} %", (
-        ": check focal length and distortion, whether images were scaled or cropped since the camera was calibrated, and the scale "
-        "of the gyroscope"
+    advice = (
+        ": check focal length and distortion, whether images were scaled or cropped since the camera was calibrated, and the "
+        "scale of the gyroscope"
     )
     if np.isinf(sigma):
         beyond = f"beyond what is looked at, {100.0 * _SHORTEST:+.0f} to {100.0 * _LONGEST:+.0f} %"
         return Evidence(key, f"beyond {100.0 * epsilon:+.0f} %", "warning", f"{text}, {beyond}{advice}")
-    text += f", standard deviation {100.0 * sigma:.1f} %"
+    value, text = f"{100.0 * epsilon:+.1f} %", f"{text}, standard deviation {100.0 * sigma:.1f} %"
     if abs(epsilon) <= max(_SMALL, _SURE * sigma):
         return Evidence(key, value, "ok", text)
     return Evidence(key, value, "warning", text + advice)
