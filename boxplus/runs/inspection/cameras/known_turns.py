@@ -150,7 +150,8 @@ def end_behind(values: Floats, costs: Floats) -> float | None:
 def _weighed(costs: Floats) -> Floats:
     """Costs (V, P) by what is left of each pair at its best, so that none with a wrong corner outvotes the others."""
     least = costs.min(axis=0)
-    return costs / np.maximum(least, np.median(least))
+    weighed: Floats = costs / np.maximum(least, np.median(least))
+    return weighed
 
 
 def _optimum(values: Floats, total: Floats) -> float:
