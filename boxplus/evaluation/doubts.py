@@ -66,14 +66,14 @@ def alignment_doubts(
     loose = _loose(association.ground_truth, alignment, rmse, wide)
     w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
     world = _world_turn(association.estimate, association.ground_truth)
+    turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
     in_one_world = _scatter_deg(world @ association.estimate.R, association.ground_truth.R)
     if w_first is not None:
         doubts.append(w_first)
-    elif alignment.kind == "none" and scatter > _CONSTANT_DEG and in_one_world < _CLEARLY * scatter:
-        turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
+    elif alignment.kind == "none" and turn > _CONSTANT_DEG and _are_worlds(association, world, scatter, in_one_world):
         doubts.append(
-            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same: "
-            "all errors but the relative ones contain that; --align lays one over the other"
+            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same, "
+            "and all errors but the relative ones contain that; --align se3 lays one over the other"
         )
     elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
@@ -83,6 +83,23 @@ def alignment_doubts(
             f"given, for this rotation with --transform-right 'xyz_qxyzw: 0 0 0 {x:.5f} {y:.5f} {z:.5f} {w:.5f}'"
         )
     return doubts
+
+
+def _are_worlds(association: Association, world: NDArray[np.float64], scatter: float, in_one_world: float) -> bool:
+    """Whether orientations differ by a turn of the world, not of the body.
+
+    Of a body that turns about one axis, as a car does, or not at all, both read alike: there the positions decide.
+
+    Args:
+        world: (3, 3) of the estimate's world to the true one. scatter, in_one_world: without and with that turn [deg].
+    """
+    if scatter > _CONSTANT_DEG and in_one_world < _CLEARLY * scatter:
+        return True
+    if in_one_world > max(scatter, _CONSTANT_DEG):
+        return False
+    estimate, truth = (x.p - x.p.mean(axis=0) for x in (association.estimate, association.ground_truth))
+    as_read, turned = (rms(np.linalg.norm(truth - estimate @ R.T, axis=1)) for R in (np.eye(3), world))
+    return turned < _CLEARLY * as_read
 
 
 def _loose(truth: Trajectory, alignment: Alignment, rmse: float, wide: float) -> NDArray[np.float64]:

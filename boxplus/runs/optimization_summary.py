@@ -90,7 +90,8 @@ class OptimizationSummary(_Part):
     doubt: str | None = Field(None, description="why the result is not to be trusted; the exit code is then 3")
     timing_s: dict[str, float]
     is_last_of_several: bool = Field(
-        False, description="cost_initial, history and timing_s but for its `optimisation` are of the last of several solves"
+        False,
+        description="cost_initial, history and timing_s but for its `start` and `optimisation` are of the last of several solves",
     )
     history: list[IterationFacts]
 

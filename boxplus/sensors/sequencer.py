@@ -44,6 +44,8 @@ class Frame:
 
 BEFORE_START = "scan before a start could be found"
 """Why an odometry that could not begin gave up a scan, among what was rejected."""
+AFTER_GAP = "scan after a gap, before another start could be found"
+"""The same of one that could not go on."""
 
 
 class Sequencer:

@@ -55,6 +55,21 @@ def test_worlds_that_were_not_laid_over_each_other_are_no_other_columns():
     assert "the orientations differ by 130.0° in the world (scatter 0.0°): the worlds are not the same" in said
 
 
+@pytest.mark.parametrize("swing", [0.0, 1.0], ids=["straight on", "as a car"])
+@pytest.mark.parametrize("heading_deg", [8.0, 130.0])
+def test_of_a_body_that_turns_about_one_axis_positions_tell_worlds_from_bodies(swing, heading_deg):
+    """A car with a heading of its own was told that its body frame is another, with --transform-right to mend that."""
+    truth = path()
+    R = so3.exp(swing * np.sin(0.02 * np.arange(len(truth.time_ns)))[:, None] * [0.0, 0.0, 2.0])
+    turn = so3.exp(np.radians([[0.0, 0.0, heading_deg]]))[0]
+    body = moved(truth, truth.p, R)
+    said = " // ".join(evaluate(moved(truth, truth.p @ turn, turn.T @ R), body, alignment="none").warnings)
+    assert f"differ by {heading_deg:.1f}° in the world (scatter 0.0°): the worlds are not the same" in said
+    assert "body frames are not the same" not in said and "reorder the columns" not in said
+    said = " // ".join(evaluate(moved(truth, truth.p, R @ turn), body, alignment="none").warnings)
+    assert "the body frames are not the same" in said and "worlds are not the same" not in said
+
+
 @pytest.mark.parametrize("alignment", ["none", "yaw", "se3", "sim3"])
 @pytest.mark.parametrize("change", [lambda p: p * [1, -1, 1], lambda p: p * [1, 1, -1], lambda p: p[:, [1, 0, 2]]])
 def test_a_mirrored_path_is_told(change, alignment):

@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 
+from boxplus._words import either
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
@@ -15,7 +16,7 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 
-_LATE_S, _FEW_SCANS = 1.0, 10  # a start in motion may take as long, and a second without a path is not missed
+_LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
 
 
 class RunStatistics(EstimateStatistics):
@@ -77,23 +78,20 @@ class RunStatistics(EstimateStatistics):
         return [WarningFacts(text=text, count=1)]
 
     def late_start_warnings(self, unstarted: int) -> list[WarningFacts]:
-        """A warning where the path begins more than a second later than what was read, or anew later than a gap of it ended.
+        """A warning where the path begins more than a second later than what was read.
 
         Args:
             unstarted: scans that were left without a pose, as no start could be found that early.
         """
-        if self.first_time_ns is None or self._first_scan_ns is None:
+        if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
             return []
         late_s = (self.first_time_ns - self._first_scan_ns) * 1e-9
-        if unstarted and late_s > _LATE_S:
-            where = f"path and map begin {late_s:.1f} s after the first scan"
-        elif unstarted > _FEW_SCANS:
-            where = "it took so long to begin anew after a gap"
-        else:
+        if late_s <= _LATE_S:
             return []
         text = (
-            f"{unstarted} of the {self.scans_read} scans that were read have no pose: no start was found sooner, {where}; let a "
-            "recording start at rest, or where walls are near"
+            f"{unstarted} of the {self.scans_read} scans that were read {either(unstarted, 'has', 'have')} no pose: no start was "
+            f"found sooner, path and map begin {late_s:.1f} s after the first scan; let a recording start at rest, or where "
+            "walls are near"
         )
         return [WarningFacts(text=text, count=1)]
 

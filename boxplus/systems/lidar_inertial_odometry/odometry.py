@@ -22,7 +22,7 @@ from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.sequencer import BEFORE_START, Frame, Sequencer
+from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
@@ -217,7 +217,7 @@ class LidarInertialOdometry(Snapshots):
 
     def _forget(self, oldest: int) -> None:
         """Scans that no start will begin with."""
-        self._sequencer.rejected[BEFORE_START] += self._unstarted.add(self._waiting[: max(oldest, 0)])
+        self._sequencer.rejected[AFTER_GAP if self._gap else BEFORE_START] += self._unstarted.add(self._waiting[: max(oldest, 0)])
         del self._waiting[: max(oldest, 0)]
 
     def _process(self, frame: Frame) -> Estimate:

@@ -25,7 +25,7 @@ from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.sequencer import BEFORE_START, Sequencer
+from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
@@ -169,7 +169,7 @@ class LidarOdometry(Snapshots):
             self.start_problem = found
             keep = 0 if final else _LONGEST_START_SCANS
             forgotten = max(len(self._waiting) - keep, min(1, len(self._waiting)))
-            self._sequencer.rejected[BEFORE_START] += forgotten
+            self._sequencer.rejected[AFTER_GAP if self._gap else BEFORE_START] += forgotten
             del self._waiting[:forgotten]
             self._next_try = len(self._waiting) + 1 + len(self._waiting) // 3
             return []

@@ -383,13 +383,21 @@ def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
 
 
 def test_a_path_that_begins_late_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    counters = property(lambda self: {BEFORE_START: 12})
-    monkeypatch.setattr(LidarInertialOdometry, "counters", counters)
-    summary = run_odometry(walk(1.5), tmp_path / "out")
+    simulation = simulate("walk", duration_s=3.6, lidar=LIDAR)
+    begin_ns = simulation.start_ns + 2_200_000_000
+
+    def without_first_samples(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            if isinstance(event, Scan):
+                yield event
+            elif (later := event.time_ns >= begin_ns).any():
+                yield ImuSamples(event.time_ns[later], event.gyro[later], event.accel[later])
+
+    monkeypatch.setattr(LidarInertialOdometry, "counters", property(lambda self: {BEFORE_START: 15}))
+    recording = as_recording(simulation, Fault("late", "the IMU begins late", without_first_samples))
+    summary = run_odometry(recording, tmp_path / "out")
     (told,) = [warning.text for warning in summary.warnings if "have no pose" in warning.text]
-    assert told.startswith(
-        "12 of the 14 scans that were read have no pose: no start was found sooner, it took so long to begin anew"
-    )
+    assert re.match(r"15 of the \d\d scans that were read have no pose: no start .* begin 1\.\d s after the first scan", told)
 
 
 def test_a_lidar_alone(tmp_path: Path) -> None:

@@ -109,19 +109,32 @@ def test_settings_of_an_imu_are_refused() -> None:
     assert alone == LidarOdometryConfig(max_points=1000, threads=2) and type(alone) is LidarOdometryConfig
 
 
-def test_scans_that_cannot_be_used_are_counted() -> None:
+def _of_noise(begin_ns: int, count: int) -> list[Scan]:
     random = np.random.default_rng(0)
-    odometry = LidarOdometry()
-    noise = [
+    return [
         Scan(
             random.normal(0, 10, (2000, 3)).astype(np.float32),
-            np.linspace(0, 99_000_000, 2000).astype(np.int64) + k * 100_000_000,
+            np.linspace(0, 99_000_000, 2000).astype(np.int64) + start_ns,
             None,
-            k * 100_000_000,
-            k * 100_000_000 + 99_000_000,
+            start_ns,
+            start_ns + 99_000_000,
         )
-        for k in range(12)
+        for start_ns in (begin_ns + k * 100_000_000 for k in range(count))
     ]
+
+
+def test_scans_that_find_no_start_after_a_gap_are_none_before_the_path() -> None:
+    """A run said of them that path and map begin so late, 0.0 s after the first scan."""
+    simulation = simulate("walk", duration_s=3.0, lidar=SPARSE)
+    scans, odometry = _scans(simulation), LidarOdometry()
+    estimates = _run(odometry, [*scans, *_of_noise(simulation.end_ns + 2_000_000_000, 12)])
+    assert len(estimates) == len(scans) and odometry.contradiction is not None
+    after = {"scan jumping ahead in time": 10, "scan after a gap, before another start could be found": 2}
+    assert odometry.counters == after
+
+
+def test_scans_that_cannot_be_used_are_counted() -> None:
+    odometry, noise = LidarOdometry(), _of_noise(0, 12)
     assert _run(odometry, [noise[0], *noise]) == []
     assert odometry.start is None and odometry.start_problem is not None
     assert odometry.counters["scan with a repeated time"] == 1

@@ -84,7 +84,9 @@ class Comparison:
         camera = self._pictures[0]
         aligned = align(self.turns, imu)
         found = check_rotation(camera, aligned)
-        if not isinstance(aligned, str) and camera.model is not None and not any(e.value == "unlike" for e in found):
+        if isinstance(aligned, str) or camera.model is None or any(e.value == "unlike" for e in found):
+            return found
+        if np.isfinite(aligned.offset_std_s):  # otherwise the clocks are so far apart that no turn is known
             turns = known_turns(camera, self.turns, imu, aligned)
             found += [check_readout(camera, turns), check_focal_length(camera, turns)]
         return found

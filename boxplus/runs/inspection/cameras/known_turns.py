@@ -26,6 +26,7 @@ _MARGIN_S = 0.04  # of IMU samples on both sides of two images
 _FEWEST_CORNERS = 40
 _MOST_CORNERS = 120
 _PARTS = 10
+_SURE = 5.0  # standard deviations
 
 FEWEST_PAIRS = 30
 """Of images, that tell something."""
@@ -118,8 +119,7 @@ def best_of(values: Floats, costs: Floats) -> tuple[float, float] | None:
     Args:
         values: (V,) evenly spaced; costs: (V, P) misfits of every pair.
     """
-    # Pairs are weighed by what is left of them at their best, so that none with a wrong corner outvotes the others.
-    costs = costs / np.maximum(costs.min(axis=0), np.median(costs.min(axis=0)))
+    costs = _weighed(costs)
     total = costs.sum(axis=1)
     best, step = int(np.argmin(total)), float(values[1] - values[0])
     if not 0 < best < len(values) - 1:
@@ -131,6 +131,27 @@ def best_of(values: Floats, costs: Floats) -> tuple[float, float] | None:
     parts = [_optimum(values, costs[:, k::_PARTS].sum(axis=1)) for k in range(_PARTS)]
     std = float(1.4826 * np.median(np.abs(np.array(parts) - np.median(parts)))) / np.sqrt(_PARTS)
     return _optimum(values, total), max(std, float(np.sqrt(2.0 / curvature)) * step)
+
+
+def end_behind(values: Floats, costs: Floats) -> float | None:
+    """The end of the values, 0 among them, behind which lies what fits all pairs best; None where that is not sure.
+
+    Every part of the pairs has to say so by itself, and all of them far more than noise explains that 0 does not fit.
+    """
+    costs = _weighed(costs)
+    total = costs.sum(axis=1)
+    end = float(values[np.argmin(total)])
+    if end not in (values[0], values[-1]) or total[np.argmin(np.abs(values))] - total.min() < _SURE**2:
+        return None
+    parts = [values[np.argmin(costs[:, k::_PARTS].sum(axis=1))] / end for k in range(_PARTS)]
+    return end if min(parts) > 0.5 else None
+
+
+def _weighed(costs: Floats) -> Floats:
+    """Costs (V, P) by what is left of each pair at its best, so that none with a wrong corner outvotes the others."""
+    least = costs.min(axis=0)
+    weighed: Floats = costs / np.maximum(least, np.median(least))
+    return weighed
 
 
 def _optimum(values: Floats, total: Floats) -> float:

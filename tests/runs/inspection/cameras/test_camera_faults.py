@@ -12,6 +12,7 @@ import pytest
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.cameras.focal_length import check_focal_length, estimate_focal_length
 from boxplus.runs.inspection.cameras.known_turns import known_turns
@@ -60,7 +61,9 @@ def seen(
     return pixels, inside
 
 
-def turning(seed: int, readout_s: float, lens: LensKind = "radtan") -> tuple[CameraSimulation, Turns, ImuSamples]:
+def turning(
+    seed: int, readout_s: float, lens: LensKind = "radtan", noise_px: float = NOISE_PX
+) -> tuple[CameraSimulation, Turns, ImuSamples]:
     """Corners of a moving camera and the samples of its gyroscope, without images."""
     simulation = simulate_cameras("room_moving", seed, duration_s=12.0, rig=make_rig("stereo", lens, 0.5))
     random = np.random.default_rng(seed)
@@ -75,7 +78,7 @@ def turning(seed: int, readout_s: float, lens: LensKind = "radtan") -> tuple[Cam
         both = np.flatnonzero(in_first & in_second)[:150]
         R = simulation.T_world_camera(0, [begin_ns, end_ns])[:, :3, :3]
         R_2_1 = R[1].T @ R[0]
-        noise = random.normal(0.0, NOISE_PX, (2, len(both), 2))
+        noise = random.normal(0.0, noise_px, (2, len(both), 2))
         turns.add(begin_ns, end_ns, R_2_1, before[both] + noise[0], after[both] + noise[1])
     return simulation, turns, simulation.imu.samples(simulation.start_ns, simulation.end_ns, 0)
 
@@ -119,7 +122,7 @@ def test_a_wrong_focal_length_is_told_from_how_far_the_gyroscope_turns(seed: int
     epsilon, sigma = found
     assert abs(epsilon - (1.0 / factor - 1.0)) < 4.0 * sigma + 0.005 and sigma < 0.01
     said = check_focal_length(camera, known)
-    assert (said.verdict == "warning") == ("check the focal length" in said.text) == (factor != 1.0)
+    assert (said.verdict == "warning") == ("check focal length" in said.text) == (factor != 1.0)
     assert check_readout(camera, known).verdict == "ok"  # one is not taken for the other
     assert check_focal_length(camera, known[:20]).value == "unchecked"
 
@@ -131,6 +134,44 @@ def test_a_rolling_shutter_is_no_focal_length() -> None:
     aligned = align(turns, imu)
     assert not isinstance(aligned, str)
     assert check_focal_length(camera, known_turns(camera, turns, imu, aligned)).verdict == "ok"
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.6])
+def test_a_focal_length_far_off_is_told_too(factor: float) -> None:
+    """MH_05 with a focal length stated 30 % too short was "unchecked", as the camera were turning too little."""
+    simulation, turns, imu = turning(1, 0.0)
+    camera = streams(simulation.scenario.rig)[0]
+    assert camera.model is not None
+    stated = dataclasses.replace(camera.model, fx=factor * camera.model.fx, fy=factor * camera.model.fy)
+    aligned = align(turns, imu)
+    assert not isinstance(aligned, str)
+    camera = dataclasses.replace(camera, model=stated)
+    said = check_focal_length(camera, known_turns(camera, turns, imu, aligned))
+    assert said.verdict == "warning" and said.value == ("beyond +36 %" if factor < 1.0 else "beyond -28 %")
+    assert "beyond what is looked at, -28 to +36 %: check focal length and distortion" in said.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lens", ["radtan", "equidistant"])
+def test_noise_of_corners_is_no_focal_length(lens: LensKind) -> None:
+    """Directions drawn together have less of it: corners good to 1 px asked for a focal length more than a third longer."""
+    simulation, turns, imu = turning(1, 0.0, lens, noise_px=1.0)
+    camera = streams(simulation.scenario.rig)[0]
+    aligned = align(turns, imu)
+    assert not isinstance(aligned, str)
+    found = estimate_focal_length(camera, known_turns(camera, turns, imu, aligned))
+    assert found is not None and abs(found[0]) < 2.0 * found[1] < 0.1
+
+
+def test_turns_that_no_clock_tells_are_not_compared() -> None:
+    """Beyond the offsets looked at, the gyroscope's turns are those of other instants."""
+    simulation, turns, imu = turning(1, 0.0)
+    compared = Comparison(streams(simulation.scenario.rig)[:1], 1)
+    compared.turns = turns
+    asked = ["cam0_imu_time_offset", "R_imu_cam0", "cam0_shutter", "cam0_focal_length"]
+    assert [finding.key for finding in compared.with_imu(imu)] == asked
+    late = dataclasses.replace(imu, time_ns=imu.time_ns + 160_000_000)
+    assert [(finding.key, finding.value) for finding in compared.with_imu(late)] == [(asked[0], "beyond the search")]
 
 
 def pairs(simulation: CameraSimulation) -> Corners:
