@@ -56,4 +56,6 @@ class Saturation:
 
 def _in_a_row(true: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     """(N - count + 1, 6): whether the sample and the `count` - 1 before it are true, from the first with that many before it."""
-    return np.lib.stride_tricks.sliding_window_view(true, count, axis=0).all(axis=-1)
+    windows = np.lib.stride_tricks.sliding_window_view(true, count, axis=0)
+    found: NDArray[np.bool_] = np.logical_and.reduce(windows, axis=-1)
+    return found
