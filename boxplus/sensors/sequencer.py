@@ -16,6 +16,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 _GYRO_LIMIT, _ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
+_EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class Frame:
     Attributes:
         scan: the scan.
         imu: samples from the last one at or before `begin_ns` to the first one at or after the scan's end, where they exist.
-        begin_ns: end of the previous frame (for the first one: start of the scan).
+        begin_ns: end of the previous frame (for the first one: start of the scan, which the samples cover).
         covered: whether a sample at or after the scan's end exists.
         largest_gap_s: longest time between neighbouring samples within (begin_ns, scan.end_ns], ends included.
     """
@@ -215,10 +216,22 @@ class Sequencer:
         if not len(imu):
             self.rejected["scan without any IMU sample"] += 1
             return None
+        if self._last_end_ns is None and self._began_unseen(scan, imu):
+            self.rejected["scan that began before the first IMU sample"] += 1
+            return None
         self._last_end_ns = scan.end_ns
         # A gap that began before the frame, or has not ended yet, is a gap in all of it.
         spans = [int(imu.time_ns[0]) - begin, scan.end_ns - int(imu.time_ns[-1]), int(np.diff(imu.time_ns).max(initial=0))]
         return Frame(scan, imu, begin, covered, max(spans) * 1e-9)
+
+    @staticmethod
+    def _began_unseen(scan: Scan, imu: ImuSamples) -> bool:
+        """Whether nothing tells how the platform moved at the beginning of a scan: as where a recording is read from its middle.
+
+        The map that such a scan begins would be as distorted as it is.
+        """
+        unseen_ns = min(int(imu.time_ns[0]), scan.end_ns) - scan.start_ns
+        return unseen_ns > (_EARLIER * float(np.median(np.diff(imu.time_ns))) if len(imu) > 1 else 0)
 
     def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:
         """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""

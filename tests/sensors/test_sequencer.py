@@ -220,6 +220,31 @@ def _feed(sequencer: Sequencer, begin_ms: float, seconds: float) -> list[Frame]:
     return frames
 
 
+def test_a_first_scan_that_began_before_the_imu_is_no_frame() -> None:
+    sequencer = Sequencer()
+    sequencer.add_scan(_scan(0, 100))
+    sequencer.add_scan(_scan(100, 200))
+    sequencer.add_imu(_imu(*range(100, 206, 5)))  # as where a recording is read from its middle on
+    (frame,) = sequencer.frames()
+    assert (frame.begin_ns, frame.largest_gap_s) == (T0 + 100 * MS, 0.005)
+    assert sequencer.rejected == {"scan that began before the first IMU sample": 1}
+
+
+@pytest.mark.parametrize("first_ms", [5.0, 60.0])
+def test_a_sample_is_held_for_an_interval_and_not_for_half_a_scan(first_ms: float) -> None:
+    sequencer = Sequencer()
+    sequencer.add_imu(_imu(*np.arange(first_ms, 106.0, 5.0)))
+    sequencer.add_scan(_scan(0, 100))
+    assert len(sequencer.frames()) == (first_ms == 5.0)
+
+
+def test_a_first_scan_of_an_instant_asks_for_no_earlier_sample() -> None:
+    sequencer = Sequencer()
+    sequencer.add_scan(_scan(0, 0))
+    sequencer.add_imu(_imu(5))
+    assert len(sequencer.frames()) == 1
+
+
 def test_times_that_step_back_for_good_are_told() -> None:
     sequencer = Sequencer()
     _feed(sequencer, 0.0, 3.0)

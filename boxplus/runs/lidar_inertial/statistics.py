@@ -13,6 +13,7 @@ from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.start.start import WAITING
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 
@@ -77,11 +78,12 @@ class RunStatistics(EstimateStatistics):
         )
         return [WarningFacts(text=text, count=1)]
 
-    def late_start_warnings(self, unstarted: int) -> list[WarningFacts]:
+    def late_start_warnings(self, unstarted: int, refusal: str | None) -> list[WarningFacts]:
         """A warning where the path begins more than a second later than what was read.
 
         Args:
             unstarted: scans that were left without a pose, as no start could be found that early.
+            refusal: why the last of them was none, a sentence.
         """
         if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
             return []
@@ -93,6 +95,8 @@ class RunStatistics(EstimateStatistics):
             f"found sooner, path and map begin {late_s:.1f} s after the first scan; let a recording start at rest, or where "
             "walls are near"
         )
+        if refusal:
+            text += f". Just before: {refusal.removesuffix(WAITING)}"
         return [WarningFacts(text=text, count=1)]
 
     def scan_gaps(self) -> list[Gap]:

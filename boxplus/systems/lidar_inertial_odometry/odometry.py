@@ -76,7 +76,7 @@ class LidarInertialOdometry(Snapshots):
         self.config, self._live = as_settings(LioConfig, config), live
         self.map, self._arrivals = IkdTree(cell_size=self.config.map_cell), FirstArrivals(self.config.map_cell)
         self.start: Start | None = None
-        self.start_problem: str | None = None
+        self.start_problem: str | None = None  # why there was none sooner
         self._sequencer = Sequencer()
         self._waiting: list[Frame] = []
         self._next_try, self._time_ns = 0, 0  # scans that wait, and the instant of the state
@@ -198,7 +198,7 @@ class LidarInertialOdometry(Snapshots):
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
         self._forget(sum(frame.scan.end_ns < found.time_ns for frame in self._waiting))
-        self.start, self.start_problem, self._unstarted = found, None, UnstartedScans(self.config)
+        self.start, self._unstarted = found, UnstartedScans(self.config)
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]

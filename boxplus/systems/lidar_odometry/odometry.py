@@ -74,7 +74,7 @@ class LidarOdometry(Snapshots):
         self.config = config.of_lidar_alone() if isinstance(config, LioConfig) else config
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self.start: LidarStart | None = None
-        self.start_problem: str | None = None
+        self.start_problem: str | None = None  # why there was none sooner
         self._sequencer = Sequencer()
         self._waiting: list[Scan] = []
         self._until_shown = self.config.model_copy(update={"weak_threshold": _SHOWN * self.config.weak_threshold})
@@ -173,7 +173,7 @@ class LidarOdometry(Snapshots):
             del self._waiting[:forgotten]
             self._next_try = len(self._waiting) + 1 + len(self._waiting) // 3
             return []
-        self.start, self.start_problem = found, None
+        self.start = found
         self._state, self._cov = found.motion.last, found.covariance.copy()
         if self._gap is None:
             self._datum = MapDatum(nav_state(self._state).pack(), self._cov, SHARED_ERRORS)

@@ -221,7 +221,10 @@ class Localizer:
         if not at_once:
             before, self._promising = self._promising, T_map_odo
             if before is None or not self._agree(before, T_map_odo, local_map.T_odo_map):
-                return f"not {self.config.decisive:g} times as good as the next place: a second query has to agree"
+                return (
+                    f"not {self.config.decisive:g} times as good as the next place: a second query has to agree, of "
+                    f"{self.config.query_duration:g} s or {self.config.query_length:g} m more"
+                )
         T_map_body = se3.compose(best.T_map_query, T_query_body)
         Ad = se3.adjoint(se3.inverse(T_query_body))
         self._tracker = Tracker(self._map, T_map_body, Ad @ best.covariance @ Ad.T, self.config)

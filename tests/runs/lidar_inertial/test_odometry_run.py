@@ -397,7 +397,7 @@ def test_a_path_that_begins_late_is_told(tmp_path: Path, monkeypatch: pytest.Mon
     recording = as_recording(simulation, Fault("late", "the IMU begins late", without_first_samples))
     summary = run_odometry(recording, tmp_path / "out")
     (told,) = [warning.text for warning in summary.warnings if "have no pose" in warning.text]
-    assert re.match(r"15 of the \d\d scans that were read have no pose: no start .* begin 1\.\d s after the first scan", told)
+    assert re.match(r"15 of the \d\d scans that were read have no pose: no start .* begin 2\.\d s after the first scan", told)
 
 
 def test_a_lidar_alone(tmp_path: Path) -> None:

@@ -85,12 +85,13 @@ def test_scans_without_a_pose_are_told(unstarted: int) -> None:
     assert origin is not None
     statistics.add_event(Scan.from_arrays(np.ones((2, 3)), np.array([-10, 0]) + origin - unstarted * 100_000_000))
     statistics.scans_read = 15 + unstarted
-    told = statistics.late_start_warnings(unstarted)
+    told = statistics.late_start_warnings(unstarted, "not at rest, and one wall says little; waiting for more data")
     assert len(told) == (1 if unstarted == 65 else 0)
     if told:
-        assert statistics.late_start_warnings(1)[0].text.startswith("1 of the 80 scans that were read has no pose: ")
+        assert statistics.late_start_warnings(1, None)[0].text.startswith("1 of the 80 scans that were read has no pose: ")
         assert told[0].text.startswith("65 of the 80 scans that were read have no pose: no start was found sooner, ")
         assert "begin 6.5 s after the first scan" in told[0].text
+        assert told[0].text.endswith("where walls are near. Just before: not at rest, and one wall says little")
 
 
 @pytest.mark.slow

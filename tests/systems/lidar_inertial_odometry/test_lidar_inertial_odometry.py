@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -14,9 +14,12 @@ from hypothesis.extra import numpy as hnp
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import Simulation
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from tests.systems.lidar_inertial_odometry.small_drives import config, position_errors, room_walk, run
 
 MS = 1_000_000
@@ -103,6 +106,38 @@ def test_without_an_imu_nothing_is_invented(events: list[Scan | ImuSamples]) -> 
     scans = [e for e in events if isinstance(e, Scan)]
     assert run(odometry, scans) == []
     assert odometry.counters == {"scan without any IMU sample": len(scans)}
+
+
+def test_read_from_the_middle_it_begins_with_a_scan_that_the_imu_covers(
+    events: list[Scan | ImuSamples], room: Simulation
+) -> None:
+    """Once the map began with a scan undistorted by the one sample after it, and the biases left what was known of them."""
+    scans = [e for e in events if isinstance(e, Scan)]
+    cut_ns = scans[20].end_ns - 5 * MS
+    later = [e for e in events if (e.end_ns if isinstance(e, Scan) else int(e.time_ns[-1])) > cut_ns]
+    late = [
+        e if isinstance(e, Scan) else ImuSamples(*(values[e.time_ns > cut_ns] for values in (e.time_ns, e.gyro, e.accel)))
+        for e in later
+    ]
+    odometry = LidarInertialOdometry(config(room))
+    found = run(odometry, late)
+    assert odometry.counters == {"scan that began before the first IMU sample": 1}
+    assert found[0].time_ns == scans[21].end_ns
+
+
+def test_why_there_was_no_start_sooner_is_kept(
+    events: list[Scan | ImuSamples], room: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries: list[int] = []
+
+    def refused_once(frames: Sequence[Frame], settings: LioConfig) -> Start | str:
+        tries.append(len(frames))
+        return find_start(frames, settings) if len(tries) > 1 else "a wall says little"
+
+    monkeypatch.setattr(f"{LidarInertialOdometry.__module__}.find_start", refused_once)
+    odometry = LidarInertialOdometry(config(room))
+    assert run(odometry, events) and odometry.start is not None
+    assert odometry.start_problem == "a wall says little"
 
 
 def test_without_scans_nothing_is_invented(events: list[Scan | ImuSamples]) -> None:

@@ -55,6 +55,14 @@ def test_a_start_elsewhere_is_found_and_followed(world: World, place_map: KnownM
     assert localizer.losses == 1 and localizer.doubt is None  # nothing speaks against where it was until then
 
 
+def test_one_query_that_has_to_be_borne_out_tells_how_much_more_is_asked(world: World, place_map: KnownMap) -> None:
+    """A recording that ended just before the second query said only that there had to be one."""
+    drive = drive_of(world, [[14, 1.5], [0, 1.5]], seed=5)
+    careful = LocalizationConfig(candidates=5, decisive=1e6, query_length=7.0, query_duration=60.0)
+    verdicts = [one.search.verdict for one in push_all(Localizer(place_map, careful), drive, own_world(drive)) if one.search]
+    assert verdicts[0].endswith("a second query has to agree, of 60 s or 7 m more")
+
+
 @pytest.mark.parametrize("ratio", [1.01, 0.99])
 def test_a_map_of_other_lengths_is_named(world: World, place_map: KnownMap, ratio: float) -> None:
     """A hundredth too long it fits, and once poses in it were given without a word."""

@@ -41,7 +41,8 @@ _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where o
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
-_WAITING = "; waiting for more data"
+WAITING = "; waiting for more data"
+"""How a refusal ends that the next scans may lift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +145,7 @@ class _Beginning:
         return not turns and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
 
     def not_moving(self, why: str) -> _NotYet:
-        return _NotYet(f"not at rest ({self.evidence}), and {why}{_WAITING}")
+        return _NotYet(f"not at rest ({self.evidence}), and {why}{WAITING}")
 
 
 def _check_accelerometer(norm: float) -> None:
@@ -173,11 +174,11 @@ def _first_path(seen: _Beginning) -> LidarPath:
     """How the LiDAR moved, from its scans, unbroken."""
     path = lidar_path(seen.scans, seen.registration, gyro_guesses(seen.imu, seen.extrinsic.R_imu_lidar), unbroken=True)
     if _broken(path) or len(path) < min(len(seen.frames), 3):
-        raise _NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){_WAITING}")
+        raise _NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
     time_ns = seen.imu.time_ns
     within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
     if len(path) < 2 or within < _FEWEST_SAMPLES:
-        raise _NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{_WAITING}")
+        raise _NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{WAITING}")
     return path
 
 
@@ -206,7 +207,7 @@ def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
         else "its unit, its sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little"
     )
     raise _NotYet(
-        f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: {why}{_WAITING}"
+        f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: {why}{WAITING}"
     )
 
 

@@ -1,0 +1,54 @@
+"""A limit that is reached again and again is told; the rounded top of a motion is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.systems.lidar_inertial_odometry.watches.saturation import Saturation
+
+STEP = 0.0081722  # m/s², of the accelerometer that the values below are from
+SCAN = 20  # samples
+
+
+def told(accel_z: NDArray[np.float64]) -> list[str]:
+    """What is said of these values (N,), scan by scan; neighbouring scans share a sample."""
+    saturation = Saturation()
+    accel = np.zeros((len(accel_z), 3))
+    accel[:, 2] = accel_z
+    time_ns = 5_000_000 * np.arange(1, len(accel_z) + 1)
+    found: list[str] = []
+    for k in range(0, len(accel_z) - 1, SCAN):
+        part = slice(k, k + SCAN + 1)
+        found += saturation.update(ImuSamples(time_ns[part], np.zeros((len(time_ns[part]), 3)), accel[part]))
+    return found
+
+
+def vibration(peaks: list[float], limit: float = np.inf) -> NDArray[np.float64]:
+    """One period of 0.1 s after another of these heights over 2 m/s², rounded to steps, clipped."""
+    wave = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(SCAN) / SCAN)
+    return -np.minimum(np.round((2.0 + np.concatenate([height * wave for height in peaks])) / STEP) * STEP, limit)
+
+
+def test_the_rounded_top_of_a_motion_is_no_limit() -> None:
+    z = vibration([1.5, 2.0])
+    # EuRoC MH_05 at 6.2 s: larger than anything in the second before, and the same three times.
+    z[27:33] = [-4.37213146, -4.42116471, -4.52740342, -4.52740342, -4.52740342, -4.47837017]
+    assert not told(z)
+    assert not told(np.concatenate([z, vibration([2.0, 3.0, 3.0])]))
+
+
+@pytest.mark.parametrize("shift", range(0, SCAN, 3))
+def test_a_limit_is_told_when_it_is_reached_again(shift: int) -> None:
+    # For three samples, across the border of scans as well.
+    z = np.concatenate([np.full(shift, -2.0), vibration([2.0, 3.0, 2.0, 3.0], limit=4.9)])
+    assert np.count_nonzero(z == -4.9) == 6
+    assert set(told(z)) == {"accelerometer z saturated at 4.90 m/s²: motion beyond it is not measured, covariance widened"}
+
+
+def test_a_long_plateau_is_told_at_once() -> None:
+    z = vibration([2.0, 6.0], limit=5.5)
+    assert np.count_nonzero(z == -5.5) >= 6
+    assert len(told(z)) == 1
