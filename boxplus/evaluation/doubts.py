@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.association import Association
+from boxplus.evaluation.mean_rotation import mean_rotation, scatter_deg, turned_deg, world_turn
 from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
@@ -60,14 +61,14 @@ def alignment_doubts(
     if alignment.mirrored:
         doubts.append(_MIRROR)
     R = so3.exp(rotation)
-    mean = so3.log(_mean_rotation(R)[None])[0]
+    mean = so3.log(mean_rotation(R)[None])[0]
     constant = float(np.degrees(np.linalg.norm(mean)))
-    scatter = _scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
+    scatter = scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
     w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
-    world = _world_turn(association.estimate, association.ground_truth)
+    world = world_turn(association.estimate, association.ground_truth)
     turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
-    in_one_world = _scatter_deg(world @ association.estimate.R, association.ground_truth.R)
+    in_one_world = scatter_deg(world @ association.estimate.R, association.ground_truth.R)
     if w_first is not None:
         doubts.append(w_first)
     elif alignment.kind == "none" and turn > _CONSTANT_DEG and _are_worlds(association, world, scatter, in_one_world):
@@ -145,9 +146,9 @@ def reading_doubts(association: Association, alignment: Alignment, translation: 
 
 def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alignment, rmse: float) -> Iterator[str]:
     R = alignment.R_world_estimate
-    scatter = _scatter_deg(R @ estimate.R, truth.R)
+    scatter = scatter_deg(R @ estimate.R, truth.R)
     for name, one, other in (("estimate", estimate, truth), ("ground truth", truth, estimate)):
-        if _turned_deg(one).max() < _STILL_DEG and np.quantile(_turned_deg(other), _BUT_FEW) > _TURNED_DEG:
+        if turned_deg(one).max() < _STILL_DEG and np.quantile(turned_deg(other), _BUT_FEW) > _TURNED_DEG:
             yield (
                 f"the orientations of the {name} never change: it has none, and the rotation error and the relative errors mean "
                 "nothing"
@@ -156,8 +157,8 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
     if scatter < _FAR_DEG:
         return
     conjugates = {
-        "the estimate": _scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R),
-        "the ground truth": _scatter_deg(R @ estimate.R, truth.R.transpose(0, 2, 1)),
+        "the estimate": scatter_deg(R @ estimate.R.transpose(0, 2, 1), truth.R),
+        "the ground truth": scatter_deg(R @ estimate.R, truth.R.transpose(0, 2, 1)),
     }
     which = min(conjugates, key=lambda name: conjugates[name])
     least, other_way = conjugates[which], max(conjugates.values())
@@ -186,13 +187,13 @@ def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scat
     R = alignment.R_world_estimate
     swapped = [quaternion.to_matrix(np.ascontiguousarray(x.q_wxyz[:, _W_LAST])) for x in (estimate, truth)]
     ways = {
-        "the estimate": _scatter_deg(R @ swapped[0], truth.R),
-        "the ground truth": _scatter_deg(R @ estimate.R, swapped[1]),
-        "both files": _scatter_deg(R @ swapped[0], swapped[1]),
+        "the estimate": scatter_deg(R @ swapped[0], truth.R),
+        "the ground truth": scatter_deg(R @ estimate.R, swapped[1]),
+        "both files": scatter_deg(R @ swapped[0], swapped[1]),
     }
     way = min(ways, key=lambda name: ways[name])
     if alignment.kind == "none":  # worlds that nobody laid over each other turn the differences: orientations may agree in one
-        scatter = min(scatter, _scatter_deg(_world_turn(estimate, truth) @ estimate.R, truth.R))
+        scatter = min(scatter, scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R))
     if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
         return None
     return (
@@ -388,26 +389,3 @@ class _OnLine:
         scale = sign * float(x @ y) / float(x @ x)
         angle = float(np.degrees(np.arccos(np.clip(sign * axes[0] @ axes[1], -1.0, 1.0))))
         return cls(scale, angle, rms(sign * x - y), rms(scale * sign * x - y), rms(y))
-
-
-def _scatter_deg(R_one: NDArray[np.float64], R_other: NDArray[np.float64]) -> float:
-    """Root mean square of how far relative rotations are from their mean [degrees]."""
-    between = np.swapaxes(R_other, 1, 2) @ R_one
-    return float(np.degrees(rms(np.linalg.norm(so3.log(_mean_rotation(between).T @ between), axis=1))))
-
-
-def _world_turn(estimate: Trajectory, truth: Trajectory) -> NDArray[np.float64]:
-    """The rotation (3, 3) of the estimate's world to the true one, by orientations of the same body."""
-    return _mean_rotation(truth.R @ estimate.R.transpose(0, 2, 1))
-
-
-def _mean_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation (3, 3) nearest to all of (M, 3, 3); that of half turns, too, whose rotation vectors cancel."""
-    U, _, Vt = np.linalg.svd(R.mean(axis=0))
-    return np.asarray((U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt)
-
-
-def _turned_deg(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Turns (M,) from the mean orientation [degrees]."""
-    R = trajectory.R
-    return np.asarray(np.degrees(np.linalg.norm(so3.log(_mean_rotation(R).T @ R), axis=1)))

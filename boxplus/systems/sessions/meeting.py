@@ -179,8 +179,7 @@ class _Meeting:
                 f"local map {loop.query} over {loop.place} {rival}"
             )
         passed = sum(loop.refusal is None for loop in self.loops.values())
-        fit = f"{passed or 'none'} of them {either(passed, 'fits', 'fit')}"
-        return f"{_pairs(len(self.loops))} alike at one alignment, and {fit}"
+        return f"{_pairs(len(self.loops))} alike at one alignment, and {passed or 'none'} of them {either(passed, 'fits', 'fit')}"
 
     def _look_for_encounters(self) -> None:
         """Step 1."""
