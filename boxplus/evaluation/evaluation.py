@@ -19,11 +19,11 @@ from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_
 from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
 from boxplus.evaluation.clock_rate import ClockRate
-from boxplus.evaluation.doubts import alignment_doubts, reading_doubts
+from boxplus.evaluation.doubts.incidents import incident_doubts, jump_doubts
+from boxplus.evaluation.doubts.other_meanings import alignment_doubts, reading_doubts
+from boxplus.evaluation.doubts.rounded_positions import rounded_position_doubts
+from boxplus.evaluation.doubts.rounded_stamps import rounding_doubts
 from boxplus.evaluation.frames import Plane, projected
-from boxplus.evaluation.incidents import incident_doubts, jump_doubts
-from boxplus.evaluation.rounded_positions import rounded_position_doubts
-from boxplus.evaluation.rounded_stamps import rounding_doubts
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
 from boxplus.evaluation.time_offset import TimeOffset

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.association import Association
-from boxplus.evaluation.mean_rotation import mean_rotation, scatter_deg, turned_deg, world_turn
+from boxplus.evaluation.doubts.mean_rotation import mean_rotation, scatter_deg, turned_deg, world_turn
 from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
@@ -66,16 +66,10 @@ def alignment_doubts(
     scatter = scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
     w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
-    world = world_turn(association.estimate, association.ground_truth)
-    turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
-    in_one_world = scatter_deg(world @ association.estimate.R, association.ground_truth.R)
     if w_first is not None:
         doubts.append(w_first)
-    elif alignment.kind == "none" and turn > _CONSTANT_DEG and _are_worlds(association, world, scatter, in_one_world):
-        doubts.append(
-            f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same, "
-            "and all errors but the relative ones contain that; --align se3 lays one over the other"
-        )
+    elif alignment.kind == "none" and (worlds := _worlds(association, scatter)) is not None:
+        doubts.append(worlds)
     elif _is_beyond(mean, loose) and scatter < min(0.5 * constant, _FAR_DEG) and not undetermined:
         w, x, y, z = quaternion.from_matrix(so3.exp(mean[None]))[0]
         doubts.append(
@@ -86,21 +80,28 @@ def alignment_doubts(
     return doubts
 
 
-def _are_worlds(association: Association, world: NDArray[np.float64], scatter: float, in_one_world: float) -> bool:
-    """Whether orientations differ by a turn of the world, not of the body.
+def _worlds(association: Association, scatter: float) -> str | None:
+    """A sentence where orientations differ by a turn of the world, not of the body.
 
     Of a body that turns about one axis, as a car does, or not at all, both read alike: there the positions decide.
 
     Args:
-        world: (3, 3) of the estimate's world to the true one. scatter, in_one_world: without and with that turn [deg].
+        scatter: of the orientations as they were read [deg].
     """
-    if scatter > _CONSTANT_DEG and in_one_world < _CLEARLY * scatter:
-        return True
-    if in_one_world > max(scatter, _CONSTANT_DEG):
-        return False
-    estimate, truth = (x.p - x.p.mean(axis=0) for x in (association.estimate, association.ground_truth))
-    as_read, turned = (rms(np.linalg.norm(truth - estimate @ R.T, axis=1)) for R in (np.eye(3), world))
-    return turned < _CLEARLY * as_read
+    world = world_turn(association.estimate, association.ground_truth)
+    turn = float(np.degrees(np.linalg.norm(so3.log(world[None])[0])))
+    in_one_world = scatter_deg(world @ association.estimate.R, association.ground_truth.R)
+    if turn <= _CONSTANT_DEG or in_one_world > max(scatter, _CONSTANT_DEG):
+        return None
+    if not (scatter > _CONSTANT_DEG and in_one_world < _CLEARLY * scatter):
+        estimate, truth = (x.p - x.p.mean(axis=0) for x in (association.estimate, association.ground_truth))
+        as_read, turned = (rms(np.linalg.norm(truth - estimate @ R.T, axis=1)) for R in (np.eye(3), world))
+        if turned >= _CLEARLY * as_read:
+            return None
+    return (
+        f"the orientations differ by {turn:.1f}° in the world (scatter {in_one_world:.1f}°): the worlds are not the same, and "
+        "all errors but the relative ones contain that; --align se3 lays one over the other"
+    )
 
 
 def _loose(truth: Trajectory, alignment: Alignment, rmse: float, wide: float) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import pytest
 from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
-from tests.evaluation.test_other_meanings import moved, path, told
+from tests.evaluation.doubts.test_other_meanings import moved, path, told
 
 KINDS = ["none", "origin", "yaw", "se3", "sim3"]
 

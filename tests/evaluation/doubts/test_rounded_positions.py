@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.evaluation.evaluation import evaluate
-from tests.evaluation.test_other_meanings import moved, path, told
+from tests.evaluation.doubts.test_other_meanings import moved, path, told
 
 
 def six_digits(p: np.ndarray) -> np.ndarray:
