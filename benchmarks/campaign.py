@@ -6,6 +6,7 @@
     python benchmarks/campaign.py --only fault=clock_offset --only world=hall --seeds 0:1000
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
     python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
+    python benchmarks/campaign.py --rough --seeds 0:40        # with what real recordings have besides: rain, people, lost packets
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
 
 A seed draws world, motion, sensors, mounting and, in half of the runs, one fault. Every run ends `right`, flagged with the `right
@@ -72,11 +73,11 @@ def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
     begin, end = options.seeds
     if options.real is None:
         seeds = [seed for seed in range(begin, end) if draw_kinds(seed).matches(dict(options.only))]
-        return functools.partial(run_seed, command_line=options.bag), seeds
+        return functools.partial(run_seed, command_line=options.bag, rough=options.rough), seeds
     missing = why_not(options.shared)
     if missing is not None:
         return f"no recordings with a real IMU: {missing}"
-    return functools.partial(run_real, shared=options.shared), list(range(begin, begin + options.real))
+    return functools.partial(run_real, shared=options.shared, rough=options.rough), list(range(begin, begin + options.real))
 
 
 def _runs(run: Run, seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
@@ -107,6 +108,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes")
     parser.add_argument("--bag", action="store_true", help="write bags and run the real command line")
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
+    parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")

@@ -18,11 +18,12 @@ from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, faults, write_recording
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-PARTS = ("draws", "judge", "places", "real", "report", "run", "spoil")
+PARTS = ("draws", "judge", "nuisances", "places", "real", "report", "run", "spoil")
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +116,9 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
         "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted: its rotation was estimated"
     )
     assert verdict(absent, unknown).verdict == "silent"
+    covered = judge.Outcome(0, None, summary_of(unknown), estimate_of(simulation, 3.0, 1.0))
+    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), absent).verdict == "flagged"
+    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), faulty).verdict == "flagged"
     assert verdict(absent, unknown, source="identity").verdict == "flagged"
     vague = "by its own covariance the run knows its last position to 2.5 m (1 sigma) only, after a way of 80 m: {}"
     of_it = vague.format("T_imu_lidar was known to 1.8 deg and 14 cm at first (better: --T-imu-lidar)")
@@ -183,8 +187,10 @@ def test_that_nothing_shows_the_speed_is_no_false_alarm_where_the_run_behaves_li
         (draw, said, wide, "flagged"),
         (draw, vague, wide, "flagged"),
     ):
-        errors = judge.errors_of(estimate, simulation)
-        assert judge.judge(judge.Outcome(0, None, summary, estimate), errors, place).false_alarm == alarm
+        errors, outcome = judge.errors_of(estimate, simulation), judge.Outcome(0, None, summary, estimate)
+        assert judge.judge(outcome, errors, place).false_alarm == alarm
+        as_featureless = judge.judge(outcome, errors, replace(place, featureless=True)).false_alarm
+        assert judge.judge(outcome, errors, place, truly_weak=True).false_alarm == as_featureless
 
 
 @pytest.mark.parametrize(
@@ -217,6 +223,31 @@ def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: Simpl
     assert first.kinds == second.kinds == draws.draw_kinds(7)
     np.testing.assert_array_equal(first.truth().scan(3).p_lidar, second.truth().scan(3).p_lidar)
     assert len(first.truth().scan(3)) <= 20_000  # a rosette of 200,000 points a second
+
+
+def test_nuisances_follow_from_their_seed_and_leave_the_rest_alone(campaign: SimpleNamespace, seed: int) -> None:
+    nuisances, simulation = campaign.nuisances, replace(campaign.draws.draw(seed), duration_s=1.5).truth()
+    scene = nuisances.Scene(simulation, simulation.T_imu_lidar, simulation.scenario.lidar.channels)
+    drawn = [nuisances.draw_nuisances(scene, other)[1] for other in range(60)]
+    assert {name for names in drawn for name in names.split("+")} == set(nuisances._MAKERS)
+    plain = list(simulation.events())
+    scans, samples = ([event for event in plain if isinstance(event, kind)] for kind in (Scan, ImuSamples))
+    for name, make in nuisances._MAKERS.items():
+        nuisance = make(scene, np.random.default_rng(3))
+        first, second = list(nuisance.events(plain)), list(nuisance.events(simulation.events()))
+        seen = [event for event in first if isinstance(event, Scan)]
+        read = [event for event in first if isinstance(event, ImuSamples)]
+        for one, other in zip(first, second, strict=True):
+            np.testing.assert_array_equal(one.time_ns, other.time_ns)
+        assert np.all(np.diff(np.concatenate([block.time_ns for block in read])) > 0), name
+        points, spoilt = np.concatenate([scan.p_lidar for scan in scans]), np.concatenate([scan.p_lidar for scan in seen])
+        of_imu = name in ("jitter", "imu_errors")
+        assert np.isfinite(spoilt).all() and np.array_equal(points, spoilt) == of_imu, name
+        if name in ("beams", "people", "mixed_pixels", "carrier"):  # along their rays, or nearly
+            cosine = np.sum(points * spoilt, axis=1) / np.linalg.norm(points, axis=1) / np.linalg.norm(spoilt, axis=1)
+            assert cosine.min() > np.cos(np.deg2rad(0.5)), name
+        same = all(np.array_equal(one.accel, other.accel) for one, other in zip(samples, read, strict=True))
+        assert same == (name not in ("losses", "imu_errors")), name
 
 
 def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespace) -> None:
@@ -261,7 +292,7 @@ def test_a_real_recording_is_spoilt_after_its_reader(campaign: SimpleNamespace, 
     T_true = np.diag([1.0, -1.0, -1.0, 1.0])
     fault = faults.inverted_extrinsic().then(faults.flip_gyro())
     spoiled, option = campaign.spoil.deliver("recorded", fault, T_true)
-    made = campaign.real.RealDraw(seed, draw.kinds, "", False, 2.0, spoiled, path, T_true, {}, option)
+    made = campaign.real.RealDraw(seed, draw.kinds, "", False, 2.0, spoiled, path, T_true, 16, {}, option)
     options = RecordingOptions(gyro_unit="rad/s")
     with open_recording(path, options) as plain, campaign.real.opened_real(made, options) as recording:
         assert option is None

@@ -36,6 +36,7 @@ class Kinds(Filtered):
         extrinsic: "given" as an option, "recorded" in the recording, or "absent".
         fault: "none" is a sound recording.
         bag: "true" when it goes through a file.
+        nuisance: what real recordings have besides (nuisances.py), joined by "+"; "none" without `rough`.
     """
 
     world: str
@@ -45,6 +46,7 @@ class Kinds(Filtered):
     extrinsic: str
     fault: str
     bag: str
+    nuisance: str = "none"
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,11 @@ Where a place is featureless, nothing tells rest from a constant speed. That a r
 nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it. Nor is it one
 that a run refuses there because the surroundings do not show how the platform moves.
 
+Nor is it one where the exact geometry of its weak scans does leave a direction open.
+
 Where nobody gave the mounting, it is no news that it is unknown, nor how much of the position is for that reason; and a run that
-takes the identity for it because no motion shows it, says so and is wrong for it, has not raised a false alarm.
+takes the identity for it because no motion shows it, says so and is wrong for it, has not raised a false alarm. One that says
+how well it knows the mounting, and whose covariance covers an error beyond what is right, has told of it: `flagged`.
 """
 
 from __future__ import annotations
@@ -233,7 +236,9 @@ def names_cause(flags: list[str], draw: Drawn) -> bool:
     return any(re.search(pattern, text, re.IGNORECASE) for text in flags)
 
 
-def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak: bool = False) -> Verdict:
+def judge(
+    outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak: bool = False, truly_weak: bool = False
+) -> Verdict:
     """The verdict on a run.
 
     Args:
@@ -241,6 +246,7 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
         errors: of its trajectory; None without one.
         draw: what the recording was.
         falsely_weak: scans were called weak although the LiDAR saw enough (see `run.falsely_weak`).
+        truly_weak: scans were called weak, and in none of them the LiDAR saw enough.
     """
     flags = flags_of(outcome, draw)
     reasons: list[str] = []
@@ -251,17 +257,24 @@ def judge(outcome: Outcome, errors: Errors | None, draw: Drawn, *, falsely_weak:
     sound = draw.kinds.fault == "none"
     weak = errors is not None and outcome.estimate is not None and weak_share_of_error(outcome.estimate, errors) >= 0.5
     said = _NOT_SHOWN if outcome.error is None else _REFUSED_FOR_IT
-    nothing_shown = draw.featureless and all(said.search(text) for text in flags) and (weak or "covariance" not in reasons)
+    nothing_shown = (
+        (draw.featureless or truly_weak) and all(said.search(text) for text in flags) and (weak or "covariance" not in reasons)
+    )
     guessed = draw.kinds.extrinsic == "absent" and outcome.summary is not None and outcome.summary.extrinsic.source == "identity"
     with_reason = nothing_shown or (guessed and bool(reasons))
     false_alarm = "" if not sound else "flagged" if flags and not with_reason else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
+    told = draw.kinds.extrinsic == "absent" and reasons == ["error"] and _says_mounting_is_unknown(outcome)
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)
-    if flags or weak or guessed:
+    if flags or weak or guessed or told:
         return Verdict("flagged", reasons, flags, false_alarm)
     return Verdict("silent", reasons, flags, false_alarm)
+
+
+def _says_mounting_is_unknown(outcome: Outcome) -> bool:
+    return outcome.summary is not None and any(_UNKNOWN_MOUNTING.search(warning.text) for warning in outcome.summary.warnings)
 
 
 def weak_share_of_error(estimate: Trajectory, errors: Errors) -> float:

@@ -40,6 +40,7 @@ class RealDraw:
     Attributes:
         path: of the bag.
         T_true: (4, 4) the true mounting.
+        channels: of a spinning LiDAR; 1 of others.
     """
 
     seed: int
@@ -50,6 +51,7 @@ class RealDraw:
     spoiled: Fault
     path: Path
     T_true: NDArray[np.float64]
+    channels: int
     recording_options: dict[str, Any] = field(default_factory=dict)
     T_imu_lidar: NDArray[np.float64] | None = None
 
@@ -129,6 +131,7 @@ def draw_real(seed: int, shared: Path, work: Path) -> RealDraw:
         spoiled=spoiled,
         path=path,
         T_true=T_true,
+        channels=1 if sensor == "livox" else rings,
         recording_options=spoiling.recording_options,
         T_imu_lidar=option,
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 VERDICTS = ("right", "right cause", "flagged", "silent", "crashed")
-_KINDS = ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag")
+_KINDS = ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag", "nuisance")
 Line = dict[str, Any]
 
 
@@ -51,8 +51,9 @@ def _counts(name: str, lines: Sequence[Line]) -> str:
 
 def _table(lines: Sequence[Line], kind: str) -> str:
     rows = [f"{kind:22s} {'runs':>5s} " + " ".join(f"{verdict:>11s}" for verdict in VERDICTS) + f" {'false alarm':>11s}"]
-    for value in sorted({line[kind] for line in lines}):
-        mine = [line for line in lines if line[kind] == value]
+    drawn = [line.get(kind, "none").split("+") for line in lines]
+    for value in sorted({name for names in drawn for name in names}):
+        mine = [line for line, names in zip(lines, drawn, strict=True) if value in names]
         counts = Counter(line["verdict"] for line in mine)
         cells = " ".join(f"{counts[verdict]:11d}" for verdict in VERDICTS)
         rows.append(f"  {value:20s} {len(mine):5d} {cells} {sum(bool(line['false_alarm']) for line in mine):11d}")
@@ -82,6 +83,7 @@ def _cases(lines: Sequence[Line], verdict: str, name: str) -> str:
 def command(line: Line) -> str:
     """What repeats a run."""
     how = " --real 1" if line["real"] else " --bag" if line["bag"] == "command" else ""
+    how += " --rough" if line.get("nuisance", "none") != "none" else ""
     return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{how}"
 
 

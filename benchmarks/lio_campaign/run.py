@@ -9,9 +9,9 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,10 @@ from boxplus.simulation import Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
 from lio_campaign.judge import Drawn, Errors, Outcome, Truth, errors_of, judge
+from lio_campaign.nuisances import Scene, draw_nuisances
 from lio_campaign.real import RealDraw, draw_real, opened_real
+
+_AnyDraw = TypeVar("_AnyDraw", Draw, RealDraw)
 
 _ENOUGH_SHARE = 0.01
 """Least eigenvalue of the true information over that of all points, above which no direction of a scan is weak: 2.5 times the
@@ -39,16 +42,20 @@ _POINTS_LOOKED_AT = 500
 _COMMAND = (sys.executable, "-c", "from boxplus.cli import main; main()", "lio")
 
 
-def run_seed(seed: int, *, command_line: bool = False) -> dict[str, Any]:
+def run_seed(seed: int, *, command_line: bool = False, rough: bool = False) -> dict[str, Any]:
     """Everything about one seed, as a line of JSON.
 
     Args:
         seed: which.
         command_line: write a bag and run the real `boxplus lio` in a process of its own.
+        rough: with what real recordings have besides, see nuisances.py.
     """
     clock = _Clock()
     made = draw(seed)
     simulation = made.truth()
+    if rough:
+        lidar = simulation.scenario.lidar
+        made = _roughened(made, Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1)))
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         if command_line:
@@ -64,26 +71,38 @@ def run_seed(seed: int, *, command_line: bool = False) -> dict[str, Any]:
     return facts | _judged(made, outcome, simulation, suspects) | clock.read()
 
 
-def run_real(seed: int, shared: Path) -> dict[str, Any]:
+def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
     """The same of a recording with a real IMU and a real motion.
 
     Args:
         seed: which.
         shared: folder with `tools/make_lio_recording.py` and `data/imu`.
+        rough: as of `run_seed`.
     """
     clock = _Clock()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         made = draw_real(seed, shared, work)
+        if rough:
+            made = _roughened(made, Scene(made.truth(), made.T_true, made.channels))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
     facts = {"seed": seed, "real": True, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
     return facts | _judged(made, outcome, truth, []) | clock.read()
 
 
+def _roughened(made: _AnyDraw, scene: Scene) -> _AnyDraw:
+    """The draw with nuisances laid upon it before its fault."""
+    nuisance, names = draw_nuisances(scene, made.seed)
+    detail = f"{made.detail}; {nuisance.description}".lstrip("; ")
+    return replace(made, spoiled=nuisance.then(made.spoiled), kinds=replace(made.kinds, nuisance=names), detail=detail)
+
+
 def _judged(made: Drawn, outcome: Outcome, truth: Truth, suspects: list[dict[str, float]]) -> dict[str, Any]:
     errors = None if outcome.estimate is None else errors_of(outcome.estimate, truth)
-    verdict = judge(outcome, errors, made, falsely_weak=bool(suspects))
+    weak = outcome.estimate is not None and outcome.estimate.status is not None and "weak" in set(outcome.estimate.status)
+    looked_at = made.kinds.fault == "none" and not made.featureless and not isinstance(made, RealDraw)
+    verdict = judge(outcome, errors, made, falsely_weak=bool(suspects), truly_weak=weak and looked_at and not suspects)
     return asdict(verdict) | _figures(errors) | _facts(outcome) | {"falsely_weak_scans": suspects}
 
 

@@ -39,6 +39,7 @@ _TURNING_RAD_S = np.deg2rad(4.0)  # rms of one sensor that the other should show
 _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
 _SLOPE_DOUBTFUL = 0.03
+_TURNS_DOUBTFUL = 0.05  # of the gyroscope's scale: a pattern that rests holds turns back as well
 _SCAN_NS = 100_000_000
 FEET_PER_METRE = 3.28084
 _THICK_M = 0.08  # median misfit of a path: of sound ones the foliage of a forest reaches 5 cm
@@ -135,7 +136,8 @@ def _compare(
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
     slope = 1.0 if found.translation is None else found.translation.slope
     steady = found.rotation
-    if (refine or (slope > 0.0 and _off(slope))) and steady is not None and steady.explained > _EXPLAINED:
+    doubtful = (slope > 0.0 and _off(slope)) or (steady is not None and _turns_off(steady))
+    if (refine or doubtful) and steady is not None and steady.explained > _EXPLAINED:
         shift_ns = round(steady.offset_s * 1e9) if steady.offset_std_s < _OFFSET_KNOWN_S else 0
         corrected = GyroAttitude(imu.time_ns, (imu.gyro - steady.bias) / unit_of(steady.scale))
         refined = lidar_path(
@@ -194,7 +196,13 @@ def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
         unit = max(unit_of(rotation.scale), 1.0)
         strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(found.gyro_power)) / unit)
         return strong > float(_TURNING_RAD_S)
+    if _turns_off(rotation):
+        return True
     return T_declared is not None and contradicted_within(rotation, T_declared[:3, :3]) is not None
+
+
+def _turns_off(rotation: RotationFit) -> bool:
+    return abs(rotation.scale / unit_of(rotation.scale) - 1.0) > _TURNS_DOUBTFUL
 
 
 def _off(slope: float) -> bool:

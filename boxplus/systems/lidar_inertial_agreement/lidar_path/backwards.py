@@ -39,11 +39,12 @@ def surer_path(
     if not (_whole(path) and _whole(back)) or not np.array_equal(path.time_ns, back.time_ns):
         return path if len(np.unique(path.segment)) <= len(np.unique(back.segment)) else back
     chosen = scans_of(path.time_ns, scans)
-    if one_motion(path.poses, back.poses) or other_explains_better(chosen, back.poses, path.poses, config):
-        return path
+    # Also of two that end alike: a pattern holds back every sway of a walk, and at the end nothing is left of it.
     if other_explains_better(chosen, path.poses, back.poses, config):
         return back
-    return path if one_motion(path.poses, back.poses, *_ABOUT_THE_SAME) else None
+    if one_motion(path.poses, back.poses, *_ABOUT_THE_SAME) or other_explains_better(chosen, back.poses, path.poses, config):
+        return path
+    return None
 
 
 def lidar_path_backwards(scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning] = ()) -> LidarPath:

@@ -11,12 +11,14 @@ import pytest
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
-from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import lidar_path_backwards, surer_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for_all
+from boxplus.systems.lidar_inertial_agreement.rotation import compare_rotations
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_poses, true_twists
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
@@ -81,6 +83,21 @@ def test_of_a_path_forwards_and_one_backwards_the_better_one_is_taken() -> None:
     assert chosen is not None
     np.testing.assert_allclose(chosen.p_path_lidar, back.p_path_lidar)
     assert surer_path(truth, scans, CONFIG, ()) is truth
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_sways_after_a_rest_show_the_gyroscopes_scale(seed: int) -> None:
+    """The pattern of the rest, and turns that change within a scan, make a first path turn too little or too much."""
+    lidar = SpinningLidar(channels=128, azimuth_steps=256, vertical_fov_deg=(-45.0, 45.0))
+    walk = trajectories.walk([(-16.0, -7.0), (16.0, -7.0)], 1.2, 1.5, 2.5, seed)
+    simulation = Simulation(Scenario("sway", worlds.hall(seed=seed), walk, lidar, ImuModel()), seed, 6.0)
+    scans, imu = data(simulation)
+    guesses = gyro_guesses(imu, simulation.T_imu_lidar[:3, :3])
+    first = compare_rotations(lidar_path(scans, with_cells_for_all(scans, CONFIG), guesses), imu)
+    rotation = compare_sensors(scans, imu, CONFIG, T_declared=simulation.T_imu_lidar).rotation
+    assert first is not None and rotation is not None
+    assert abs(first.scale - 1.0) > 0.06
+    assert abs(rotation.scale - 1.0) < 0.02
 
 
 def test_where_two_paths_differ_and_scans_do_not_decide_neither_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
