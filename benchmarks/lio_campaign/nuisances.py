@@ -146,7 +146,8 @@ def _people(scene: Scene, random: Random) -> Fault:
     truth, T = scene.truth, scene.T_imu_lidar
     begin_ns = truth.start_ns
     span_s = (truth.end_ns - begin_ns) * 1e-9
-    way = truth.ground_truth(np.linspace(begin_ns, truth.end_ns, 50).astype(np.int64)).p_world_imu
+    instants = begin_ns + np.linspace(0, truth.end_ns - begin_ns, 50).astype(np.int64)
+    way = truth.ground_truth(instants).p_world_imu
     where = way[random.integers(0, len(way), count), :2] + random.uniform(-4.0, 4.0, (count, 2))
     course = random.uniform(0.0, 2.0 * np.pi, count)
     feet = float(way[:, 2].min() - 1.6)
@@ -187,14 +188,16 @@ def _people(scene: Scene, random: Random) -> Fault:
 
 def _carrier(scene: Scene, random: Random) -> Fault:
     """Something that moves along with the sensor, a mast or who carries it, stands in its view."""
-    course, width = float(random.uniform(-np.pi, np.pi)), float(np.deg2rad(random.uniform(15.0, 60.0)))
+    widest = 60.0 if scene.channels > 1 else 20.0  # of a narrow view not more than a quarter
+    course, width = float(random.uniform(-np.pi, np.pi)), float(np.deg2rad(random.uniform(15.0, widest)))
     distance, at = float(random.uniform(0.55, 1.2)), _seeded(random)
 
     def scan(scan: Scan) -> Scan:
         p = scan.p_lidar.astype(np.float64)
         ranges = np.linalg.norm(p, axis=1)
         azimuth = np.arctan2(p[:, 1], p[:, 0])
-        hit = np.abs(np.angle(np.exp(1j * (azimuth - course)))) < 0.5 * width
+        towards = course if scene.channels > 1 else 0.08 * course  # a narrow view looks along +x
+        hit = np.abs(np.angle(np.exp(1j * (azimuth - towards)))) < 0.5 * width
         nearer = distance + at(scan.start_ns).normal(0.0, 0.03, len(p))
         return _moved(scan, np.where(hit[:, None], p / ranges[:, None] * nearer[:, None], p))
 

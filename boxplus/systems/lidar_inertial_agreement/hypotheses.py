@@ -74,7 +74,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     if agreement.in_feet is not None:
         findings.append(feet_finding(agreement.in_feet))
     if translation is not None:
-        findings.append(_of_lengths(agreement, translation))
+        findings.append(_of_lengths(agreement, translation, T_declared))
         findings.append(_of_turn(rotation, translation, T_declared))
     if findings[0] is None and not shows_mounting(agreement):
         findings.append(_of_planes(agreement))
@@ -316,7 +316,7 @@ def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
     )
 
 
-def _of_lengths(agreement: Agreement, translation: TranslationFit) -> Finding | None:
+def _of_lengths(agreement: Agreement, translation: TranslationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
     slope = translation.slope
     std = float(np.hypot(translation.slope_std, SLOPE_FLOOR))
     if _reversed(translation):
@@ -324,6 +324,12 @@ def _of_lengths(agreement: Agreement, translation: TranslationFit) -> Finding | 
             f"the LiDAR's accelerations are {slope:.2f} ± {std:.2f} times those of the accelerometer (1 is right): its sign is "
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
+        rotation = agreement.rotation
+        if T_declared is None and rotation is not None and rotation.mirrored > _FITS:
+            text += (
+                "; or the gyroscope's sign is flipped: nobody gave T_imu_lidar, and turns about one axis fit a mounting that is "
+                "half a turn off as well"
+            )
         return Finding("force_sign", text)
     if translation.explained < _FITS or translation.sigma > MISFIT_M or _lags(agreement):
         return None

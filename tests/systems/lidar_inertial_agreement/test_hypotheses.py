@@ -174,7 +174,13 @@ def test_a_path_that_accelerates_out_of_nothing_flips_no_sign() -> None:
     T = simulation.T_imu_lidar
     agreement = compare_sensors(*data(simulation, faults.flip_accel()), CONFIG, T_declared=T)
     assert [finding.cause for finding in contradictions(agreement, T)] == ["force_sign"]
-    assert agreement.translation is not None
+    assert agreement.translation is not None and agreement.rotation is not None
+    # About one axis a flipped gyroscope fits a mounting half a turn off: where none was given it may be that as well.
+    about_one = replace(agreement, rotation=replace(agreement.rotation, mirrored=agreement.rotation.explained))
+    for T_declared, said in ((None, True), (T, False)):
+        found = contradictions(about_one, T_declared)
+        assert [finding.cause for finding in found] == ["force_sign"]
+        assert ("the gyroscope's sign is flipped" in found[0].text) == said
     astray = replace(agreement, translation=replace(agreement.translation, slope=-14.6))
     assert contradictions(astray, T) == []
 
