@@ -23,6 +23,7 @@ from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.runs.cameras.causes import MAY_BE
 from boxplus.runs.direct.direct_run import run_direct_odometry
 from boxplus.simulation.cameras import as_camera_recording
+from boxplus.simulation.cameras.recorded import Recorded
 from vio_campaign.draws import FAULTY_SHARE, MOTIONS, Draw, Kinds, draw_of, make_fault, with_fault
 
 FLOOR_M, SHARE_OF_WAY, MANY_NOT_OK = 0.02, 0.02, 0.3
@@ -57,11 +58,12 @@ def draw_direct(seed: int, fault: str | None = None) -> Draw:
 
 def run_direct(made: Draw) -> dict[str, Any]:
     """The verdict and what led to it."""
-    truth = made.truth()
+    simulation = made.truth()
+    truth = Recorded(simulation, made.fault).simulation  # some faults are of the motion
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "run"
         try:
-            with as_camera_recording(truth, made.fault) as recording:
+            with as_camera_recording(simulation, made.fault) as recording:
                 summary = run_direct_odometry(recording, folder)
         except BoxplusError as problem:
             return {"verdict": _verdict(made, None, None, [str(problem)], True), "wrong": [["flag", "", str(problem)]]}

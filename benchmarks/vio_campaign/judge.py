@@ -21,6 +21,7 @@ from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+from boxplus.simulation.cameras.recorded import Recorded
 from vio_campaign.draws import Draw
 
 FLOOR_M, SHARE_OF_WAY = 0.05, 0.02
@@ -62,7 +63,7 @@ def judge_run(made: Draw, outcome: Outcome) -> str:
 
 def run_odometry(made: Draw) -> tuple[Outcome, dict[str, Any]]:
     """Write the recording, run the odometry as `boxplus vio` does, compare with the truth."""
-    truth = made.truth()
+    truth = Recorded(made.truth(), made.fault).simulation  # some faults are of the motion
     every = np.arange(truth.start_ns, truth.end_ns, 20_000_000)
     way = float(np.linalg.norm(np.diff(truth.ground_truth(every).p_world_imu, axis=0), axis=1).sum())
     with tempfile.TemporaryDirectory() as work:

@@ -17,7 +17,11 @@ from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
 MAY_BE = "this may be the cause"
-_BEFORE_S, _AFTER_S = 14.0, 2.0
+_CALIBRATION = ("_shutter", "_focal_length")  # what an odometry may take for a motion, and be off by little enough to say nothing
+BEFORE_S = 14.0
+"""How much of a recording before an instant is looked at [s]."""
+
+_AFTER_S = 2.0
 _MARGIN_NS = 500_000_000  # of IMU samples on both sides
 
 
@@ -33,17 +37,35 @@ def likely_causes(
         around_ns: when the run contradicted itself [ns]; None where it never began, and its beginning is looked at.
         with_imu: whether the run uses the IMU as well.
     """
+    return [_sentence(finding) for finding in _examined(info, events, cameras, around_ns, with_imu=with_imu)]
+
+
+def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int) -> list[str]:
+    """Sentences about shutter and focal length of the first camera, by how far the gyroscope turns, of a run that saw no trouble.
+
+    Args:
+        info, events: as of `likely_causes`.
+        around_ns: the end of fourteen seconds in which the camera turns [ns].
+    """
+    found = _examined(info, events, 1, around_ns, with_imu=True)
+    return [_sentence(finding) for finding in found if finding.key.endswith(_CALIBRATION)]
+
+
+def _examined(
+    info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, *, with_imu: bool
+) -> list[Evidence]:
+    """What is not as it should be around an instant."""
     pictures = [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
-    compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (_BEFORE_S + _AFTER_S))))
+    compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (BEFORE_S + _AFTER_S))))
     begin_ns = None
     to_8_bits, imu = EightBits(), []
     try:
         for event in events:
             time_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
             if begin_ns is None:
-                begin_ns = time_ns if around_ns is None else max(time_ns, around_ns - round(1e9 * _BEFORE_S))
-                end_ns = begin_ns + round(1e9 * (_BEFORE_S + _AFTER_S))
+                begin_ns = time_ns if around_ns is None else max(time_ns, around_ns - round(1e9 * BEFORE_S))
+                end_ns = begin_ns + round(1e9 * (BEFORE_S + _AFTER_S))
             if time_ns > end_ns + _MARGIN_NS:
                 break
             if isinstance(event, ImuSamples):
@@ -54,7 +76,7 @@ def likely_causes(
     except RecordingError:
         return []
     found = compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu and with_imu else [])
-    return [_sentence(finding) for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
+    return [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
 
 
 def _sentence(finding: Evidence) -> str:

@@ -15,9 +15,10 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
-from boxplus.runs.cameras.causes import MAY_BE, likely_causes
+from boxplus.runs.cameras.causes import BEFORE_S, MAY_BE, calibration_doubts, likely_causes
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
+from boxplus.runs.cameras.turning import Turning
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
@@ -40,7 +41,7 @@ _TOLD = {
 }  # of the tests of a start; `run.json` has all of them
 _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
-    "_troubled_ns",
+    "_troubled_ns", "_turning",
 )  # fmt: skip
 _MUCH_LOST = 0.15  # share of the frames
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
@@ -130,6 +131,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._time_offset_s = 0.0
         self._troubled_ns: int | None = None
         self._causes: list[str] = []
+        self._doubts: list[str] = []
+        self._turning = Turning(BEFORE_S)
         self._longest_gap_s = config.odometry.max_imu_gap
 
     def open(self, stack: ExitStack) -> None:
@@ -159,13 +162,20 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         super().at_end(state)
         self.seconds["writing"] += self._line_file.write()
         lost = self.counts.status.get("lost", 0) > _MUCH_LOST * self.counts.count
-        if state == "finished" and (not self.counts.count or self._odometry.contradiction is not None or lost):
+        if state != "finished":
+            return
+        turning_ns = self._turning.until_ns()
+        if not self.counts.count or self._odometry.contradiction is not None or lost:
             self.stage = "looking for the cause"
             self.show_progress()
             longest = max((gap.duration_s for gap in self.counts.imu_gaps()), default=0.0)
             if longest > self._longest_gap_s:
                 self._causes.append(f"a gap of {longest:.2f} s in the samples of the IMU")
             self._causes += likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)
+        elif turning_ns is not None:
+            self.stage = "comparing shutter and focal length with the gyroscope"
+            self.show_progress()
+            self._doubts = calibration_doubts(self._info, self.recording.read_again(), turning_ns)
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
         """See `RunLoop.push`."""
@@ -175,6 +185,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             estimates = self._odometry.push_image(event) if event.camera < len(self._rig.cameras) else []
         else:
             self.counts.add_imu(event.time_ns)
+            self._turning.add(event)
             estimates = self._odometry.push_imu(event)
         self._push_s += time.perf_counter() - began
         return estimates
@@ -235,6 +246,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if repeated:
             text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"
             shared["warnings"].append(WarningFacts(text=text, count=repeated))
+        shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in self._doubts]
         shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
             **shared,

@@ -11,9 +11,9 @@ import pytest
 
 from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo
-from boxplus.runs.cameras.causes import likely_causes
+from boxplus.runs.cameras.causes import calibration_doubts, likely_causes
 from boxplus.sensors.imu import ImuSamples
-from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
+from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
 
@@ -40,6 +40,22 @@ def test_a_clock_that_is_off_is_named_with_its_offset(recorded: tuple[CameraReco
     assert "offset of the clocks" in said
     offset_ms = float(said.split(" ms")[0].split()[-1])
     assert abs(offset_ms - 50.0) < 10.0
+
+
+@pytest.mark.slow
+def test_a_run_without_trouble_is_told_of_a_rolling_shutter_and_of_nothing_else(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]],
+) -> None:
+    info, events = recorded
+    end_ns = max(event.time_ns for event in events if not isinstance(event, ImuSamples))
+    assert calibration_doubts(info, iter(events), end_ns) == []
+    assert calibration_doubts(info, (late(event, 50_000_000) for event in events), end_ns) == []  # of the clocks others tell
+    simulation = simulate_cameras("room_moving", 4, duration_s=7.5, rig=make_rig("mono", None, 0.35, 10.0))
+    rolling = as_camera_recording(simulation, make_camera_fault("rolling_shutter"))
+    (said,) = calibration_doubts(rolling.info, iter(rolling), end_ns)
+    assert "a rolling shutter is suspected" in said
+    # Images 0.3 s apart do not turn steadily between: less than the 20 ms there are.
+    assert 12.0 < float(said.split("_shutter ")[1].split(" ms")[0]) < 22.0
 
 
 def test_a_mounting_the_wrong_way_round_is_named(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:

@@ -113,11 +113,12 @@ def _rotation(time_s: Floats, rate: Floats, begin: float, end: float) -> Floats:
     return R
 
 
-def best_of(values: Floats, costs: Floats) -> tuple[float, float] | None:
+def best_of(values: Floats, costs: Floats, independent: float = 1.0) -> tuple[float, float] | None:
     """The value that fits all pairs best, and its standard deviation; None where it lies at an end of those looked at.
 
     Args:
         values: (V,) evenly spaced; costs: (V, P) misfits of every pair.
+        independent: how many of the corners of a pair err each by itself.
     """
     costs = _weighed(costs)
     total = costs.sum(axis=1)
@@ -130,7 +131,7 @@ def best_of(values: Floats, costs: Floats) -> tuple[float, float] | None:
     # How far the optimum moves when a part of the pairs is left out says how well it is known, whatever their errors are.
     parts = [_optimum(values, costs[:, k::_PARTS].sum(axis=1)) for k in range(_PARTS)]
     std = float(1.4826 * np.median(np.abs(np.array(parts) - np.median(parts)))) / np.sqrt(_PARTS)
-    return _optimum(values, total), max(std, float(np.sqrt(2.0 / curvature)) * step)
+    return _optimum(values, total), max(std, float(np.sqrt(2.0 / (independent * curvature))) * step)
 
 
 def end_behind(values: Floats, costs: Floats) -> float | None:

@@ -19,6 +19,7 @@ from boxplus.runs.inspection.cameras.known_turns import KnownTurn, best_of
 _SEARCH_S, _STEP_S = 0.04, 0.002
 _SMALL_S = 0.004
 _SURE = 5.0
+_ALIKE = 4.0  # corners that err alike: neighbours do
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,8 @@ def estimate_readout(camera: CameraStream, turns: Sequence[KnownTurn]) -> Readou
     times = np.arange(-_SEARCH_S, _SEARCH_S + 0.5 * _STEP_S, _STEP_S)
     rays = [(camera.model.bearings(pair.pixels1)[0], camera.model.bearings(pair.pixels2)[0]) for pair in turns]
     costs = np.array([[pair.misfit(*x, time) for pair, x in zip(turns, rays, strict=True)] for time in times])
-    found = best_of(times, costs)
+    corners = float(np.mean([len(pair.pixels1) for pair in turns]))
+    found = best_of(times, costs, max(corners / _ALIKE, 1.0))
     return None if found is None else Readout(*found)
 
 
