@@ -32,6 +32,7 @@ _DEGREES = 180.0 / np.pi
 _SLOPE_S = 0.05  # each way, over which rates change: the noise of a gyroscope changes at every sample
 _LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration alone
 _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
+_LED_ASTRAY = 0.02  # of what is explained, by which steps must not make it less
 _IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
 
 
@@ -295,28 +296,11 @@ class _Refined:
         R_expected: NDArray[np.float64],
         offset_s: float,
     ) -> None:
+        self._exact, self._rate_lidar = exact, rate_lidar
         start = _Kabsch(exact(offset_s), rate_lidar, R_expected)
         self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
         for _ in range(_ROUNDS):
-            rate_imu = exact(self.offset_s)
-            slope = (exact(self.offset_s + _SLOPE_S) - exact(self.offset_s - _SLOPE_S)) / (2.0 * _SLOPE_S)
-            seen = self.scale * rate_lidar @ self.R.T
-            self.residual = rate_imu - seen - self.bias
-            norm = np.linalg.norm(self.residual, axis=1)
-            sigma = max(1.4826 * float(np.median(norm)) / 1.54, 1e-3)  # the median of a 3-d normal's length is 1.54 sigma
-            self.weight: NDArray[np.float64] = 1.0 / (1.0 + (norm / (4.0 * sigma)) ** 2) ** 2
-            # Derivatives of the residual: R <- Exp(θ) R, bias, log scale, offset.
-            J = np.zeros((len(rate_lidar), 3, 8))
-            J[:, :, :3] = so3.hat(seen)
-            J[:, :, 3:6] = -np.eye(3)
-            J[:, :, 6] = -seen
-            J[:, :, 7] = slope
-            root = np.sqrt(self.weight)
-            flat = (J * root[:, None, None]).reshape(-1, 8)
-            self.H: NDArray[np.float64] = flat.T @ flat
-            # What the motion does not show stays: a pull too small to matter where it does.
-            prior = np.array([1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3]) * sigma**2
-            step = -np.linalg.solve(self.H + np.diag(prior), flat.T @ (self.residual * root[:, None]).reshape(-1))
+            step = self._step()
             self.R = so3.exp(step[:3]) @ self.R
             self.bias = self.bias + step[3:6]
             self.scale *= float(np.exp(np.clip(step[6], -0.7, 0.7)))
@@ -324,6 +308,36 @@ class _Refined:
             if np.abs(step).max() < 1e-6:
                 break
         self.explained = _Kabsch(exact(self.offset_s), rate_lidar, R_expected).explained
+        if self.explained < start.explained - _LED_ASTRAY:
+            # What hardly changes shows neither scale nor offset, and steps along them lead anywhere.
+            self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
+            self.explained = start.explained
+            self._step()
+
+    def _step(self) -> NDArray[np.float64]:
+        """Residuals, their weights and information where the estimate is, and the step (8,) from there."""
+        rate_imu = self._exact(self.offset_s)
+        slope = (self._exact(self.offset_s + _SLOPE_S) - self._exact(self.offset_s - _SLOPE_S)) / (2.0 * _SLOPE_S)
+        seen = self.scale * self._rate_lidar @ self.R.T
+        self.residual = rate_imu - seen - self.bias
+        norm = np.linalg.norm(self.residual, axis=1)
+        sigma = max(1.4826 * float(np.median(norm)) / 1.54, 1e-3)  # the median of a 3-d normal's length is 1.54 sigma
+        self.weight: NDArray[np.float64] = 1.0 / (1.0 + (norm / (4.0 * sigma)) ** 2) ** 2
+        # Derivatives of the residual: R <- Exp(θ) R, bias, log scale, offset.
+        J = np.zeros((len(self._rate_lidar), 3, 8))
+        J[:, :, :3] = so3.hat(seen)
+        J[:, :, 3:6] = -np.eye(3)
+        J[:, :, 6] = -seen
+        J[:, :, 7] = slope
+        root = np.sqrt(self.weight)
+        flat = (J * root[:, None, None]).reshape(-1, 8)
+        self.H: NDArray[np.float64] = flat.T @ flat
+        # What the motion does not show stays: a pull too small to matter where it does.
+        prior = np.array([1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3]) * sigma**2
+        step: NDArray[np.float64] = -np.linalg.solve(
+            self.H + np.diag(prior), flat.T @ (self.residual * root[:, None]).reshape(-1)
+        )
+        return step
 
 
 class _Kabsch:

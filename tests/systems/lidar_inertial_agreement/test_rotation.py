@@ -47,6 +47,18 @@ def test_a_few_fast_turns_are_no_outliers(seed: int) -> None:
     assert fit.explained > fit.mirrored - 1e-3
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_a_turn_about_one_axis_that_just_begins_is_no_flipped_sign(seed: int) -> None:
+    """Scale, bias and offset are hardly told apart: steps along them must not lead to where little is explained."""
+    random = np.random.default_rng(seed)
+    begun = np.clip(np.linspace(0.0, 1.0, 46)[:, None] - 0.7, 0.0, None) / 0.3
+    rate = 0.2 * begun * np.array([0.05, 1.0, 0.0]) + 5e-4 * random.normal(size=(46, 3))
+    fit = compared(rate, np.full((46, 1), 0.015), so3.exp(random.normal(size=3)), random)
+    assert fit.explained > 0.75
+    assert fit.explained > fit.mirrored - 0.02
+    assert fit.scale == pytest.approx(1.0, abs=0.4)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("std", "known"), [(0.005, "well"), (0.02, "coarsely"), (0.2, "not")])
