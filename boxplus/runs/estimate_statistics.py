@@ -172,6 +172,11 @@ class EstimateStatistics:
         """Intervals between IMU samples more than three times the usual one."""
         return self._imu_gaps.gaps(self.first_time_ns or 0) if self.first_time_ns is not None else []
 
+    @property
+    def longest_imu_gap_s(self) -> float:
+        """The longest of them, before the first estimate or without any too [s]; 0 without."""
+        return max((gap.duration_s for gap in self._imu_gaps.gaps(0)), default=0.0)
+
     def weak_intervals(self) -> list[WeakInterval]:
         """Successive estimates with the same status other than ok."""
         return list(self._weak)

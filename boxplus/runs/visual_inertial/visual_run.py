@@ -168,7 +168,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if not self.counts.count or self._odometry.contradiction is not None or lost:
             self.stage = "looking for the cause"
             self.show_progress()
-            longest = max((gap.duration_s for gap in self.counts.imu_gaps()), default=0.0)
+            longest = self.counts.longest_imu_gap_s
             if longest > self._longest_gap_s:
                 self._causes.append(f"a gap of {longest:.2f} s in the samples of the IMU")
             self._causes += likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)

@@ -44,6 +44,9 @@ _SCAN_NS = 100_000_000
 FEET_PER_METRE = 3.28084
 _THICK_M = 0.08  # median misfit of a path: of sound ones the foliage of a forest reaches 5 cm
 ROTATION_KNOWN_RAD = 0.05
+LAG_RAD = float(np.deg2rad(2.5))
+"""By how much a right mounting may seem turned because registrations lag, however many scans there are."""
+
 _COARSELY_RAD = 0.2
 _DECLARED_ARM_STD = 0.02  # m
 
@@ -258,7 +261,7 @@ def apart(
 def apart_allowed(fit: RotationFit, known_rad: float = ROTATION_KNOWN_RAD, deviations: float = 3.0) -> float:
     """How far a right mounting may seem to be from the found one [rad]."""
     std, _ = fit.rotation_std
-    return float(np.deg2rad(2.5)) + deviations * float(np.linalg.norm(std[std < known_rad]))
+    return LAG_RAD + deviations * float(np.linalg.norm(std[std < known_rad]))
 
 
 def contradicted_within(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> float | None:

@@ -32,6 +32,7 @@ from boxplus.systems.lidar_inertial_agreement.lengths import FEWEST_SLOPES, leng
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
+from boxplus.systems.lidar_inertial_agreement.mountings import Turn, mounting_of_many, turn_from
 
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _WINDOW_S = 4.0
@@ -81,6 +82,8 @@ class Watch:
         self._first_with_clocks: Agreement | None = None
         self._slopes: list[tuple[float, float]] = []
         self._slopes_until_ns = 0
+        self._turns: list[Turn] = []
+        self._turns_until_ns = 0
 
     def add(
         self,
@@ -164,7 +167,7 @@ class Watch:
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
-        findings = self._with_lengths(agreement, findings)
+        findings = self._with_lengths(agreement, self._with_mountings(agreement, findings))
         if agreement.astray is not None:
             self._astray = agreement.astray
             findings.append(agreement.astray)
@@ -193,6 +196,17 @@ class Watch:
             self._first_with_clocks = agreement
             return None
         return clock_drift(self._first_with_clocks, agreement)
+
+    def _with_mountings(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
+        """The findings, with what all stretches so far say of a mounting that was given."""
+        rotation = agreement.rotation
+        if self._T_declared is None or rotation is None or findings or not judges_rotation(agreement):
+            return findings
+        if int(agreement.path.time_ns[0]) > self._turns_until_ns - _OVERLAP_NS:
+            self._turns.append(turn_from(rotation, self._T_declared[:3, :3]))
+            self._turns_until_ns = int(agreement.path.time_ns[-1])
+        found = mounting_of_many(self._turns)
+        return findings if found is None else [found]
 
     def _with_lengths(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
         """The findings, with what all stretches so far say of the lengths.

@@ -268,6 +268,12 @@ class VisualInertialOdometry:
         self._forget_imu(self.window.frames[0].time_ns)
         return estimate
 
+    def _longest_gap_s(self, time_ns: int) -> float:
+        """Between the samples that lie around the time from the frame before to this one [s]."""
+        first = max(int(np.searchsorted(self._imu.time_ns, self._time_ns, side="right")) - 1, 0)
+        around = self._imu.time_ns[first : int(np.searchsorted(self._imu.time_ns, time_ns)) + 1]
+        return 1e-9 * float(np.diff(around).max(initial=0))
+
     def _rate(self, time_ns: int) -> NDArray[np.float64]:
         """Angular velocity (3,) that the gyroscope measured at a time of the cameras' clock [rad/s]."""
         at = time_ns + self.window.cut_ns
@@ -284,6 +290,8 @@ class VisualInertialOdometry:
 
     def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         turn = np.eye(3)
+        if self._search.seen and self._longest_gap_s(time_ns) > self.config.max_imu_gap:
+            self._search.seen.clear()  # no start across it
         if self._search.seen:
             chosen = (self._imu.time_ns >= self._time_ns - 20_000_000) & (self._imu.time_ns <= time_ns + 20_000_000)
             attitude = GyroAttitude(self._imu.time_ns[chosen], self._imu.gyro[chosen])

@@ -163,6 +163,18 @@ def test_a_silent_imu_is_bridged_by_the_images_taken_meanwhile(cameras: int) -> 
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 4)
 
 
+@pytest.mark.parametrize(("begin_s", "end_s"), [(0.22, 0.9), (0.0, 0.6)])
+def test_no_start_reaches_across_a_silent_imu(begin_s: float, end_s: float) -> None:
+    """The samples are missing between two frames that wait for a start: those before it are of no use, and nothing breaks."""
+    flight = Flight(703, 3.0)
+    vio, estimates = run(flight, rig(), CONFIG, silent=(begin_s, end_s))
+    assert vio.start is not None and vio.contradiction is None
+    known = [e for e in estimates if e.status != "starting"]
+    assert known[0].time_ns * 1e-9 >= flight.time_ns[0] * 1e-9 + end_s
+    error, covariance = position_and_yaw_error(flight, known[0], known[-1])
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all()
+
+
 def test_what_moves_on_its_own_is_left_out_or_named() -> None:
     flight = Flight(11, 6.0)
     _, estimates = run(flight, rig(), CONFIG, SimulatedTracker(flight, rig(), moving=0.5))
