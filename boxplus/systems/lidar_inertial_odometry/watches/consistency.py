@@ -237,7 +237,8 @@ class Consistency:
             return []
         whole, known = (np.diagonal(P)[T_BW : T_BW + 3] for P in (posterior.cov, update.cov))
         bias, by_mounting = posterior.x[BW : BW + 3], np.maximum(whole - known, 0.0)
-        return self._contradicting("steady", self._steady.update(frame.scan.end_ns, bias, known, by_mounting))
+        rate = float(np.linalg.norm(frame.imu.gyro - bias, axis=1).mean())
+        return self._contradicting("steady", self._steady.update(frame.scan.end_ns, bias, known, by_mounting, rate))
 
     def _pushes(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
         """Whether the corrections of the velocity are as white as noise is."""

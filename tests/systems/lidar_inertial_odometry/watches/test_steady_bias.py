@@ -56,3 +56,17 @@ def test_a_bias_that_moves_with_an_unknown_mounting_is_not_spoken_of_but_beyond_
         told.append(steady.update(k * 10**8, np.full(3, 0.0006 * k), known, by_mounting))
     assert not any(told)
     assert steady.update(2 * 10**9, np.full(3, 0.1), known, by_mounting)
+
+
+@pytest.mark.parametrize(("scale", "told"), [(0.004, False), (0.05, True)])
+def test_what_a_gyroscopes_scale_makes_of_turns_is_no_bias_that_moved(scale: float, told: bool) -> None:
+    """The platform turns at 1.5 rad/s, one way and then the other, and the estimate of the bias follows."""
+    steady, said = SteadyBias(1e-6), []
+    known = np.full(3, 1e-8)
+    for k in range(100):
+        follows = scale * 1.5 * np.tanh((k - 50) / 10.0) * np.array([0.0, 0.0, 1.0])
+        said.append(steady.update(k * 10**8, follows, known, np.zeros(3), rate=1.5))
+    assert any(said) == told
+    at_rest = SteadyBias(1e-6)
+    assert at_rest.update(0, np.zeros(3), known, np.zeros(3)) is None
+    assert at_rest.update(10**9, np.full(3, 0.012), known, np.zeros(3))
