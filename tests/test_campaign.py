@@ -117,8 +117,10 @@ def test_what_counts_as_a_flag(campaign: SimpleNamespace, seed: int) -> None:
     )
     assert verdict(absent, unknown).verdict == "silent"
     covered = judge.Outcome(0, None, summary_of(unknown), estimate_of(simulation, 3.0, 1.0))
-    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), absent).verdict == "flagged"
-    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), faulty).verdict == "flagged"
+    of_sound = replace(sound, kinds=replace(sound.kinds, extrinsic="absent"))
+    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), of_sound).verdict == "flagged"
+    assert judge.judge(covered, judge.errors_of(covered.estimate, simulation), absent).verdict == "silent"
+    assert verdict(of_sound, unknown).verdict == "silent"  # the covariance does not cover it
     assert verdict(absent, unknown, source="identity").verdict == "flagged"
     vague = "by its own covariance the run knows its last position to 2.5 m (1 sigma) only, after a way of 80 m: {}"
     of_it = vague.format("T_imu_lidar was known to 1.8 deg and 14 cm at first (better: --T-imu-lidar)")
@@ -227,7 +229,8 @@ def test_every_fault_has_causes_and_draws_follow_from_their_seed(campaign: Simpl
 
 def test_nuisances_follow_from_their_seed_and_leave_the_rest_alone(campaign: SimpleNamespace, seed: int) -> None:
     nuisances, simulation = campaign.nuisances, replace(campaign.draws.draw(seed), duration_s=1.5).truth()
-    scene = nuisances.Scene(simulation, simulation.T_imu_lidar, simulation.scenario.lidar.channels)
+    lidar = simulation.scenario.lidar
+    scene = nuisances.Scene(simulation, simulation.T_imu_lidar, lidar.channels, lidar.vertical_fov_deg)
     drawn = [nuisances.draw_nuisances(scene, other)[1] for other in range(60)]
     assert {name for names in drawn for name in names.split("+")} == set(nuisances._MAKERS)
     plain = list(simulation.events())
@@ -292,7 +295,7 @@ def test_a_real_recording_is_spoilt_after_its_reader(campaign: SimpleNamespace, 
     T_true = np.diag([1.0, -1.0, -1.0, 1.0])
     fault = faults.inverted_extrinsic().then(faults.flip_gyro())
     spoiled, option = campaign.spoil.deliver("recorded", fault, T_true)
-    made = campaign.real.RealDraw(seed, draw.kinds, "", False, 2.0, spoiled, path, T_true, 16, {}, option)
+    made = campaign.real.RealDraw(seed, draw.kinds, "", False, 2.0, spoiled, path, T_true, 16, (-15.0, 15.0), {}, option)
     options = RecordingOptions(gyro_unit="rad/s")
     with open_recording(path, options) as plain, campaign.real.opened_real(made, options) as recording:
         assert option is None

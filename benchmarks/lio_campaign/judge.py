@@ -17,11 +17,11 @@ Where a place is featureless, nothing tells rest from a constant speed. That a r
 nothing else, and as what it does not know shows: its error arose in weak scans, or its covariance covers it. Nor is it one
 that a run refuses there because the surroundings do not show how the platform moves.
 
-Nor is it one where the exact geometry of its weak scans does leave a direction open.
+Nor is it one where the exact geometry of the weak scans that are looked at does leave a direction open.
 
 Where nobody gave the mounting, it is no news that it is unknown, nor how much of the position is for that reason; and a run that
-takes the identity for it because no motion shows it, says so and is wrong for it, has not raised a false alarm. One that says
-how well it knows the mounting, and whose covariance covers an error beyond what is right, has told of it: `flagged`.
+takes the identity for it because no motion shows it, says so and is wrong for it, has not raised a false alarm. A sound one that
+says how well it knows the mounting, and whose covariance covers an error beyond what is right, has told of it: `flagged`.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def judge(
         errors: of its trajectory; None without one.
         draw: what the recording was.
         falsely_weak: scans were called weak although the LiDAR saw enough (see `run.falsely_weak`).
-        truly_weak: scans were called weak, and in none of them the LiDAR saw enough.
+        truly_weak: scans were called weak, and in none of those looked at the LiDAR saw enough.
     """
     flags = flags_of(outcome, draw)
     reasons: list[str] = []
@@ -265,7 +265,7 @@ def judge(
     false_alarm = "" if not sound else "flagged" if flags and not with_reason else "weak" if falsely_weak else ""
     if not reasons and outcome.exit_code in (0, 3):
         return Verdict("right", reasons, flags, false_alarm)
-    told = draw.kinds.extrinsic == "absent" and reasons == ["error"] and _says_mounting_is_unknown(outcome)
+    told = sound and draw.kinds.extrinsic == "absent" and reasons == ["error"] and _says_mounting_is_unknown(outcome)
     if names_cause(flags, draw) or (sound and ((weak and draw.featureless) or guessed)):
         return Verdict("right cause", reasons, flags, false_alarm)
     if flags or weak or guessed or told:

@@ -33,18 +33,21 @@ class Scene:
     Attributes:
         truth: motion of the IMU.
         T_imu_lidar: (4, 4) the true mounting.
-        channels: of a spinning LiDAR; 1 of others.
+        channels: of a spinning LiDAR, whose points come one ring after the other, firing by firing; 1 of others.
+        elevation_deg: of its lowest and highest ring.
     """
 
     truth: Truth
     T_imu_lidar: NDArray[np.float64]
     channels: int
+    elevation_deg: tuple[float, float]
 
 
 def draw_nuisances(scene: Scene, seed: int) -> tuple[Fault, str]:
     """One to three of them as one change of the events, and their names joined by "+"."""
     random = np.random.Generator(np.random.PCG64([seed, 4]))
-    names = sorted(str(name) for name in random.choice(list(_MAKERS), int(random.integers(1, _MOST + 1)), replace=False))
+    order = list(_MAKERS)
+    names = sorted(map(str, random.choice(order, int(random.integers(1, _MOST + 1)), replace=False)), key=order.index)
     nuisance = _MAKERS[names[0]](scene, random)
     for name in names[1:]:
         nuisance = nuisance.then(_MAKERS[name](scene, random))
@@ -63,7 +66,7 @@ def _changes(
                 changed: Event | None = event if scan is None else scan(event)
             else:
                 changed = event if imu is None else imu(event)
-            if changed is not None:
+            if changed is not None and (isinstance(changed, Scan) or len(changed)):
                 yield changed
 
     return Fault(name, text, events)
@@ -118,7 +121,7 @@ def _mixed_pixels(scene: Scene, random: Random) -> Fault:
 
 def _beams(scene: Scene, random: Random) -> Fault:
     """Every laser has a range offset of its own, and looks a little elsewhere than it should."""
-    count = max(scene.channels, 1)
+    count, (low, high) = scene.channels, np.deg2rad(scene.elevation_deg)
     offset_m = random.normal(0.0, random.uniform(0.005, 0.02), count)
     offset_rad = np.deg2rad(random.normal(0.0, random.uniform(0.01, 0.06), count))
 
@@ -126,11 +129,9 @@ def _beams(scene: Scene, random: Random) -> Fault:
         p = scan.p_lidar.astype(np.float64)
         level, ranges = np.hypot(p[:, 0], p[:, 1]), np.linalg.norm(p, axis=1)
         elevation = np.arctan2(p[:, 2], level)
+        laser = np.zeros(len(p), int)
         if count > 1:
-            span = np.array([elevation.min(), elevation.max()]) if len(p) else np.zeros(2)
-            laser = np.rint((elevation - span[0]) / max(span[1] - span[0], 1e-9) * (count - 1)).astype(int)
-        else:
-            laser = np.zeros(len(p), int)
+            laser = np.clip(np.rint((elevation - low) / (high - low) * (count - 1)), 0, count - 1).astype(int)
         elevation, longer = elevation + offset_rad[laser], ranges + offset_m[laser]
         azimuth = np.arctan2(p[:, 1], p[:, 0])
         across = longer * np.cos(elevation)
@@ -230,7 +231,7 @@ def _jitter(scene: Scene, random: Random) -> Fault:
             return samples
         late = at(int(samples.time_ns[0])).exponential(imu_s * 1e9, len(samples)).astype(np.int64)
         step = int(np.diff(samples.time_ns).min())
-        return replace(samples, time_ns=np.sort(samples.time_ns + np.minimum(late, step - 1)))
+        return replace(samples, time_ns=np.sort(samples.time_ns + np.minimum(late, max(step - 1, 0))))
 
     return _changes("jitter", f"scans {1000 * scan_s:.1f} ms late on average, samples {1000 * imu_s:.1f} ms", scan, imu)
 
@@ -250,7 +251,7 @@ def _losses(scene: Scene, random: Random) -> Fault:
         return _moved(scan, scan.p_lidar, ~gone[packet])
 
     def imu(samples: ImuSamples) -> ImuSamples:
-        keep = at(int(samples.time_ns[0])).uniform(size=len(samples)) > samples_lost if len(samples) else np.zeros(0, bool)
+        keep = at(int(samples.time_ns[0])).uniform(size=len(samples)) > samples_lost
         return ImuSamples(samples.time_ns[keep], samples.gyro[keep], samples.accel[keep])
 
     percent = [f"{100.0 * share:.1f} %" for share in (samples_lost, packets_lost, scans_lost)]
@@ -283,13 +284,14 @@ def _axes(random: Random, sigma: float) -> NDArray[np.float64]:
 
 
 _MAKERS: dict[str, Callable[[Scene, Random], Fault]] = {
-    "dropouts": _dropouts,
-    "mixed_pixels": _mixed_pixels,
-    "beams": _beams,
     "people": _people,
     "carrier": _carrier,
+    "mixed_pixels": _mixed_pixels,
+    "beams": _beams,
     "tails": _tails,
-    "jitter": _jitter,
+    "dropouts": _dropouts,
     "losses": _losses,
+    "jitter": _jitter,
     "imu_errors": _imu_errors,
 }
+"""From the scene to the computer: in this order they are laid upon each other."""

@@ -30,7 +30,8 @@ from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, Setting, deliver, d
 
 _FLIGHTS = {"V1_03_difficult": 104.0, "MH_05_difficult": 110.0}
 """Sequences with the seconds of them that may be used."""
-_SENSORS = ("velodyne", "ouster", "livox")
+_SENSORS = {"velodyne": (-15.0, 15.0), "ouster": (-22.5, 22.5), "livox": (0.0, 0.0)}
+"""Sensors with the elevations of their lowest and highest ring [deg]; a Livox has none."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class RealDraw:
     Attributes:
         path: of the bag.
         T_true: (4, 4) the true mounting.
-        channels: of a spinning LiDAR; 1 of others.
+        channels, elevation_deg: of a spinning LiDAR, its lowest and highest ring; 1 and zero of others.
     """
 
     seed: int
@@ -52,6 +53,7 @@ class RealDraw:
     path: Path
     T_true: NDArray[np.float64]
     channels: int
+    elevation_deg: tuple[float, float] = (0.0, 0.0)
     recording_options: dict[str, Any] = field(default_factory=dict)
     T_imu_lidar: NDArray[np.float64] | None = None
 
@@ -90,7 +92,7 @@ def draw_real(seed: int, shared: Path, work: Path) -> RealDraw:
     flight = str(random.choice(list(_FLIGHTS)))
     duration_s = float(random.uniform(12.0, 20.0))
     start_s = float(random.uniform(0.0, _FLIGHTS[flight] - duration_s))
-    sensor, corridor = str(random.choice(_SENSORS)), bool(random.uniform() < 0.15)
+    sensor, corridor = str(random.choice(list(_SENSORS))), bool(random.uniform() < 0.15)
     extrinsic = str(random.choice(EXTRINSICS, p=(0.4, 0.4, 0.2)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
     if fault in MOUNTING_FAULTS and extrinsic == "absent":
@@ -132,6 +134,7 @@ def draw_real(seed: int, shared: Path, work: Path) -> RealDraw:
         path=path,
         T_true=T_true,
         channels=1 if sensor == "livox" else rings,
+        elevation_deg=_SENSORS[sensor],
         recording_options=spoiling.recording_options,
         T_imu_lidar=option,
     )

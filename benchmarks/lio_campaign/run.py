@@ -55,7 +55,8 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False) -> d
     simulation = made.truth()
     if rough:
         lidar = simulation.scenario.lidar
-        made = _roughened(made, Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1)))
+        elevation = getattr(lidar, "vertical_fov_deg", (0.0, 0.0))
+        made = _roughened(made, Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1), elevation))
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         if command_line:
@@ -63,7 +64,7 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False) -> d
         else:
             outcome = _in_process(lambda options: _opened(made, simulation, work, options), made, work)
     suspects: list[dict[str, float]] = []
-    if made.kinds.fault == "none" and not made.featureless and outcome.estimate is not None:
+    if _looked_at(made) and outcome.estimate is not None:
         suspects = falsely_weak(outcome.estimate, simulation)
     facts = {"seed": seed, "real": False, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
     if command_line:
@@ -84,7 +85,7 @@ def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
         work = Path(folder)
         made = draw_real(seed, shared, work)
         if rough:
-            made = _roughened(made, Scene(made.truth(), made.T_true, made.channels))
+            made = _roughened(made, Scene(made.truth(), made.T_true, made.channels, made.elevation_deg))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
     facts = {"seed": seed, "real": True, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
@@ -98,11 +99,16 @@ def _roughened(made: _AnyDraw, scene: Scene) -> _AnyDraw:
     return replace(made, spoiled=nuisance.then(made.spoiled), kinds=replace(made.kinds, nuisance=names), detail=detail)
 
 
+def _looked_at(made: Drawn) -> bool:
+    """Whether the exact geometry says which scans are weak: of a sound simulation whose points are those of the LiDAR's model."""
+    sound = made.kinds.fault == "none" and made.kinds.nuisance == "none"
+    return sound and not made.featureless and not isinstance(made, RealDraw)
+
+
 def _judged(made: Drawn, outcome: Outcome, truth: Truth, suspects: list[dict[str, float]]) -> dict[str, Any]:
     errors = None if outcome.estimate is None else errors_of(outcome.estimate, truth)
     weak = outcome.estimate is not None and outcome.estimate.status is not None and "weak" in set(outcome.estimate.status)
-    looked_at = made.kinds.fault == "none" and not made.featureless and not isinstance(made, RealDraw)
-    verdict = judge(outcome, errors, made, falsely_weak=bool(suspects), truly_weak=weak and looked_at and not suspects)
+    verdict = judge(outcome, errors, made, falsely_weak=bool(suspects), truly_weak=weak and _looked_at(made) and not suspects)
     return asdict(verdict) | _figures(errors) | _facts(outcome) | {"falsely_weak_scans": suspects}
 
 

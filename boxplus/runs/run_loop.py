@@ -127,7 +127,6 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
         self.write_summary("running")
         try:
             state = self._process(should_stop)
-            self.ended = time.perf_counter()
             if state == "finished" and not self.counts.count:
                 raise self.nothing_found()
             self.finish()
@@ -162,12 +161,14 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
                     self.keep(estimate)
                 self.show_progress()
                 if event is None:
+                    self.ended = time.perf_counter()
                     self.at_end("finished")
                     return "finished"
                 self.events += 1
                 self.between_events()
                 if time.perf_counter() > self._summary_due:
                     self.write_summary("running")
+            self.ended = time.perf_counter()
             self.at_end("interrupted")
         return "interrupted"
 

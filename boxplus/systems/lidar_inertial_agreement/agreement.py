@@ -132,6 +132,8 @@ def _compare(
         surer = None
     elif _doubtful(found, T_declared):
         surer = surer_path(path, scans, config, guesses)
+    elif _turns_off(found.rotation):
+        surer = surer_path(path, scans, config, guesses) or path
     if surer is None:
         return replace(found, rotation=None, translation=None, astray=astray)
     if surer is not path:
@@ -139,8 +141,7 @@ def _compare(
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
     slope = 1.0 if found.translation is None else found.translation.slope
     steady = found.rotation
-    doubtful = (slope > 0.0 and _off(slope)) or (steady is not None and _turns_off(steady))
-    if (refine or doubtful) and steady is not None and steady.explained > _EXPLAINED:
+    if (refine or (slope > 0.0 and _off(slope)) or _turns_off(steady)) and steady is not None and steady.explained > _EXPLAINED:
         shift_ns = round(steady.offset_s * 1e9) if steady.offset_std_s < _OFFSET_KNOWN_S else 0
         corrected = GyroAttitude(imu.time_ns, (imu.gyro - steady.bias) / unit_of(steady.scale))
         refined = lidar_path(
@@ -199,13 +200,14 @@ def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
         unit = max(unit_of(rotation.scale), 1.0)
         strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(found.gyro_power)) / unit)
         return strong > float(_TURNING_RAD_S)
-    if _turns_off(rotation):
-        return True
     return T_declared is not None and contradicted_within(rotation, T_declared[:3, :3]) is not None
 
 
-def _turns_off(rotation: RotationFit) -> bool:
-    return abs(rotation.scale / unit_of(rotation.scale) - 1.0) > _TURNS_DOUBTFUL
+def _turns_off(rotation: RotationFit | None) -> bool:
+    """Whether the gyroscope's scale seems to be wrong, by more than it is known to."""
+    if rotation is None:
+        return False
+    return abs(rotation.scale / unit_of(rotation.scale) - 1.0) > max(_TURNS_DOUBTFUL, 3.0 * rotation.scale_std)
 
 
 def _off(slope: float) -> bool:

@@ -38,6 +38,7 @@ _FITS = 0.8
 _CLOSELY = 0.95
 _REVERSED = 0.6  # a sign is told from its opposite by less than a scale from another
 _SCALE_OFF = 0.12
+_AS_WELL = 0.02  # of what is explained, by a mirror and by a mounting: turns about one axis do not tell them apart
 _OFFSET_OK_S = 0.014
 _OFFSET_STD_S = 0.012
 _SLOPE_OF_MANY_FLOOR = 0.03
@@ -325,10 +326,10 @@ def _of_lengths(agreement: Agreement, translation: TranslationFit, T_declared: N
             "flipped, gravity instead of specific force (negate the accelerations), or the LiDAR's points are mirrored"
         )
         rotation = agreement.rotation
-        if T_declared is None and rotation is not None and rotation.mirrored > _FITS:
+        if T_declared is None and rotation is not None and rotation.mirrored > rotation.explained - _AS_WELL:
             text += (
-                "; or the gyroscope's sign is flipped: nobody gave T_imu_lidar, and turns about one axis fit a mounting that is "
-                "half a turn off as well"
+                "; or the gyroscope's sign is flipped: nobody gave T_imu_lidar, and these turns fit a mounting that is half a "
+                "turn off as well"
             )
         return Finding("force_sign", text)
     if translation.explained < _FITS or translation.sigma > MISFIT_M or _lags(agreement):

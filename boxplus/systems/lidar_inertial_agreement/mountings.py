@@ -17,15 +17,22 @@ from boxplus.systems.lidar_inertial_agreement.agreement import LAG_RAD, ROTATION
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 
-FEWEST_TURNS = 2
+_FEWEST_TURNS = 2
+_KNOWN_RAD = 0.1  # of an axis, by a stretch alone: what is known coarsely has errors that no number of stretches averages away
+_ALIKE = 0.75  # of the stretches, that turn the same way
 _DEVIATIONS = 3.0
 
 Turn = tuple[NDArray[np.float64], NDArray[Any]]
 
 
 def turn_from(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> Turn:
-    """The rotation (3,) from a mounting to the one that a stretch shows, about the IMU's axes, and its information (3, 3)."""
-    return so3.log(fit.R_imu_lidar @ R_imu_lidar.T), np.linalg.inv(fit.covariance[:3, :3])
+    """The rotation (3,) from a mounting to the one that a stretch shows, about the IMU's axes, and its information (3, 3).
+
+    Axes that the stretch does not know by itself have none.
+    """
+    variance, axes = np.linalg.eigh(fit.covariance[:3, :3])
+    known = np.where(variance < _KNOWN_RAD**2, 1.0 / variance, 0.0)
+    return so3.log(fit.R_imu_lidar @ R_imu_lidar.T), (axes * known) @ axes.T
 
 
 def mounting_of_many(turns: Sequence[Turn]) -> Finding | None:
@@ -34,17 +41,19 @@ def mounting_of_many(turns: Sequence[Turn]) -> Finding | None:
     Args:
         turns: of each, from `turn_from`.
     """
-    if len(turns) < FEWEST_TURNS:
+    if len(turns) < _FEWEST_TURNS:
         return None
-    information = sum((known for _, known in turns), np.zeros((3, 3)))
+    information = sum((known for _, known in turns), 1e-6 * np.eye(3))
     theta = np.linalg.solve(information, sum((known @ turn for turn, known in turns), np.zeros(3)))
     # Stretches that differ by more than they say know less than they say.
     scatter = sum(float((turn - theta) @ known @ (turn - theta)) for turn, known in turns) / (3.0 * (len(turns) - 1))
     variance, axes = np.linalg.eigh(np.linalg.inv(information))
     std = np.sqrt(variance * max(scatter, 1.0))
     seen = std < ROTATION_KNOWN_RAD
-    angle, sigma = float(np.linalg.norm((axes.T @ theta)[seen])), float(np.linalg.norm(std[seen]))
-    if angle < LAG_RAD + _DEVIATIONS * sigma:
+    off = (axes * seen) @ axes.T @ theta
+    angle, sigma = float(np.linalg.norm(off)), float(np.linalg.norm(std[seen]))
+    alike = np.mean([float(off @ known @ turn) > 0.5 * float(off @ known @ off) for turn, known in turns])
+    if angle < LAG_RAD + _DEVIATIONS * sigma or alike < _ALIKE:
         return None
     return Finding(
         "extrinsic",

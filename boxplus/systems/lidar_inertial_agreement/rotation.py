@@ -289,6 +289,11 @@ def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns:
 class _Refined:
     """Gauss-Newton on rotation, bias, scale and offset together, robustly, from the best rotation at one offset."""
 
+    R: NDArray[np.float64]
+    scale: float
+    bias: NDArray[np.float64]
+    offset_s: float
+
     def __init__(
         self,
         exact: Callable[[float], NDArray[np.float64]],
@@ -298,24 +303,32 @@ class _Refined:
     ) -> None:
         self._exact, self._rate_lidar = exact, rate_lidar
         start = _Kabsch(exact(offset_s), rate_lidar, R_expected)
-        self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
+        self._begin(start, offset_s)
         for _ in range(_ROUNDS):
-            step = self._step()
+            step = -np.linalg.solve(*self._linearized())
             self.R = so3.exp(step[:3]) @ self.R
             self.bias = self.bias + step[3:6]
             self.scale *= float(np.exp(np.clip(step[6], -0.7, 0.7)))
             self.offset_s += float(np.clip(step[7], -0.02, 0.02))
             if np.abs(step).max() < 1e-6:
                 break
-        self.explained = _Kabsch(exact(self.offset_s), rate_lidar, R_expected).explained
-        if self.explained < start.explained - _LED_ASTRAY:
+        if self._explained() < start.explained - _LED_ASTRAY:
             # What hardly changes shows neither scale nor offset, and steps along them lead anywhere.
-            self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
-            self.explained = start.explained
-            self._step()
+            self._begin(start, offset_s)
+            self._linearized()
+        self.explained = _Kabsch(exact(self.offset_s), rate_lidar, R_expected).explained
 
-    def _step(self) -> NDArray[np.float64]:
-        """Residuals, their weights and information where the estimate is, and the step (8,) from there."""
+    def _begin(self, start: _Kabsch, offset_s: float) -> None:
+        self.R, self.scale, self.bias, self.offset_s = start.R, max(start.scale, 1e-3), start.bias, offset_s
+
+    def _explained(self) -> float:
+        """Share of the LiDAR's turning that these rotation, scale and offset explain, as `_Kabsch.explained` is of its own."""
+        left = self._exact(self.offset_s) - self.scale * self._rate_lidar @ self.R.T
+        turned = self._rate_lidar - self._rate_lidar.mean(axis=0)
+        return 1.0 - float(((left - left.mean(axis=0)) ** 2).sum()) / max(self.scale**2 * float((turned**2).sum()), 1e-12)
+
+    def _linearized(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The normal equations (8, 8), (8,) of a step from where the estimate is; residuals, weights and information there."""
         rate_imu = self._exact(self.offset_s)
         slope = (self._exact(self.offset_s + _SLOPE_S) - self._exact(self.offset_s - _SLOPE_S)) / (2.0 * _SLOPE_S)
         seen = self.scale * self._rate_lidar @ self.R.T
@@ -334,10 +347,7 @@ class _Refined:
         self.H: NDArray[np.float64] = flat.T @ flat
         # What the motion does not show stays: a pull too small to matter where it does.
         prior = np.array([1e-3, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-3, 1e-3]) * sigma**2
-        step: NDArray[np.float64] = -np.linalg.solve(
-            self.H + np.diag(prior), flat.T @ (self.residual * root[:, None]).reshape(-1)
-        )
-        return step
+        return self.H + np.diag(prior), flat.T @ (self.residual * root[:, None]).reshape(-1)
 
 
 class _Kabsch:

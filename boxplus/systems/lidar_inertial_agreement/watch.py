@@ -43,6 +43,7 @@ _UNDECIDED_EVERY_S = 4.0  # until the motion has once shown enough
 _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
 _MOST_SLOPES = 6  # that are asked for sooner than what is decided
+_OF_ACCELERATIONS = ("length_scale", "force_sign")  # causes that leave rotations as they are
 _OVERLAP_NS = 500_000_000  # of stretches that count as two
 
 
@@ -158,8 +159,9 @@ class Watch:
         findings = contradictions(agreement, self._T_declared)
         if self._T_declared is None and not findings:
             findings = [finding for finding in [mounting_in_use(agreement, self._T_compared)] if finding is not None]
-        if shows_mounting(agreement) and not findings:
-            self.mounting_borne_out = True
+        other_mounting = self._by_all_stretches(agreement, findings)
+        if other_mounting is not None or (shows_mounting(agreement) and not findings):
+            self.mounting_borne_out = other_mounting is None
         # Registrations that went astray turn like nothing else either: once is not enough to part two sensors.
         doubted, self._doubted = self._doubted, bool(findings) and findings[0].cause == "not_together"
         if self._doubted and not doubted:
@@ -167,7 +169,9 @@ class Watch:
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
-        findings = self._with_lengths(agreement, self._with_mountings(agreement, findings))
+        findings = self._with_lengths(agreement, findings)
+        if other_mounting is not None and not any(finding.cause == "extrinsic" for finding in findings):
+            findings.append(other_mounting)
         if agreement.astray is not None:
             self._astray = agreement.astray
             findings.append(agreement.astray)
@@ -197,16 +201,16 @@ class Watch:
             return None
         return clock_drift(self._first_with_clocks, agreement)
 
-    def _with_mountings(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
-        """The findings, with what all stretches so far say of a mounting that was given."""
+    def _by_all_stretches(self, agreement: Agreement, findings: list[Finding]) -> Finding | None:
+        """What all stretches so far say together of a mounting that was given; the newest is one where nothing else is off."""
         rotation = agreement.rotation
-        if self._T_declared is None or rotation is None or findings or not judges_rotation(agreement):
-            return findings
+        sound = all(finding.cause in _OF_ACCELERATIONS for finding in findings)
+        if self._T_declared is None or rotation is None or not sound or not judges_rotation(agreement):
+            return mounting_of_many(self._turns)
         if int(agreement.path.time_ns[0]) > self._turns_until_ns - _OVERLAP_NS:
             self._turns.append(turn_from(rotation, self._T_declared[:3, :3]))
             self._turns_until_ns = int(agreement.path.time_ns[-1])
-        found = mounting_of_many(self._turns)
-        return findings if found is None else [found]
+        return mounting_of_many(self._turns)
 
     def _with_lengths(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
         """The findings, with what all stretches so far say of the lengths.

@@ -44,6 +44,7 @@ from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
 
 _START_ITERATIONS = 20
 _OUTLIER = 4.0  # standard deviations
+BEFORE_A_GAP = "frames that waited for a start when samples of the IMU were missing"
 REPEATED = "images that are the one before, while the IMU moved"
 _LONGEST_STALL_NS = 3_000_000_000  # that images which come again are left out
 _GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
@@ -291,7 +292,8 @@ class VisualInertialOdometry:
     def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         turn = np.eye(3)
         if self._search.seen and self._longest_gap_s(time_ns) > self.config.max_imu_gap:
-            self._search.seen.clear()  # no start across it
+            self._counters[BEFORE_A_GAP] += len(self._search.seen)
+            self._search = StartSearch()
         if self._search.seen:
             chosen = (self._imu.time_ns >= self._time_ns - 20_000_000) & (self._imu.time_ns <= time_ns + 20_000_000)
             attitude = GyroAttitude(self._imu.time_ns[chosen], self._imu.gyro[chosen])

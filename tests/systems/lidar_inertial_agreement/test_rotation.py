@@ -56,6 +56,7 @@ def test_a_turn_about_one_axis_that_just_begins_is_no_flipped_sign(seed: int) ->
     fit = compared(rate, np.full((46, 1), 0.015), so3.exp(random.normal(size=3)), random)
     assert fit.explained > 0.75
     assert fit.explained > fit.mirrored - 0.02
+    assert abs(fit.scale - 1.0) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -179,3 +179,32 @@ def test_live_no_scan_waits_for_the_comparison(monkeypatch: pytest.MonkeyPatch) 
     may_end.set()
     told = following.finish()
     assert told is not None and following.contradiction is not None and following.contradiction.text == told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degrees", "named"), [(6.0, True), (0.0, False)])
+def test_a_given_mounting_is_contradicted_by_all_stretches_together_and_stays_so(degrees: float, named: bool) -> None:
+    """Also past a stretch that asks for another length by itself, and one that shows nothing."""
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=T)
+    assert seen.rotation is not None and seen.translation is not None
+    covariance, of_slope = seen.rotation.covariance.copy(), seen.translation.covariance.copy()
+    covariance[:3, :3], of_slope[SLOPE, SLOPE] = np.deg2rad(0.9) ** 2 * np.eye(3), 0.045**2
+    rotation = replace(seen.rotation, R_imu_lidar=turned(T, degrees, 0)[:3, :3], covariance=covariance)
+    assert contradictions(replace(seen, rotation=rotation), T) == []  # by no stretch alone
+    following, stages = watch.Watch(CONFIG, T), []
+    for k, slope in enumerate([1.0, 1.0, 1.0, 1.0, 1.3, 1.0, None]):
+        time_ns = seen.path.time_ns - seen.path.time_ns[0] + k * 8_000_000_000
+        translation = replace(seen.translation, slope=slope or 1.0, covariance=of_slope, explained=0.9)
+        shown = None if slope is None else rotation
+        agreement = replace(seen, path=replace(seen.path, time_ns=time_ns), rotation=shown, translation=translation)
+        following._take_up(agreement)
+        stages.append((following.contradiction is not None, following.mounting_borne_out))
+    assert stages[0] == (False, True)
+    first = next((k for k, (contradicted, _) in enumerate(stages) if contradicted), len(stages))
+    assert (first < 4) == named
+    assert all(contradicted and not borne_out for contradicted, borne_out in stages[first:])
+    if named:
+        assert following.contradiction is not None and "stretches together" in following.contradiction.text

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from boxplus import CameraImage, InputError
 from boxplus.manifolds import so3
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VioEstimate, VisualInertialOdometry
+from boxplus.systems.visual_inertial_odometry.odometry import BEFORE_A_GAP
 from tests.systems.visual_inertial_odometry.simulated_rays import (
     PIXEL_SIGMA,
     Flight,
@@ -169,6 +170,7 @@ def test_no_start_reaches_across_a_silent_imu(begin_s: float, end_s: float) -> N
     flight = Flight(703, 3.0)
     vio, estimates = run(flight, rig(), CONFIG, silent=(begin_s, end_s))
     assert vio.start is not None and vio.contradiction is None
+    assert (BEFORE_A_GAP in vio.counters) == (begin_s > 0.0)  # from the beginning on, no frame waited
     known = [e for e in estimates if e.status != "starting"]
     assert known[0].time_ns * 1e-9 >= flight.time_ns[0] * 1e-9 + end_s
     error, covariance = position_and_yaw_error(flight, known[0], known[-1])

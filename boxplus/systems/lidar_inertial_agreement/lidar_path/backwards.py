@@ -35,7 +35,7 @@ def surer_path(
         config, guesses: as for `lidar_path`.
     """
     back = lidar_path_backwards(scans, config, guesses)
-    # A whole path that is one motion either way.
+    # A path that is whole, before one that is not.
     if not (_whole(path) and _whole(back)) or not np.array_equal(path.time_ns, back.time_ns):
         return path if len(np.unique(path.segment)) <= len(np.unique(back.segment)) else back
     chosen = scans_of(path.time_ns, scans)
