@@ -77,6 +77,19 @@ def test_a_view_is_shown_every_frame_as_it_is_written(finished: tuple[VioFolder,
     assert known == read_trajectory(folder.trajectory).time_ns.tolist()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rolling", [False, True])
+def test_a_run_without_trouble_says_that_its_shutter_rolls(tmp_path: Path, rolling: bool) -> None:
+    simulation = simulate_cameras("room_moving", 4, duration_s=7.5, rig=make_rig("stereo", None, 0.35, 10.0))
+    fault = make_camera_fault("rolling_shutter") if rolling else None
+    with as_camera_recording(simulation, fault) as recording:
+        summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
+    assert summary.contradiction is None
+    said = [warning.text for warning in summary.warnings if "a rolling shutter is suspected" in warning.text]
+    assert len(said) == rolling
+    assert read_vio_summary(VioFolder(tmp_path / "out").summary).warnings == summary.warnings
+
+
 def test_every_frame_with_a_state_has_a_row_everywhere(finished: tuple[VioFolder, VioSummary]) -> None:
     folder, summary = finished
     trajectory, frames = read_trajectory(folder.trajectory), read_frame_log(folder.frames)

@@ -20,7 +20,7 @@ _SEARCH_S, _STEP_S = 0.04, 0.002
 _SMALL_S = 0.004
 _SURE = 5.0
 # Corners that err alike, as neighbours do. With it, four rendered global shutters came to 0.0 to 0.4 deviations from none, four
-# rolling ones to 1 to 3 from theirs (6 ms too short at most), and EuRoC's MH_01, V1_03 and MH_05 to 3.7, 1 and 1 (1.1 ms at most).
+# rolling ones to 1 to 3 from theirs (6 ms too short at most), EuRoC's MH_01, V1_03 and MH_05 to 3.7, 1 and 1 (1.1 ms at most).
 # A focal length is pulled by what all corners share, and counts pairs of images.
 _ALIKE = 4.0
 
