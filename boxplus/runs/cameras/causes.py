@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.recordings.info import Evidence
+from boxplus.recordings.stream_checks import check_rate
 from boxplus.runs.inspection.cameras.comparison import Comparison
+from boxplus.runs.inspection.cameras.views import Views, check_views
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
@@ -22,6 +26,7 @@ BEFORE_S = 14.0
 """How much of a recording before an instant is looked at [s]."""
 
 _AFTER_S = 2.0
+_GAP = 1.5  # times the usual interval between images, as for 'boxplus inspect'
 _MARGIN_NS = 500_000_000  # of IMU samples on both sides
 
 
@@ -58,6 +63,7 @@ def _examined(
     pictures = [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
     compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (BEFORE_S + _AFTER_S))))
+    views = {camera.index: (camera.name, Views()) for camera in pictures}
     begin_ns = None
     to_8_bits, imu = EightBits(), []
     try:
@@ -72,11 +78,19 @@ def _examined(
                 if event.time_ns[-1] > begin_ns - _MARGIN_NS:
                     imu.append(event)
             elif not event.is_depth and event.camera < cameras and time_ns >= begin_ns:
-                compared.note(event, to_8_bits(event.grey()))
+                grey = to_8_bits(event.grey())
+                compared.note(event, grey)
+                views[event.camera][1].note(event, grey)
     except RecordingError:
         return []
-    found = compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu and with_imu else [])
+    found = [finding for name, seen in views.values() for finding in _of_images(name, seen)]
+    found += compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu and with_imu else [])
     return [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
+
+
+def _of_images(name: str, seen: Views) -> list[Evidence]:
+    """Images that are missing, dark, or show nothing."""
+    return check_rate(name, np.array(seen.time_ns, np.int64), gap_factor=_GAP) + check_views(name, seen)
 
 
 def _sentence(finding: Evidence) -> str:

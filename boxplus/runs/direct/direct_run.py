@@ -128,10 +128,11 @@ class _Run(CameraRun[Estimate, DirectSummary]):
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
         super().at_end(state)
-        if state == "finished" and self._cameras.kind == "stereo" and self.counts.count and self._contradiction() and has("cv2"):
+        if state == "finished" and self.counts.count and self._contradiction() and has("cv2"):
             self.stage = "looking for the cause"
             self.show_progress()
-            self._causes = likely_causes(self._info, self.recording.read_again(), 2, self._troubled_ns, with_imu=False)
+            cameras = 2 if self._cameras.kind == "stereo" else 1
+            self._causes = likely_causes(self._info, self.recording.read_again(), cameras, self._troubled_ns, with_imu=False)
 
     def push(self, event: CameraEvent) -> list[Estimate]:
         """See `RunLoop.push`."""
