@@ -80,6 +80,7 @@ class Alignment:
             this is another place or a wrong pose; `unobservable`, a direction of motion about which grey values say
             no more than their noise.
         reason: why the pose must not be believed, in a sentence with figures; empty when `converged`.
+        shift_px: of the image that makes grey values differ by as much as they do [px]; from one on it is another place.
 
     Example:
         >>> camera, v = bp.Pinhole(100.0, 100.0, 63.5, 47.5), np.linspace(0.0, 20.0, 128)
@@ -100,6 +101,7 @@ class Alignment:
     iterations: tuple[int, ...]
     status: Status
     reason: str
+    shift_px: float = 0.0
 
 
 def track(
@@ -307,7 +309,7 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
     overlap, count = pixels / len(level.grey), max(pixels, 1)
     covariance = np.full((6, 6), np.nan)
     status: Status = "converged"
-    reason = ""
+    reason, shift_px = "", 0.0
     unit = np.array([1.0, 1.0, 1.0, descent.reach, descent.reach, descent.reach])
     H, all_weights = descent.with_equal_shares(level, image)
     information = (_without_brightness(H) if descent.brightness else H[:6, :6]) * unit[:, None] * unit
@@ -327,6 +329,7 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         signal = _signal(information, noise)
         above_image = np.inf if level.gradient_noise == 0.0 else float(_signal(information, image_noise)[0])
         is_right_place = signal.mean() >= _LEAST_MEAN_SIGNAL
+        shift_px = float(np.sqrt(_LEAST_MEAN_SIGNAL / signal.mean()))
         is_known = signal[0] >= _LEAST_SIGNAL and above_image >= _LEAST_SIGNAL
         if code == ITERATION_LIMIT:
             status = "iteration limit"
@@ -334,7 +337,7 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         elif not is_right_place:
             status = "large residual"
             reason = (
-                f"grey values differ by {sigma:.3g}, as much as a shift of {2.0 / np.sqrt(signal.mean()):.2g} pixels makes them "
+                f"grey values differ by {sigma:.3g}, as much as a shift of {shift_px:.2g} pixels makes them "
                 "differ (1 at most): the image shows something else, or the start was too far away"
             )
         elif not is_known:
@@ -357,6 +360,7 @@ def _judged(descent: _Descent, level: Level, image: Image, code: int, iterations
         iterations=iterations,
         status=status,
         reason=reason,
+        shift_px=shift_px,
     )
 
 

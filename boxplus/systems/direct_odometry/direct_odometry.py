@@ -50,6 +50,7 @@ DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its po
 _STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _WORLD = np.diag([1e-5**2] * 6)  # of the first pose, which is the world's
 _SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lost
+_NEARLY_LOST = 0.5  # pixels, a shift of which makes grey values differ as much: with one the view is lost
 _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
 _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find again in its second view
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
@@ -282,8 +283,7 @@ class DirectOdometry:
             self._reference, self._seen_ns = keyframe, time_ns
             self._velocity_s = self._log_gain = self._offset = 0.0
         watch.lap("keyframe")
-        number = -1 if keyframe is None else keyframe.number
-        return self._estimate(time_ns, number, keyframe is not None, None, verdict, watch)
+        return self._estimate(time_ns, -1 if keyframe is None else keyframe.number, keyframe is not None, None, verdict, watch)
 
     def _predicted(self, elapsed_s: float) -> Matrix:
         """Where the camera is if its motion goes on."""
@@ -333,7 +333,7 @@ class DirectOdometry:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
         keyframe.least_sigma = min(keyframe.least_sigma, alignment.sigma)
-        fits_worse = alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
+        fits_worse = alignment.shift_px > _NEARLY_LOST or alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
         return fits_worse or max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:

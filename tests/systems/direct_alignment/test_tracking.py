@@ -142,6 +142,7 @@ def test_what_cannot_be_trusted_is_flagged(seed: int) -> None:
     keyframe = Keyframe.prepare(first, depth, CAMERA, levels=3)
     elsewhere, _, _ = textured_plane(seed + 100, MOTION)
     assert told(track(keyframe, elsewhere), "large residual", "something else")
+    assert track(keyframe, elsewhere).shift_px > 1.0 > 0.5 > track(keyframe, first).shift_px
     assert told(track(keyframe, np.full_like(first, 90.0) + rng.normal(size=first.shape)), "large residual", "differ by")
     away = track(keyframe, first, T_21=[1.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0])
     assert told(away, "little overlap", "of the keyframe land in the image") and away.overlap < 0.2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
+from boxplus.sensors.image import Image
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
+from boxplus.systems.direct_odometry.verdict import Tracked
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Drive, Room, drive, errors
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -335,3 +338,21 @@ def test_recorded_stereo_frames() -> None:
         assert estimate.status == "ok"
     length = np.linalg.norm(true[8][:, 3])
     assert abs(np.linalg.norm(estimate.p_world_camera) - length) < 0.01 * length
+
+
+def test_a_frame_whose_view_is_nearly_lost_becomes_a_keyframe(drives: list[Drive], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grey values that differ by as much as a shift of half a pixel: by the next frame it may be a whole one."""
+    seen, asked = drives[0], []
+    plain = DirectOdometry._track
+
+    def nearly_lost(odometry: DirectOdometry, image: Image, T_predicted: Matrix) -> Tracked:
+        tracked = plain(odometry, image, T_predicted)
+        alignment = replace(tracked.alignment, shift_px=0.6 if len(asked) == 3 else 0.1)
+        asked.append(alignment.shift_px)
+        return tracked._replace(alignment=alignment)
+
+    monkeypatch.setattr(DirectOdometry, "_track", nearly_lost)
+    config = DirectOdometryConfig(keyframe_flow=0.5, keyframe_flow_translation=0.5, keyframe_residual=50.0)
+    odometry = DirectOdometry(CAMERA, config)
+    estimates = [odometry.push_rgbd(t, g, z) for t, g, z in zip(seen.time_ns[:7], seen.grey, seen.depth, strict=False)]
+    assert [k for k, estimate in enumerate(estimates) if estimate.is_keyframe] == [0, 4]
