@@ -111,7 +111,7 @@ class Health:
         if self._disagreeing > _DISAGREE:
             sentences.append(
                 f"{100 * self._disagreeing:.0f} % of the landmarks seen are not where they should be: much of the view moves on "
-                "its own, or camera and IMU do not belong together as calibrated"
+                f"its own, or cameras and IMU do not belong together as calibrated ({self._calibrated(tracks)})"
             )
         if self._imu_ratio > _IMU_RATIO:
             sentences.append(
@@ -132,6 +132,12 @@ class Health:
                 "which camera is which, and T_imu_camera"
             )
         return sentences
+
+    @staticmethod
+    def _calibrated(tracks: Tracks) -> str:
+        """What of a calibration may be wrong."""
+        several = tracks.pixels.shape[1] > 1
+        return f"mountings{', the baseline between cameras' if several else ''}, focal lengths, clocks"
 
     def _view(self, tracks: Tracks) -> str:
         """What the images themselves say about it."""

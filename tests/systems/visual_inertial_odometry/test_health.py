@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from boxplus.errors import SingularProblemError
@@ -44,6 +46,19 @@ def test_an_imu_within_its_noise_is_ok_and_one_that_goes_on_beyond_it_a_contradi
     statuses = judged(off, 1.6, 80)
     assert statuses[0] == "ok" and statuses[-1] == "weak"
     assert off.contradiction is not None and "the IMU disagrees with the cameras" in off.contradiction
+
+
+def test_landmarks_that_are_elsewhere_name_the_baseline_where_there_is_one() -> None:
+    wrong = Fit(10, 30, np.zeros(0, np.int64), 0.2, 0.3)
+    for cameras, named in ((1, False), (2, True)):
+        health = Health(VioConfig())
+        health.begin(0)
+        for k in range(1, 80):
+            tracks = frame(k)
+            seen = replace(tracks, pixels=np.zeros((40, cameras, 2)), contrast=np.full(cameras, 40.0))
+            health.judge(seen, wrong, False, 0.005, 0.01)
+        assert health.contradiction is not None and "of the landmarks seen are not where they should be" in health.contradiction
+        assert ("baseline" in health.contradiction) == named
 
 
 def test_a_pose_that_nothing_determines_is_lost() -> None:
