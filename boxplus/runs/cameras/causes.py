@@ -89,7 +89,9 @@ def _examined(
 
 
 def _of_images(name: str, seen: Views) -> list[Evidence]:
-    """Images that are missing, dark, or show nothing."""
+    """Images that are missing, dark, or show nothing; nothing of a camera that has none there."""
+    if len(seen.time_ns) < 2:
+        return []
     return check_rate(name, np.array(seen.time_ns, np.int64), gap_factor=_GAP) + check_views(name, seen)
 
 
