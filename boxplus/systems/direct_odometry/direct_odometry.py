@@ -50,7 +50,7 @@ DepthOf = Callable[[Matrix, float], SensedDepth]  # of a new keyframe, by its po
 _STANDSTILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _WORLD = np.diag([1e-5**2] * 6)  # of the first pose, which is the world's
 _SEARCH_DEG = 20.0  # how far around the last pose a view is looked for while lost
-_NEARLY_LOST = 0.5  # pixels, a shift of which makes grey values differ as much: with one the view is lost
+_NEARLY_LOST = 0.5, 1.25  # px, whose shift changes grey values as much (one is lost); and by those of the frames before
 _STAYS = 0.7  # the keyframe that is tracked is left only for one that is closer by this factor
 _LEAST_FOUND = 0.4  # share of the patches that one camera alone has to find again in its second view
 _SCARCE = 0.3  # share of pixels without a measured depth from which on depths by the motion are looked for
@@ -204,7 +204,7 @@ class DirectOdometry:
         T = se3.compose(keyframe.T_world_camera, se3.inverse(T_camera_keyframe))
         Ad = se3.adjoint(T_camera_keyframe)
         covariance = Ad @ self.window.covariance(keyframe) @ Ad.T + alignment.covariance
-        is_keyframe, added = self._asks_for_keyframe(alignment, keyframe), None
+        is_keyframe, added = self._asks_for_keyframe(alignment, keyframe, verdict.residual_ratio), None
         if is_keyframe:
             log_gain = keyframe.log_gain - alignment.brightness[0]
             depth = depth_of(T, log_gain)
@@ -329,11 +329,12 @@ class DirectOdometry:
             wanted[k.number] = away * (_STAYS if k is self._reference else 1.0)
         return min(self.window.keyframes, key=lambda k: wanted[k.number])
 
-    def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe) -> bool:
+    def _asks_for_keyframe(self, alignment: Alignment, keyframe: WindowKeyframe, ratio: float) -> bool:
         by_brightness = abs(alignment.brightness[0]) / self.config.keyframe_brightness
         missing = (1.0 - alignment.overlap) / (1.0 - self.config.keyframe_overlap)
         keyframe.least_sigma = min(keyframe.least_sigma, alignment.sigma)
-        fits_worse = alignment.shift_px > _NEARLY_LOST or alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
+        fits_worse = alignment.sigma > self.config.keyframe_residual * keyframe.least_sigma
+        fits_worse |= alignment.shift_px > _NEARLY_LOST[0] and ratio > _NEARLY_LOST[1]
         return fits_worse or max(keyframe_distance(keyframe.tracker, alignment.T_21, self.config) + by_brightness, missing) > 1.0
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
@@ -355,8 +356,7 @@ class DirectOdometry:
         """(6, 6) of the last pose, and of what the camera may have done since."""
         since_s = self._unseen_s(time_ns)
         turned, moved = min(_LOST_TURN * since_s, np.pi), _LOST_SPEED * since_s
-        covariance: Matrix = self._covariance + np.diag([turned**2] * 3 + [moved**2] * 3)
-        return covariance
+        return np.asarray(self._covariance + np.diag([turned**2] * 3 + [moved**2] * 3))
 
     def _resume(self, time_ns: int) -> None:
         """The first view since the last pose that can be followed: its pose is the last one, with all that may have happened."""

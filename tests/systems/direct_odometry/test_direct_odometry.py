@@ -340,8 +340,14 @@ def test_recorded_stereo_frames() -> None:
     assert abs(np.linalg.norm(estimate.p_world_camera) - length) < 0.01 * length
 
 
-def test_a_frame_whose_view_is_nearly_lost_becomes_a_keyframe(drives: list[Drive], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Grey values that differ by as much as a shift of half a pixel: by the next frame it may be a whole one."""
+@pytest.mark.parametrize("ratio", [1.5, 1.0])
+def test_a_frame_whose_view_is_nearly_lost_becomes_a_keyframe(
+    drives: list[Drive], monkeypatch: pytest.MonkeyPatch, ratio: float
+) -> None:
+    """Grey values that differ by as much as a shift of half a pixel: by the next frame it may be a whole one.
+
+    Where they always do, as noise of an image with little texture does, nothing is about to be lost.
+    """
     seen, asked = drives[0], []
     plain = DirectOdometry._track
 
@@ -349,10 +355,10 @@ def test_a_frame_whose_view_is_nearly_lost_becomes_a_keyframe(drives: list[Drive
         tracked = plain(odometry, image, T_predicted)
         alignment = replace(tracked.alignment, shift_px=0.6 if len(asked) == 3 else 0.1)
         asked.append(alignment.shift_px)
-        return tracked._replace(alignment=alignment)
+        return tracked._replace(alignment=alignment, verdict=tracked.verdict._replace(residual_ratio=ratio))
 
     monkeypatch.setattr(DirectOdometry, "_track", nearly_lost)
     config = DirectOdometryConfig(keyframe_flow=0.5, keyframe_flow_translation=0.5, keyframe_residual=50.0)
     odometry = DirectOdometry(CAMERA, config)
     estimates = [odometry.push_rgbd(t, g, z) for t, g, z in zip(seen.time_ns[:7], seen.grey, seen.depth, strict=False)]
-    assert [k for k, estimate in enumerate(estimates) if estimate.is_keyframe] == [0, 4]
+    assert [k for k, estimate in enumerate(estimates) if estimate.is_keyframe] == ([0, 4] if ratio > 1.25 else [0])
