@@ -16,10 +16,10 @@ from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault
+from boxplus.simulation.faults import Event
 from lio_campaign.judge import Truth
 
 Random = np.random.Generator
-Event = Scan | ImuSamples
 _MOST = 3
 _PERSON_RADIUS_M, _PERSON_HEIGHT_M = 0.3, 1.75
 _PACKETS_PER_SCAN = 75
@@ -74,9 +74,8 @@ def _changes(
 
 def _moved(scan: Scan, p_lidar: NDArray[np.floating], keep: NDArray[np.bool_] | None = None) -> Scan:
     """The scan with other points, and of these only some; the sweep's ends stay."""
-    chosen = np.ones(len(p_lidar), bool) if keep is None else keep
-    intensity = None if scan.intensity is None else scan.intensity[chosen]
-    return Scan(p_lidar[chosen].astype(np.float32), scan.time_ns[chosen], intensity, scan.start_ns, scan.end_ns)
+    moved = replace(scan, p_lidar=p_lidar.astype(np.float32))
+    return moved if keep is None else moved.where(keep)
 
 
 def _seeded(random: Random) -> Callable[[int], Random]:

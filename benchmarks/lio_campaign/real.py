@@ -53,7 +53,7 @@ class RealDraw:
     path: Path
     T_true: NDArray[np.float64]
     channels: int
-    elevation_deg: tuple[float, float] = (0.0, 0.0)
+    elevation_deg: tuple[float, float]
     recording_options: dict[str, Any] = field(default_factory=dict)
     T_imu_lidar: NDArray[np.float64] | None = None
 

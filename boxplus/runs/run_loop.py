@@ -150,6 +150,7 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
             events = iter(self.recording)
             for _ in range(self.events):
                 next(events, None)
+            state: State = "interrupted"
             while not should_stop():
                 began = time.perf_counter()
                 event = next(events, None)
@@ -161,16 +162,15 @@ class RunLoop(ABC, Generic[EventT, EstimateT, FactsT]):
                     self.keep(estimate)
                 self.show_progress()
                 if event is None:
-                    self.ended = time.perf_counter()
-                    self.at_end("finished")
-                    return "finished"
+                    state = "finished"
+                    break
                 self.events += 1
                 self.between_events()
                 if time.perf_counter() > self._summary_due:
                     self.write_summary("running")
             self.ended = time.perf_counter()
-            self.at_end("interrupted")
-        return "interrupted"
+            self.at_end(state)
+        return state
 
     def write_summary(self, state: State, error: str | None = None) -> FactsT:
         """Write `run.json` as things are."""

@@ -6,17 +6,17 @@ the corners of two cameras lie, tells clocks apart from mountings, and both from
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.cameras.events import CameraEvent
-from boxplus.recordings.cameras.info import CameraRecordingInfo
+from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate
 from boxplus.runs.inspection.cameras.comparison import Comparison
-from boxplus.runs.inspection.cameras.views import Views, check_views
+from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_views
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
@@ -26,7 +26,6 @@ BEFORE_S = 14.0
 """How much of a recording before an instant is looked at [s]."""
 
 _AFTER_S = 2.0
-_GAP = 1.5  # times the usual interval between images, as for 'boxplus inspect'
 _MARGIN_NS = 500_000_000  # of IMU samples on both sides
 
 
@@ -42,7 +41,13 @@ def likely_causes(
         around_ns: when the run contradicted itself [ns]; None where it never began, and its beginning is looked at.
         with_imu: whether the run uses the IMU as well.
     """
-    return [_sentence(finding) for finding in _examined(info, events, cameras, around_ns, with_imu=with_imu)]
+    views = {camera.index: Views() for camera in _pictures(info, cameras)}
+    compared = _compared(info, events, cameras, around_ns, views)
+    if compared is None:
+        return []
+    comparison, imu = compared
+    found = [finding for camera in _pictures(info, cameras) for finding in _of_images(camera.name, views[camera.index])]
+    return _told(found + comparison.of_cameras() + (comparison.with_imu(imu) if with_imu and len(imu) else []))
 
 
 def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int) -> list[str]:
@@ -52,18 +57,28 @@ def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent],
         info, events: as of `likely_causes`.
         around_ns: the end of fourteen seconds in which the camera turns [ns].
     """
-    found = _examined(info, events, 1, around_ns, with_imu=True)
-    return [_sentence(finding) for finding in found if finding.key.endswith(_CALIBRATION)]
+    compared = _compared(info, events, 1, around_ns, {})
+    if compared is None or not len(compared[1]):
+        return []
+    comparison, imu = compared
+    return _told([finding for finding in comparison.with_imu(imu) if finding.key.endswith(_CALIBRATION)])
 
 
-def _examined(
-    info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, *, with_imu: bool
-) -> list[Evidence]:
-    """What is not as it should be around an instant."""
-    pictures = [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
+def _pictures(info: CameraRecordingInfo, cameras: int) -> list[CameraStream]:
+    return [camera for camera in info.cameras if camera.kind == "intensity"][:cameras]
+
+
+def _compared(
+    info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, views: Mapping[int, Views]
+) -> tuple[Comparison, ImuSamples] | None:
+    """The first cameras around an instant, and the samples there; None where the recording cannot be read.
+
+    Args:
+        views: of each camera, where its images are to be noted as well.
+    """
+    pictures = _pictures(info, cameras)
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
     compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (BEFORE_S + _AFTER_S))))
-    views = {camera.index: (camera.name, Views()) for camera in pictures}
     begin_ns = None
     to_8_bits, imu = EightBits(), []
     try:
@@ -80,20 +95,21 @@ def _examined(
             elif not event.is_depth and event.camera < cameras and time_ns >= begin_ns:
                 grey = to_8_bits(event.grey())
                 compared.note(event, grey)
-                views[event.camera][1].note(event, grey)
+                if event.camera in views:
+                    views[event.camera].note(event, grey)
     except RecordingError:
-        return []
-    found = [finding for name, seen in views.values() for finding in _of_images(name, seen)]
-    found += compared.of_cameras() + (compared.with_imu(ImuSamples.joined(imu)) if imu and with_imu else [])
-    return [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
+        return None
+    return compared, ImuSamples.joined(imu)
 
 
 def _of_images(name: str, seen: Views) -> list[Evidence]:
     """Images that are missing, dark, or show nothing; nothing of a camera that has none there."""
     if len(seen.time_ns) < 2:
         return []
-    return check_rate(name, np.array(seen.time_ns, np.int64), gap_factor=_GAP) + check_views(name, seen)
+    return check_rate(name, np.array(seen.time_ns, np.int64), gap_factor=GAP_FACTOR) + check_views(name, seen)
 
 
-def _sentence(finding: Evidence) -> str:
-    return f"{finding.key} {finding.value}: {finding.text}"
+def _told(found: list[Evidence]) -> list[str]:
+    """A sentence for each that is not as it should be."""
+    wrong = [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
+    return [f"{finding.key} {finding.value}: {finding.text}" for finding in wrong]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twi
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.mountings import Turn, mounting_of_many, turn_from
+
+Said = TypeVar("Said")
 
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _WINDOW_S = 4.0
@@ -81,10 +84,8 @@ class Watch:
         self._T_last: NDArray[np.float64] | None = None
         self._T_compared: NDArray[np.float64] = np.eye(4)
         self._first_with_clocks: Agreement | None = None
-        self._slopes: list[tuple[float, float]] = []
-        self._slopes_until_ns = 0
-        self._turns: list[Turn] = []
-        self._turns_until_ns = 0
+        self._slopes: _Stretches[tuple[float, float]] = _Stretches()
+        self._turns: _Stretches[Turn] = _Stretches()
 
     def add(
         self,
@@ -179,7 +180,7 @@ class Watch:
         end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
         wait, news = _UNDECIDED_EVERY_S, None
         if decisive:
-            if not 0 < len(self._slopes) < _MOST_SLOPES or lengths_known(self._slopes):
+            if not 0 < len(self._slopes.said) < _MOST_SLOPES or lengths_known(self._slopes.said):
                 wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
             self._decided += 1
             before = self.contradiction
@@ -205,12 +206,9 @@ class Watch:
         """What all stretches so far say together of a mounting that was given; the newest is one where nothing else is off."""
         rotation = agreement.rotation
         sound = all(finding.cause in _OF_ACCELERATIONS for finding in findings)
-        if self._T_declared is None or rotation is None or not sound or not judges_rotation(agreement):
-            return mounting_of_many(self._turns)
-        if int(agreement.path.time_ns[0]) > self._turns_until_ns - _OVERLAP_NS:
-            self._turns.append(turn_from(rotation, self._T_declared[:3, :3]))
-            self._turns_until_ns = int(agreement.path.time_ns[-1])
-        return mounting_of_many(self._turns)
+        if self._T_declared is not None and rotation is not None and sound and judges_rotation(agreement):
+            self._turns.add(agreement, turn_from(rotation, self._T_declared[:3, :3]))
+        return mounting_of_many(self._turns.said)
 
     def _with_lengths(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
         """The findings, with what all stretches so far say of the lengths.
@@ -221,13 +219,26 @@ class Watch:
         if agreement.in_feet is not None or any(finding.cause != "length_scale" for finding in findings):
             return findings
         slope = slope_of(agreement)
-        if slope is not None and int(agreement.path.time_ns[0]) > self._slopes_until_ns - _OVERLAP_NS:
-            self._slopes.append(slope)
-            self._slopes_until_ns = int(agreement.path.time_ns[-1])
-        if len(self._slopes) < FEWEST_SLOPES:
+        if slope is not None:
+            self._slopes.add(agreement, slope)
+        if len(self._slopes.said) < FEWEST_SLOPES:
             return findings
-        lengths = lengths_of_many(self._slopes)
+        lengths = lengths_of_many(self._slopes.said)
         return [] if lengths is None else [lengths]
+
+
+class _Stretches(Generic[Said]):
+    """What stretches that do not overlap said, each for itself."""
+
+    def __init__(self) -> None:
+        self.said: list[Said] = []
+        self._until_ns = 0
+
+    def add(self, agreement: Agreement, said: Said) -> None:
+        """One more, unless it overlaps the last one."""
+        if int(agreement.path.time_ns[0]) > self._until_ns - _OVERLAP_NS:
+            self.said.append(said)
+            self._until_ns = int(agreement.path.time_ns[-1])
 
 
 def _clears(finding: Finding, agreement: Agreement) -> bool:

@@ -12,7 +12,7 @@ from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate, check_rejected
 from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.stereo import check_synchronisation
-from boxplus.runs.inspection.cameras.views import Views, check_blur, check_corners, check_views
+from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_blur, check_corners, check_views
 from boxplus.runs.inspection.imu_checks import check_finite, check_saturation
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
@@ -44,7 +44,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
         return [*info.evidence, Evidence("recording", "cannot be read", "error", str(error))]
     found += [*info.evidence, *check_rejected(recording.rejected)]
     for camera in info.cameras:
-        found += check_rate(camera.name, np.array(views[camera.index].time_ns, np.int64), gap_factor=1.5)
+        found += check_rate(camera.name, np.array(views[camera.index].time_ns, np.int64), gap_factor=GAP_FACTOR)
         if camera.kind == "intensity":
             found += check_views(camera.name, views[camera.index])
             found += check_blur(camera.name, views[camera.index])

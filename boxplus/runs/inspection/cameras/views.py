@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from boxplus.recordings.info import Evidence, Verdict
 from boxplus.sensors.camera_image import CameraImage
 
+GAP_FACTOR = 1.5
+"""Times the usual interval between images, from which on some are missing."""
+
 _JUMP = 0.25  # of the mean brightness, between neighbours
 _DARK, _BRIGHT = 15.0, 240.0
 _BLOCK = 8
