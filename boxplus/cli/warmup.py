@@ -50,8 +50,11 @@ def _compile_apart(part: str) -> tuple[set[str], str]:
 
 def _compile_here(part: str) -> None:
     """Do this part, and write the names of the kernels that had to be compiled to the standard output."""
+    import gc
+
     from boxplus._jit import on_compilation
 
+    gc.set_threshold(100_000, 50, 50)  # a compiler keeps most of what it makes: a tenth of the time went into looking for garbage
     compiled: list[str] = []
     with on_compilation(compiled.append):
         _PARTS[part]()

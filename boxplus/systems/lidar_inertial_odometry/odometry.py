@@ -14,6 +14,7 @@ from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import SHARED_ERRORS, Correction, MapDatum
 from boxplus.filtering.nav_state import RL, TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
+from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
@@ -233,10 +234,9 @@ class LidarInertialOdometry(Snapshots):
         clock.lap("slide map")
         points, map_points = self._thinned(p_lidar)
         clock.lap("voxel filter")
-        measurement = self._measurement(frame, points)
-        x_prior = self._x.copy()
-        turns = self._excitation.sufficient
-        update = mounted_update(self._x, self._cov, measurement, self.config, self._unshown, turns=turns)
+        measurement, x_prior = self._measurement(frame, points), self._x.copy()
+        stamped = UncertainInstant(measurement, mean_motion(self._x_before, x_prior, frame.duration_s), self.config.stamp_noise)
+        update = mounted_update(self._x, self._cov, stamped, self.config, self._unshown, turns=self._excitation.sufficient)
         posterior, cov_prior = update.posterior, update.cov_prior
         on_map, fitting = (measurement.on_map_share, measurement.fitting_share) if posterior.valid else (0.0, 1.0)
         directions = posterior.last.directions if posterior.valid else None
