@@ -9,8 +9,6 @@ Source: Demmel et al., Square root marginalization, ICCV 2021; Qin, Li and Shen,
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +31,7 @@ from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.creep import CornerCreep
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, most_are_below, motion_px
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import mean_parallax, triangulate
+from boxplus.systems.visual_inertial_odometry.frame_solver import FrameSolver
 from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
 from boxplus.systems.visual_inertial_odometry.lines.landmarks import LineLandmarks
 from boxplus.systems.visual_inertial_odometry.observations import Fit, Floats, Frame, Ints, Seen
@@ -41,10 +40,6 @@ from boxplus.systems.visual_inertial_odometry.start.start import Start, imu_nois
 
 _HUBER = 1.5  # standard deviations
 _LEAVING = 2  # keyframes at most, for every one that is new
-# A tilt of the whole window against the accelerometer's bias is 1e-8 of what the IMU knows from frame to frame, and decides
-# where it goes: more damping than that would hold it where it is, while the covariance says it is known.
-# A step that is hardly expected to lower the cost is left to the next frame, which begins there.
-_SOLVER: dict[str, Any] = {"cost_tolerance": 1e-3, "expected_tolerance": 3e-3, "initial_damping": 1e-10, "examine": False}
 _MEDIAN_OF_TWO = 1.386  # of χ² with two degrees of freedom
 _LAST_INTERVALS = 5
 _REST_NS, _REST_PX, _REST_CORNERS = 300_000_000, 0.5, 15
@@ -100,7 +95,7 @@ class Window:
         self._imu_group: Group | None = None
         self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
         self._seen = Seen.none()
-        self._creep = CornerCreep(weigh=not config.refines_mounting)
+        self._solver, self._creep = FrameSolver(), CornerCreep(weigh=not config.refines_mounting)
         self._track: Ints = np.zeros(0, np.int64)  # of each landmark its corner, and the frame it is anchored in
         self._anchor: Ints = np.zeros(0, np.int64)
         self._founded = 0  # landmarks that the last keyframe saw
@@ -248,7 +243,7 @@ class Window:
         self._follow_clock()
         self._connect(np.arange(len(self._seen.frame)), len(self.frames) - 1)
         self.lines.connect(self.bodies, self.mountings)
-        solution = self.problem.solve(max_iterations=max_iterations or self._config.max_iterations, **_SOLVER)
+        solution = self._solver.solve(self.problem, max_iterations or self._config.max_iterations)
         self.problem.set_values(solution)
         number = self.frames[-1].number
         self.covariance = self._creep.spread * covariance_of(solution, self.bodies[number], self.states[number])
