@@ -16,7 +16,7 @@ _STEPS = 4
 
 
 def _bend(x: Any) -> Any:
-    return np.array([1e3 * (x[1] - x[0] * x[0]), 1.0 - x[0]])
+    return np.array([3e2 * (x[1] - x[0] * x[0]), 1.0 - x[0]])
 
 
 def _valley(x: float) -> Problem:
