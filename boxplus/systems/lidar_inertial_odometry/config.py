@@ -76,7 +76,7 @@ class LioConfig(LidarOdometryConfig):
     gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
     accel_bias_walk: float = Field(1e-3, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]")
     stamp_noise: float = Field(
-        5e-4, ge=0, le=0.1, description="standard deviation of a scan's time stamp from scan to scan, against the IMU's clock [s]"
+        3e-4, ge=0, le=0.1, description="standard deviation of a scan's time stamp from scan to scan, against the IMU's clock [s]"
     )
     max_imu_gap: float = Field(0.15, gt=0, description="longest interval between IMU samples that is integrated over [s]")
     gravity_aligned: bool = Field(True, description="world frame with z up; False: the first IMU frame is the world")

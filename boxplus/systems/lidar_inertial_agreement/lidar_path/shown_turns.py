@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 KNOWN_RAD = 0.02  # standard deviation of an attitude that is known
+_BY_GYROSCOPE_RAD = 0.015  # the same of one that a gyroscope carries on over a second: half a second at a bias of 0.03 rad/s
 _FORETOLD_M = 0.5  # standard deviation: what says less of a position is noise, and would take attitudes with it
 
 
@@ -25,6 +28,17 @@ def shown_turns(path: LidarPath) -> tuple[NDArray[np.float64], NDArray[np.float6
     shares, axes = np.linalg.eigh(np.einsum("nij,nj,nkj->ik", vectors, share, vectors) / len(poses))
     known = shares > 0.5
     return axes[:, known], axes[:, ~known]
+
+
+def turned_by_gyroscope(path: LidarPath) -> LidarPath:
+    """The path with its attitudes as known as a gyroscope makes them, also where the surroundings do not show them.
+
+    For a path of a second or two whose scans were undistorted and foretold with a gyroscope: it keeps what that says about the
+    axes that no surface shows.
+    """
+    information = path.information.copy()
+    information[:, :3, :3] += np.eye(3) / _BY_GYROSCOPE_RAD**2
+    return replace(path, information=information)
 
 
 def _of_attitude(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Lid
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -266,6 +267,8 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
 
 def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
     """Velocity, gravity and bias from path and accelerometer, where both fit each other."""
+    if seen.config.extrinsic_estimation == "off":  # it is known how the gyroscope lies: it shows what the surroundings do not
+        path = turned_by_gyroscope(path)
     fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
         raise seen.not_moving("the surroundings do not show how the platform turns")
