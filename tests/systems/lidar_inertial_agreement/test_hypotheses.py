@@ -242,3 +242,17 @@ def test_attitudes_known_coarsely_show_no_lengths() -> None:
     assert agreement.rotation is not None and judges_lengths(agreement)
     coarse = replace(agreement, rotation=replace(agreement.rotation, coarse=True))
     assert not judges_lengths(coarse) and slope_of(coarse) is None and slope_of(agreement) is not None
+
+
+@pytest.mark.slow
+def test_lengths_are_not_judged_where_the_accelerations_ask_for_another_mounting() -> None:
+    """On a circle at a constant rate gravity that is turned and force that is longer are told from each other by noise only."""
+    simulation = handheld(4)
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)
+    assert agreement.translation is not None
+    for degrees, causes in ((3.0, ["length_scale"]), (25.0, [])):
+        turn = np.radians([0.0, degrees, 0.0])
+        confounded = replace(agreement, translation=replace(agreement.translation, slope=2.7, turn=turn))
+        assert [finding.cause for finding in contradictions(confounded, simulation.T_imu_lidar)] == causes
+        assert judges_lengths(confounded) == bool(causes)
+        assert (slope_of(confounded) is not None) == bool(causes)
