@@ -46,7 +46,7 @@ _FITS_OF_MANY = 0.7
 _FARTHEST_REVERSED = 4.5  # feet, and a third of it
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
-_CONFOUNDED_RAD = np.deg2rad(15.0)
+_TURN_OPEN_RAD = np.deg2rad(15.0)
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MUCH_NEARER = 0.5  # of the angle to the given mounting is left to its inverse, where that was meant
 _MOUNTED = 0.95  # share of the turning that a mounting explains
@@ -109,8 +109,8 @@ def judges_lengths(agreement: Agreement) -> bool:
     translation = agreement.translation
     if translation is None or not _path_counts(agreement) or _lags(agreement):
         return False
-    fits = translation.explained > _FITS and translation.sigma < MISFIT_M and not _asks_for_another_mounting(translation)
-    return fits and float(np.hypot(translation.slope_std, SLOPE_FLOOR)) < SLOPE_KNOWN
+    fits = translation.explained > _FITS and translation.sigma < MISFIT_M
+    return fits and not _leaves_mounting_open(translation) and float(np.hypot(translation.slope_std, SLOPE_FLOOR)) < SLOPE_KNOWN
 
 
 def _lags(agreement: Agreement) -> bool:
@@ -335,17 +335,17 @@ def _of_lengths(agreement: Agreement, translation: TranslationFit, T_declared: N
         return Finding("force_sign", text)
     if translation.explained < _FITS or translation.sigma > MISFIT_M or _lags(agreement):
         return None
-    return None if _asks_for_another_mounting(translation) else slope_finding(slope, std)
+    return None if _leaves_mounting_open(translation) else slope_finding(slope, std)
 
 
-def _asks_for_another_mounting(translation: TranslationFit) -> bool:
-    """Whether the accelerations fit best with the mounting turned far: then their slope says nothing of lengths.
+def _leaves_mounting_open(translation: TranslationFit) -> bool:
+    """Whether the accelerations show the mounting about no axis: then their slope says nothing of lengths.
 
     On a circle at a constant rate force, bias and a turned gravity are all constant in the IMU's frame, and none is told from
-    another: a path of few rings, bent by half a centimetre, asked for lengths 2.7 times as long and a mounting turned by 24 deg.
-    Lengths that are wrong turn it by 9 deg at most.
+    another: a path of few rings, bent by half a centimetre, asked for lengths 2.7 times as long and a mounting turned by 24 deg,
+    known to 22 deg about its best axis. Where lengths in feet were found the best axis was known to 12 deg or less.
     """
-    return float(np.linalg.norm(translation.turn)) > _CONFOUNDED_RAD
+    return bool(np.linalg.eigvalsh(translation.covariance[TURN, TURN])[0] > _TURN_OPEN_RAD**2)
 
 
 def slope_of(agreement: Agreement) -> tuple[float, float] | None:
@@ -353,7 +353,7 @@ def slope_of(agreement: Agreement) -> tuple[float, float] | None:
     translation = agreement.translation
     if translation is None or not _path_counts(agreement) or _lags(agreement):
         return None
-    if translation.explained < _FITS_OF_MANY or translation.sigma > MISFIT_M or _asks_for_another_mounting(translation):
+    if translation.explained < _FITS_OF_MANY or translation.sigma > MISFIT_M or _leaves_mounting_open(translation):
         return None
     std = float(np.hypot(translation.slope_std, _SLOPE_OF_MANY_FLOOR))
     return (translation.slope, std) if std < SLOPE_KNOWN else None

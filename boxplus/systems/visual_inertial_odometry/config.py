@@ -48,7 +48,7 @@ class VioConfig(Settings):
     )
     keyframe_tracked: float = Field(0.7, gt=0, lt=1, description="a smaller share of landmarks still tracked makes a keyframe")
     keyframe_interval: float = Field(1.0, gt=0, description="longest time between keyframes while moving [s]")
-    max_iterations: int = Field(4, ge=1, le=50, description="most steps of the solver, per frame")
+    max_iterations: int = Field(4, ge=1, le=50, description="steps of the solver per frame; more where all of them are refused")
     gyro_noise: float | None = Field(None, gt=0, description="gyroscope noise [rad/s/√Hz]; None is what the rig states")
     accel_noise: float | None = Field(None, gt=0, description="accelerometer noise [m/s²/√Hz]; None is what the rig states")
     gyro_bias_walk: float | None = Field(

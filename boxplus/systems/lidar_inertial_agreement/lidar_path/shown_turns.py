@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.manifolds import so3
+from boxplus.sensors.gyro_attitude import GyroAttitude
+from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 KNOWN_RAD = 0.02  # standard deviation of an attitude that is known
-_BY_GYROSCOPE_RAD = 0.015  # the same of one that a gyroscope carries on over a second: half a second at a bias of 0.03 rad/s
+_BY_GYROSCOPE_RAD = 0.015  # the same of one that a gyroscope has carried on, on average over a second at a bias of 0.03 rad/s
 _FORETOLD_M = 0.5  # standard deviation: what says less of a position is noise, and would take attitudes with it
 
 
@@ -30,15 +33,33 @@ def shown_turns(path: LidarPath) -> tuple[NDArray[np.float64], NDArray[np.float6
     return axes[:, known], axes[:, ~known]
 
 
-def turned_by_gyroscope(path: LidarPath) -> LidarPath:
-    """The path with its attitudes as known as a gyroscope makes them, also where the surroundings do not show them.
+def turned_by_gyroscope(
+    path: LidarPath, imu: ImuSamples, R_imu_lidar: NDArray[np.float64], bias: NDArray[np.float64]
+) -> LidarPath:
+    """The path with the turns about an axis that its poses do not show taken from the gyroscope, and known as well as by that.
 
-    For a path of a second or two whose scans were undistorted and foretold with a gyroscope: it keeps what that says about the
-    axes that no surface shows.
+    One axis, as the normal of a wall that fills the view: where poses show fewer than two, nothing holds the gyroscope against
+    the LiDAR, and the path is returned as it is.
+
+    Args:
+        path: of one segment, a second or two long.
+        imu: samples that cover it.
+        R_imu_lidar: (3, 3) mounting.
+        bias: (3,) of the gyroscope [rad/s], IMU frame.
     """
+    shown, not_shown = shown_turns(path)
+    if shown.shape[1] != 2:
+        return path
+    at = GyroAttitude(imu.time_ns, imu.gyro - bias).at(path.time_ns) @ R_imu_lidar
+    R = path.R_path_lidar
+    steps, by_gyroscope = (so3.log(np.swapaxes(M[:-1], 1, 2) @ M[1:]) for M in (R, at))
+    steps += (by_gyroscope - steps) @ not_shown @ not_shown.T
+    turned = [R[0]]
+    for step in so3.exp(steps):
+        turned.append(turned[-1] @ step)
     information = path.information.copy()
-    information[:, :3, :3] += np.eye(3) / _BY_GYROSCOPE_RAD**2
-    return replace(path, information=information)
+    information[1:, :3, :3] += not_shown @ not_shown.T / _BY_GYROSCOPE_RAD**2
+    return replace(path, R_path_lidar=np.array(turned), information=information)
 
 
 def _of_attitude(information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ _ACCEL_BIAS_STD = 0.15  # m/s²
 _MOUNTING_STD = 0.01  # rad
 _MEAN_ACCEL_STD = 2.0  # m/s²
 _GYRO_BIAS_STD = 5e-3  # rad/s, of the difference to the LiDAR over a second
-_ANY_GYRO_BIAS_STD = 0.02  # rad/s, of a gyroscope in order, about axes where the LiDAR does not show how it turns
+_ANY_GYRO_BIAS_STD = 0.05  # rad/s, of a gyroscope in order, about axes where the LiDAR does not show how it turns
 _TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
 
 
@@ -130,9 +130,18 @@ def gyro_bias(path: LidarPath, imu: ImuSamples, extrinsic: NavState) -> NDArray[
 
 
 def moving_state(
-    frames: Sequence[Frame], path: LidarPath, imu: ImuSamples, fit: TranslationFit, extrinsic: NavState, config: LioConfig
+    frames: Sequence[Frame],
+    path: LidarPath,
+    not_shown: NDArray[np.float64],
+    imu: ImuSamples,
+    fit: TranslationFit,
+    extrinsic: NavState,
+    config: LioConfig,
 ) -> tuple[NavState, NDArray[np.float64]]:
-    """State and covariance at the end of the first scan, carried there from the beginning of the batch."""
+    """State and covariance at the end of the first scan, carried there from the beginning of the batch.
+
+    About the axes `not_shown` (3, K), LiDAR frame, the surroundings say nothing of the gyroscope's bias.
+    """
     first = fit.stretches[0]
     bias_gyro = gyro_bias(path, imu, extrinsic)
     known = _with_mounting_known(fit, extrinsic, config)
@@ -162,7 +171,7 @@ def moving_state(
         extrinsic.p_imu_lidar,
     )
     covariance = _first_covariance(config, gyro_sigma=_GYRO_BIAS_STD, accel_sigma=0.0, velocity_sigma=0.0, gravity_sigma=0.0)
-    open_turns = extrinsic.R_imu_lidar @ shown_turns(path)[1]
+    open_turns = extrinsic.R_imu_lidar @ not_shown
     covariance[T_BW : T_BW + 3, T_BW : T_BW + 3] += _ANY_GYRO_BIAS_STD**2 * open_turns @ open_turns.T
     turn = np.zeros((9, 9))
     turn[:3, :3] = turn[3:6, 3:6] = R_world_path

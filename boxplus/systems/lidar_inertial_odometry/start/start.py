@@ -20,7 +20,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Lid
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
-from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import turned_by_gyroscope
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -250,8 +250,11 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
             f"{np.degrees(np.linalg.norm(drift[:3])):.1f} deg off where its first ones want it (few rings, a repeating pattern, "
             "foliage, or moving things)"
         )
+    not_shown = shown_turns(path)[1]
+    if seen.config.extrinsic_estimation == "off":  # it is known how the gyroscope lies: it shows what the surroundings do not
+        path = turned_by_gyroscope(path, imu, seen.extrinsic.R_imu_lidar, gyro_bias(path, imu, seen.extrinsic))
     fit = _checked_fit(seen, path)
-    state, covariance = moving_state(seen.frames, path, imu, fit, seen.extrinsic, seen.config)
+    state, covariance = moving_state(seen.frames, path, not_shown, imu, fit, seen.extrinsic, seen.config)
     sigma = _checked_speed(seen, state, covariance)
     speed = float(np.linalg.norm(state.v_world_imu))
     other = other_speed(path, scans, seen.registration, guesses)
@@ -267,8 +270,6 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
 
 def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
     """Velocity, gravity and bias from path and accelerometer, where both fit each other."""
-    if seen.config.extrinsic_estimation == "off":  # it is known how the gyroscope lies: it shows what the surroundings do not
-        path = turned_by_gyroscope(path)
     fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
         raise seen.not_moving("the surroundings do not show how the platform turns")
