@@ -1,7 +1,8 @@
-"""Whether scans fit as well at another speed: what a registration alone cannot know, which ends in the minimum next to its start.
+"""Whether scans fit as well, or better, at another speed: a registration ends in the minimum next to its start and cannot know.
 
 Over open ground the rings of a LiDAR go along with it. A scan that is laid upon the one before it, ring upon ring, fits about as
-well as one that is laid where it was seen; which of the two a registration finds is decided by where it began.
+well as one that is laid where it was seen; which of the two a registration finds is decided by where it began. Along a street at
+15 m/s the walls look the same from scan to scan as well, and what began at rest stays at rest.
 """
 
 from __future__ import annotations
@@ -20,6 +21,48 @@ _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no 
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
 _DEVIATIONS, _ANOTHER_M_S = 5.0, 0.3  # beyond both another speed is another
 _AS_WELL = 1.1  # times the cost
+_SEARCHED_M_S = np.arange(5.0, 34.0, 3.0)  # both ways along the axis that is known least: the fastest car that is mapped
+_FIRST_SCANS, _CLEARLY, _NOT_REST_M_S = 4, 0.8, 3.0  # tried at every speed; times the cost at rest
+
+
+def better_speed(
+    path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning]
+) -> NDArray[np.float64] | None:
+    """A mean velocity (3,) [m/s] at which the first scans fit clearly better than on a path that rests, or None.
+
+    Searched along the axis that is known least, where it is not known well. Of 16 streets at a constant 15 to 20 m/s, 11 passed
+    for rest; with the right speed the cost was 0.45 to 0.75 times that at rest. Of platforms that do rest, in streets, forests,
+    fields, tunnels and warehouses, no other speed came below 0.85.
+
+    Args:
+        path, scans, config, guesses: as for `other_speed`.
+    """
+    information = path.information[1:, 3:, 3:]
+    if len(path) < _FIRST_SCANS or _sigma(information) < _SURE_M:
+        return None
+    axis = np.linalg.eigh(information.mean(axis=0))[1][:, 0]
+    most, found = _CLEARLY * float(path.cost[:_FIRST_SCANS].sum()), None
+    for velocity in np.concatenate([_SEARCHED_M_S, -_SEARCHED_M_S])[:, None] * axis:
+        tried = lidar_path(scans[:_FIRST_SCANS], config, guesses, undistort=True, velocity=velocity, unbroken=True)
+        cost = float(tried.cost.sum())
+        if (
+            not tried.failed
+            and len(tried) == _FIRST_SCANS
+            and cost < most
+            and np.linalg.norm(_mean_velocity(tried)) > _NOT_REST_M_S
+        ):
+            most, found = cost, _mean_velocity(tried)
+    return found
+
+
+def _sigma(information: NDArray[np.float64]) -> float:
+    """Median standard deviation [m] of positions of information (n, 3, 3), along the axis that is known least."""
+    return float(1.0 / np.sqrt(max(float(np.median(np.linalg.eigvalsh(information)[:, 0])), 1e-12)))
+
+
+def _mean_velocity(path: LidarPath) -> NDArray[np.float64]:
+    velocity: NDArray[np.float64] = (path.p_path_lidar[-1] - path.p_path_lidar[0]) / ((path.time_ns[-1] - path.time_ns[0]) * 1e-9)
+    return velocity
 
 
 def other_speed(
@@ -32,11 +75,11 @@ def other_speed(
         scans, config, guesses: as for `lidar_path`.
     """
     information = path.information[1:, 3:, 3:]
-    if 1.0 / np.sqrt(max(float(np.median(np.linalg.eigvalsh(information)[:, 0])), 1e-12)) < _SURE_M:
+    if _sigma(information) < _SURE_M:
         return None
     axes = np.linalg.eigh(information.mean(axis=0))[1]
     seconds = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
-    velocity = (path.p_path_lidar[-1] - path.p_path_lidar[0]) / seconds
+    velocity = _mean_velocity(path)
     for away in _APART_M_S:
         for axis in (axes[:, 0], -axes[:, 0], axes[:, 1], -axes[:, 1]):
             start = velocity + away * axis
@@ -46,6 +89,5 @@ def other_speed(
             apart = other.p_path_lidar[-1] - path.p_path_lidar[-1]
             sure = apart @ path.information[-1, 3:, 3:] @ apart > _DEVIATIONS**2
             if sure and np.linalg.norm(apart) > _ANOTHER_M_S * seconds and other.cost.sum() < _AS_WELL * path.cost.sum():
-                found: NDArray[np.float64] = (other.p_path_lidar[-1] - other.p_path_lidar[0]) / seconds
-                return found
+                return _mean_velocity(other)
     return None

@@ -16,8 +16,9 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import other_explains_better
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import better_speed, other_speed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
@@ -103,8 +104,24 @@ def _start(seen: _Beginning) -> Start:
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
     if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
-        return _static_start(seen, rest)
+        moving = _path_at_speed(seen, path)
+        return _static_start(seen, rest) if moving is None else _moving_start(seen, moving)
     return _moving_start(seen, path)
+
+
+def _path_at_speed(seen: _Beginning, path: LidarPath) -> LidarPath | None:
+    """The path of a platform that moves although its scans fit at rest; None where nothing speaks for that."""
+    guesses = gyro_guesses(seen.imu, seen.extrinsic.R_imu_lidar)
+    velocity = better_speed(path, seen.scans, seen.registration, guesses)
+    if velocity is None:
+        return None
+    other = lidar_path(seen.scans, seen.registration, guesses, undistort=True, velocity=velocity, unbroken=True)
+    if _broken(other) or not other_explains_better(seen.scans, path.poses, other.poses, seen.registration):
+        raise seen.not_moving(
+            f"the surroundings do not show how fast the platform moves: the first scans fit clearly better at "
+            f"{np.linalg.norm(velocity):.1f} m/s than at rest, and the next ones show no such path"
+        )
+    return other
 
 
 def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:

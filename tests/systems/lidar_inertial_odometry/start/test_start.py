@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
+from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import Scenario, SpinningLidar, simulate
-from boxplus.simulation.motions import trajectories
+from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
@@ -79,6 +80,18 @@ def test_a_speed_that_the_surroundings_do_not_show_is_no_start(voxel: float) -> 
     named = np.array([float(value) for value in refusal.split("along (")[1].split(")")[0].split(",")])
     axis = simulation.T_imu_lidar[:3, :3].T @ simulation.ground_truth([simulation.start_ns]).R_world_imu[0].T[:, 0]
     assert abs(named @ axis) > 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed", "kind"), [(20.0, "moving"), (0.0, "static")])
+def test_a_street_that_looks_alike_at_rest_is_searched_for_a_speed(speed: float, kind: str) -> None:
+    """At 20 m/s walls and rings look the same from scan to scan, and a registration from rest stays there."""
+    lidar = SpinningLidar(channels=32, azimuth_steps=512, vertical_fov_deg=(-25.0, 15.0))
+    drive = manoeuvres.constant_velocity(2.6, (-90.0, 0.3, 1.5), (speed, 0.0, 0.0), so3.exp(np.array([0.02, -0.01, 0.3])))
+    simulation = simulate(Scenario("street", sites.street(seed=0), drive, lidar, T_imu_lidar=np.eye(4)), 0, duration_s=1.6)
+    found = find_start(frames(simulation.events())[:11], config(simulation))
+    assert isinstance(found, Start) and found.kind == kind
+    assert np.linalg.norm(found.state.v_world_imu) == pytest.approx(speed, abs=0.5)
 
 
 @pytest.mark.parametrize(("reach_m", "bias"), [(0.6, 0.0), (0.9, 0.0), (0.6, 0.015)])
