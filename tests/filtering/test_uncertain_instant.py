@@ -20,7 +20,7 @@ class _Rows:
 
     def __init__(self, H: NDArray[np.float64], z: NDArray[np.float64], R: NDArray[np.float64]) -> None:
         R_inverse = np.linalg.inv(R)
-        self._said = Information(H.T @ R_inverse @ H, H.T @ R_inverse @ z, np.zeros(12), _DIRECTIONS, len(z), 1.0)
+        self._said = Information(H.T @ R_inverse @ H, H.T @ R_inverse @ z, -H.T @ R_inverse @ z, _DIRECTIONS, len(z), 1.0)
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         del x, rematch
@@ -40,6 +40,7 @@ def test_it_is_an_error_that_all_rows_share(seed: int, rows: int, sigma_s: float
     told = UncertainInstant(_Rows(H, z, R), motion, sigma_s).at(np.zeros(PACKED), rematch=True)
     assert np.allclose(told.A, expected.A, rtol=1e-6, atol=1e-7 * np.abs(expected.A).max())
     assert np.allclose(told.b, expected.b, rtol=1e-6, atol=1e-7 * np.abs(H.T @ np.linalg.inv(R) @ z).max())
+    assert np.allclose(told.pull, -told.b, rtol=1e-9, atol=1e-12 * np.abs(told.b).max())
 
 
 def test_at_rest_and_with_an_exact_stamp_nothing_changes() -> None:
