@@ -104,7 +104,7 @@ def _start(seen: _Beginning) -> Start:
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
     if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
-        moving = _path_at_speed(seen, path)
+        moving = _path_at_speed(seen, path) if rest.determined else None  # else the start says what is not shown
         return _static_start(seen, rest) if moving is None else _moving_start(seen, moving)
     return _moving_start(seen, path)
 
