@@ -37,27 +37,28 @@ def better_speed(
     Args:
         path, scans, config, guesses: as for `other_speed`.
     """
-    information = path.information[1:, 3:, 3:]
-    if len(path) < _FIRST_SCANS or _sigma(information) < _SURE_M:
+    if len(path) < _FIRST_SCANS:
         return None
-    axis = np.linalg.eigh(information.mean(axis=0))[1][:, 0]
+    sigma, axes = _least_known(path)
+    if sigma < _SURE_M:
+        return None
     most, found = _CLEARLY * float(path.cost[:_FIRST_SCANS].sum()), None
-    for velocity in np.concatenate([_SEARCHED_M_S, -_SEARCHED_M_S])[:, None] * axis:
+    for velocity in np.concatenate([_SEARCHED_M_S, -_SEARCHED_M_S])[:, None] * axes[:, 0]:
         tried = lidar_path(scans[:_FIRST_SCANS], config, guesses, undistort=True, velocity=velocity, unbroken=True)
         cost = float(tried.cost.sum())
-        if (
-            not tried.failed
-            and len(tried) == _FIRST_SCANS
-            and cost < most
-            and np.linalg.norm(_mean_velocity(tried)) > _NOT_REST_M_S
-        ):
-            most, found = cost, _mean_velocity(tried)
+        if tried.failed or len(tried) < _FIRST_SCANS or cost >= most:
+            continue
+        moving = _mean_velocity(tried)
+        if np.linalg.norm(moving) > _NOT_REST_M_S:
+            most, found = cost, moving
     return found
 
 
-def _sigma(information: NDArray[np.float64]) -> float:
-    """Median standard deviation [m] of positions of information (n, 3, 3), along the axis that is known least."""
-    return float(1.0 / np.sqrt(max(float(np.median(np.linalg.eigvalsh(information)[:, 0])), 1e-12)))
+def _least_known(path: LidarPath) -> tuple[float, NDArray[np.float64]]:
+    """Median standard deviation [m] of the positions along the axis that is known least, and the axes (3, 3), that one first."""
+    information = path.information[1:, 3:, 3:]
+    sigma = 1.0 / np.sqrt(max(float(np.median(np.linalg.eigvalsh(information)[:, 0])), 1e-12))
+    return float(sigma), np.linalg.eigh(information.mean(axis=0))[1]
 
 
 def _mean_velocity(path: LidarPath) -> NDArray[np.float64]:
@@ -74,10 +75,9 @@ def other_speed(
         path: of one segment, found from `scans`, undistorted with the first of `guesses`.
         scans, config, guesses: as for `lidar_path`.
     """
-    information = path.information[1:, 3:, 3:]
-    if _sigma(information) < _SURE_M:
+    sigma, axes = _least_known(path)
+    if sigma < _SURE_M:
         return None
-    axes = np.linalg.eigh(information.mean(axis=0))[1]
     seconds = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
     velocity = _mean_velocity(path)
     for away in _APART_M_S:

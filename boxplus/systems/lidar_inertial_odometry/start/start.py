@@ -118,7 +118,7 @@ def _path_at_speed(seen: _Beginning, path: LidarPath) -> LidarPath | None:
     other = lidar_path(seen.scans, seen.registration, guesses, undistort=True, velocity=velocity, unbroken=True)
     if _broken(other) or not other_explains_better(seen.scans, path.poses, other.poses, seen.registration):
         raise seen.not_moving(
-            f"the surroundings do not show how fast the platform moves: the first scans fit clearly better at "
+            "the surroundings do not show how fast the platform moves: the first scans fit clearly better at "
             f"{np.linalg.norm(velocity):.1f} m/s than at rest, and the next ones show no such path"
         )
     return other
