@@ -6,6 +6,7 @@
     python benchmarks/campaign.py --only fault=clock_offset --only world=hall --seeds 0:1000
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
     python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
+    python benchmarks/campaign.py --fast --seeds 0:40         # on roads, at up to 33 m/s
     python benchmarks/campaign.py --rough --seeds 0:40        # with what real recordings have besides: rain, people, lost packets
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
 
@@ -72,8 +73,9 @@ def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
     """What to do with which seeds, or why nothing can be done."""
     begin, end = options.seeds
     if options.real is None:
-        seeds = [seed for seed in range(begin, end) if draw_kinds(seed).matches(dict(options.only))]
-        return functools.partial(run_seed, command_line=options.bag, rough=options.rough), seeds
+        kinds = functools.partial(draw_kinds, fast=options.fast)
+        seeds = [seed for seed in range(begin, end) if kinds(seed).matches(dict(options.only))]
+        return functools.partial(run_seed, command_line=options.bag, rough=options.rough, fast=options.fast), seeds
     missing = why_not(options.shared)
     if missing is not None:
         return f"no recordings with a real IMU: {missing}"
@@ -109,11 +111,14 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--bag", action="store_true", help="write bags and run the real command line")
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
     parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
+    parser.add_argument("--fast", action="store_true", help="on roads, at up to 33 m/s; not with --real")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")
     parser.add_argument("-v", "--verbose", action="store_true", help="all that is known about every run")
     options = parser.parse_args(arguments)
+    if options.fast and options.real is not None:
+        parser.error("--fast makes roads of its own: without --real")
     options.seeds = options.seeds or (0, _NIGHTLY if options.nightly else _SMALL)
     return options
 

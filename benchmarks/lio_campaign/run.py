@@ -42,16 +42,17 @@ _POINTS_LOOKED_AT = 500
 _COMMAND = (sys.executable, "-c", "from boxplus.cli import main; main()", "lio")
 
 
-def run_seed(seed: int, *, command_line: bool = False, rough: bool = False) -> dict[str, Any]:
+def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast: bool = False) -> dict[str, Any]:
     """Everything about one seed, as a line of JSON.
 
     Args:
         seed: which.
         command_line: write a bag and run the real `boxplus lio` in a process of its own.
         rough: with what real recordings have besides, see nuisances.py.
+        fast: on a road, see roads.py.
     """
     clock = _Clock()
-    made = draw(seed)
+    made = draw(seed, fast=fast)
     simulation = made.truth()
     if rough:
         lidar = simulation.scenario.lidar

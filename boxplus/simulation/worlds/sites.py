@@ -1,4 +1,4 @@
-"""More worlds to record in, each reproducible from its seed: warehouse, tunnel, street, forest, open field, stairwell.
+"""More worlds to record in, each reproducible from its seed: warehouse, tunnel, street, highway, forest, open field, stairwell.
 
 The ground is z = 0 and what is long lies along x. Each says which part of it is free of obstacles.
 """
@@ -73,6 +73,53 @@ def street(length: float = 280.0, width: float = 18.0, seed: int = 0) -> World:
     for corner_low, corner_high in (block, mirrored):
         solids += pavements(random, corner_low, corner_high, width)
     return World(solids)
+
+
+def highway(length: float = 1200.0, seed: int = 0) -> World:
+    """A divided highway along x: rails, delineators, signs, gantries and bridges, noise barriers, bushes; |y| < 5 m is free."""
+    random = _random(seed, 4)
+    half = 0.5 * length
+    solids = [rectangle((0.0, 0.0, 0.0), (length + 400.0, 400.0), reflectivity=0.2)]
+    for y in (-7.0, 7.0, 9.0, 23.0):
+        solids.append(box((0.0, y, 0.65), (length, 0.08, 0.32), reflectivity=0.8))
+        for x in np.arange(-half, half, 4.0):
+            solids.append(box((x + random.normal(0.0, 0.02), y, 0.4), (0.12, 0.14, 0.8), reflectivity=0.8))
+    for x in np.arange(-half, half, 50.0):
+        for y in (-6.4, 23.6):
+            solids.append(box((x + random.normal(0.0, 0.3), y, 0.55), (0.12, 0.12, 1.1), reflectivity=0.9))
+    for y in (-11.0, 28.0):
+        begin = -half
+        while begin < half:
+            end = begin + random.uniform(40.0, 200.0)
+            if random.uniform() < 0.35:
+                height = random.uniform(2.5, 4.5)
+                solids.append(box((0.5 * (begin + end), y, 0.5 * height), (end - begin, 0.3, height), reflectivity=0.4))
+            else:
+                solids += _bushes(random, begin, end, y)
+            begin = end
+    for x in np.arange(-half + random.uniform(20.0, 150.0), half, 150.0) + random.uniform(-30.0, 30.0):
+        what = random.uniform()
+        if what < 0.6:
+            solids.append(cylinder((x, -8.2, 0.0), 0.06, 3.2, reflectivity=0.8))
+            solids.append(box((x, -8.2, 3.0), (0.05, random.uniform(1.0, 3.0), random.uniform(0.8, 2.0)), reflectivity=0.95))
+        else:
+            deep, thick, above = (0.5, 0.6, 6.0) if what < 0.85 else (random.uniform(8.0, 14.0), 1.5, 5.5)
+            solids.append(box((x, 8.0, above + 0.5 * thick), (deep, 40.0, thick), reflectivity=0.6))
+            solids += [box((x, y, 0.5 * above), (deep, 0.6, above), reflectivity=0.6) for y in (-9.0, 8.0, 25.0)]
+    return World(solids)
+
+
+def _bushes(random: np.random.Generator, begin: float, end: float, y: float) -> list[Solid]:
+    """Bushes and trees beyond the shoulder at `y`, a few metres apart."""
+    solids: list[Solid] = []
+    for x in np.arange(begin, end, random.uniform(4.0, 15.0)):
+        place = x + random.uniform(-2.0, 2.0), y + np.sign(y) * random.uniform(0.5, 8.0)
+        if random.uniform() < 0.5:
+            solids.append(sphere((*place, random.uniform(0.2, 0.8)), random.uniform(0.5, 1.4), reflectivity=0.4))
+        else:
+            solids.append(cylinder((*place, 0.0), random.uniform(0.1, 0.3), 5.0, reflectivity=0.3))
+            solids.append(sphere((*place, random.uniform(4.0, 6.0)), random.uniform(1.2, 2.5), reflectivity=0.4))
+    return solids
 
 
 def forest(side: float = 80.0, spacing: float = 3.5, seed: int = 0) -> World:

@@ -21,7 +21,9 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import explains_changes
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Poses, Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface_distances
 
 _WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, paths that ride with a pattern 1.6 to 6
@@ -71,7 +73,10 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         more_off = (other_misfit - own_misfit) / config.plane_threshold**2
         elsewhere = not one_motion(part.poses, other, _ASTRAY_RAD, _ASTRAY_M + _ASTRAY_SHARE * _way(part.poses))
         if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and more_off > _MORE_OFF:
-            astray = _astray(part.poses, other, more_off)
+            twists = [expected[number] for number in numbers]
+            # Where all but a few things go along with the LiDAR, as on a highway, it is the path that has gone astray.
+            if not explains_changes(chosen, _turning(other, twists), twists):
+                astray = _astray(part.poses, other, more_off)
     return Explained(by_path, astray)
 
 
@@ -115,6 +120,19 @@ def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
         R.append(R[-1] @ so3.exp(seconds * rate))
         p.append(p[-1] + seconds * (R[-1] @ velocity))
     return np.array([scan.end_ns for scan in scans]), np.array(R), np.array(p)
+
+
+def _turning(motion: Poses, twists: Sequence[Twist]) -> Turning:
+    """The attitudes in between, at the rate of every step."""
+    ends, R, _ = motion
+    rates = np.array([rate for rate, _ in twists])
+
+    def at(time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        k = np.clip(np.searchsorted(ends, time_ns), 0, len(ends) - 1)
+        turned: NDArray[np.float64] = R[k] @ so3.exp(((time_ns - ends[k]) * 1e-9)[:, None] * rates[k])
+        return turned
+
+    return at
 
 
 def one_motion(own: Poses, other: Poses, angle_rad: float = 0.01, distance_m: float = 0.05) -> bool:

@@ -32,6 +32,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     nodes_within,
     thinned,
     undistorted,
+    with_held,
 )
 
 MOST_POINTS = 1500  # that a scan is registered with
@@ -116,6 +117,7 @@ def lidar_path(
     undistort: bool = False,
     expected: Sequence[Twist] | None = None,
     velocity: NDArray[np.float64] | None = None,
+    held: bool = False,
     unbroken: bool = False,
 ) -> LidarPath:
     """The path of the LiDAR through `scans`, in order of time; streamed.
@@ -127,9 +129,10 @@ def lidar_path(
         undistort: whether to undistort with the first guess, where it has been found to be right, instead of a constant rate.
         expected: of every scan, how an estimator believes that the LiDAR moved: one more start, and no further search.
         velocity: (3,) with which the first registration begins [m/s], LiDAR frame; zero when not given.
+        held: whether the LiDAR moves as far along its way as is expected, whatever the scan says of that (`common_motion`).
         unbroken: whether to stop at the first scan that cannot be registered: the most costly one, as all starts are tried.
     """
-    motion = LidarMotion(config, guesses, undistort=undistort, velocity=velocity)
+    motion = LidarMotion(config, guesses, undistort=undistort, velocity=velocity, held=held)
     for number, scan in enumerate(scans):
         motion.add(scan, None if expected is None else expected[number])
         if unbroken and motion.failed:
@@ -147,10 +150,11 @@ class LidarMotion:
         *,
         undistort: bool = False,
         velocity: NDArray[np.float64] | None = None,
+        held: bool = False,
     ) -> None:
         self._config = config.model_copy(update={"weak_threshold": min(config.weak_threshold, _WEAK)})
         self._guesses = tuple(guesses)
-        self._undistort = undistort and bool(guesses)
+        self._undistort, self._held = undistort and bool(guesses), held
         self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)
         self._map_filter = VoxelFilter(config.map_cell, MOST_MAP_POINTS)
         self._poses: list[_Pose] = []
@@ -286,6 +290,7 @@ class LidarMotion:
         if expected is not None:
             rate, velocity = expected
             starts.append((rate, self._x[R : R + 9].reshape(3, 3) @ so3.exp(0.5 * step_s * rate) @ velocity))
+            starts = starts[-1:] if self._held else starts
         # Where two expect about the same, one is enough.
         starts = [
             start
@@ -319,6 +324,7 @@ class LidarMotion:
         x[R : R + 9] = (R_before @ so3.exp(rate * step_s)).ravel()
         x[P : P + 3] = p_before + velocity * step_s
         directions: PoseDirections | None = None
+        held = velocity / np.linalg.norm(velocity) if self._held and velocity.any() else None
         for _ in range(_PASSES):
             # Within the scan the motion is what it was found to be on the way here.
             nodes = self._nodes(scan, middle_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity)
@@ -327,7 +333,7 @@ class LidarMotion:
             # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
             share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
             measurement = PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share)
-            directions = align(x, measurement, self._config)
+            directions = align(x, measurement, self._config, held=held)
             if directions is None:
                 return None
             moved = so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
@@ -346,12 +352,13 @@ class LidarMotion:
             or max(np.abs(rate).max() / _FASTEST[0], np.abs(velocity).max() / _FASTEST[1]) > 1.0
         ):
             return None
+        known = honest_information(information.A[:6, :6], directions, information.residual_rms)
         cost = information.residual_rms**2 * share + self._config.plane_threshold**2 * (1.0 - share)
         return _Fit(
             x,
             rate,
             velocity,
-            honest_information(information.A[:6, :6], directions, information.residual_rms),
+            known if held is None else with_held(known, held),
             directions.vectors[:, directions.weak],
             information.residual_rms,
             cost,

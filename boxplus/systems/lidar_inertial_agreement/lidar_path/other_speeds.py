@@ -1,8 +1,7 @@
 """Whether scans fit as well, or better, at another speed: a registration ends in the minimum next to its start and cannot know.
 
 Over open ground the rings of a LiDAR go along with it. A scan that is laid upon the one before it, ring upon ring, fits about as
-well as one that is laid where it was seen; which of the two a registration finds is decided by where it began. Along a street at
-15 m/s the walls look the same from scan to scan as well, and what began at rest stays at rest.
+well as one that is laid where it was seen; which of the two a registration finds is decided by where it began.
 """
 
 from __future__ import annotations
@@ -21,37 +20,18 @@ _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no 
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
 _DEVIATIONS, _ANOTHER_M_S = 5.0, 0.3  # beyond both another speed is another
 _AS_WELL = 1.1  # times the cost
-_SEARCHED_M_S = np.arange(5.0, 34.0, 3.0)  # both ways along the axis that is known least: the fastest car that is mapped
-_FIRST_SCANS, _CLEARLY, _NOT_REST_M_S = 4, 0.8, 3.0  # tried at every speed; times the cost at rest
+_ONE_M_S, _ONE_SHARE = 1.0, 0.05  # two speeds are one
 
 
-def better_speed(
-    path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, guesses: Sequence[Turning]
-) -> NDArray[np.float64] | None:
-    """A mean velocity (3,) [m/s] at which the first scans fit clearly better than on a path that rests, or None.
+def well_known(path: LidarPath) -> bool:
+    """Whether the scene shows the positions of a path along every axis, so well that no other speed need be looked for."""
+    return _least_known(path)[0] < _SURE_M
 
-    Searched along the axis that is known least, where it is not known well. Of 16 streets at a constant 15 to 20 m/s, 11 passed
-    for rest; with the right speed the cost was 0.45 to 0.75 times that at rest. Of platforms that do rest, in streets, forests,
-    fields, tunnels and warehouses, no other speed came below 0.85.
 
-    Args:
-        path, scans, config, guesses: as for `other_speed`.
-    """
-    if len(path) < _FIRST_SCANS:
-        return None
-    sigma, axes = _least_known(path)
-    if sigma < _SURE_M:
-        return None
-    most, found = _CLEARLY * float(path.cost[:_FIRST_SCANS].sum()), None
-    for velocity in np.concatenate([_SEARCHED_M_S, -_SEARCHED_M_S])[:, None] * axes[:, 0]:
-        tried = lidar_path(scans[:_FIRST_SCANS], config, guesses, undistort=True, velocity=velocity, unbroken=True)
-        cost = float(tried.cost.sum())
-        if tried.failed or len(tried) < _FIRST_SCANS or cost >= most:
-            continue
-        moving = _mean_velocity(tried)
-        if np.linalg.norm(moving) > _NOT_REST_M_S:
-            most, found = cost, moving
-    return found
+def one_speed(path: LidarPath, other: LidarPath) -> bool:
+    """Whether two paths through the same scans are about as fast, in about the same direction."""
+    velocity = _mean_velocity(other)
+    return bool(np.linalg.norm(_mean_velocity(path) - velocity) < _ONE_M_S + _ONE_SHARE * np.linalg.norm(velocity))
 
 
 def _least_known(path: LidarPath) -> tuple[float, NDArray[np.float64]]:

@@ -27,6 +27,8 @@ _ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on 
 _LEAST_CELL = 4.0  # range_sigma: of points closer together noise makes planes
 _ASKED = 6  # scans of a stretch
 _NODES = 21  # within a scan, of a known turning
+_HELD_M = 0.09  # standard deviation of a position along the way, where what changes between scans shows it
+_STIFF = 1e6  # times the information, along what is held
 _LEAST_GAIN = 2.0  # surfaces fill cells of half the size with four times as many points, unless these are few
 
 
@@ -57,9 +59,17 @@ def with_cells_for_all(scans: Sequence[Scan], config: RegistrationConfig) -> Reg
 
 
 def align(
-    x: NDArray[np.float64], measurement: PlaneMeasurement, config: RegistrationConfig, *, steps: int = _STEPS
+    x: NDArray[np.float64],
+    measurement: PlaneMeasurement,
+    config: RegistrationConfig,
+    *,
+    steps: int = _STEPS,
+    held: NDArray[np.float64] | None = None,
 ) -> PoseDirections | None:
-    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match."""
+    """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match.
+
+    Along a unit axis `held` (3,), frame of the map, the position stays where it is.
+    """
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None
     for step in range(steps):
@@ -67,7 +77,11 @@ def align(
         if information.used < config.min_points:
             return None
         directions = information.directions
-        delta[:6] = strong_step(information.A, information.b, directions)
+        A = information.A
+        if held is not None:
+            A = A.copy()
+            A[3:6, 3:6] += _STIFF * float(np.trace(A[3:6, 3:6])) * np.outer(held, held)
+        delta[:6] = strong_step(A, information.b, directions)
         boxplus_into(x, delta, x)
         if np.abs(delta).max() < _SETTLED:
             break
@@ -86,6 +100,15 @@ def honest_information(A: NDArray[np.float64], directions: PoseDirections, misfi
     back = strong / scale[:, None]
     honest: NDArray[np.float64] = back @ reduced @ back.T
     return honest
+
+
+def with_held(information: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Information (6, 6) of a registration whose position was held along a unit axis (3,): of the scan nothing along it."""
+    across = np.eye(6)
+    across[3:, 3:] -= np.outer(axis, axis)
+    held: NDArray[np.float64] = across @ information @ across
+    held[3:, 3:] += np.outer(axis, axis) / _HELD_M**2
+    return held
 
 
 def thinned(scan: Scan, most: int) -> Scan:

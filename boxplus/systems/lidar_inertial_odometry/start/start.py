@@ -16,11 +16,11 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import other_explains_better
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import better_speed, other_speed
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import one_speed, other_speed, well_known
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
@@ -42,6 +42,7 @@ _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
+_COMMON_M_S = 0.2  # standard deviation of a speed that what changes from scan to scan shows
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
 WAITING = "; waiting for more data"
 """How a refusal ends that the next scans may lift."""
@@ -99,29 +100,42 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
 
 def _start(seen: _Beginning) -> Start:
     """The start that fits all that has been seen."""
-    path = _first_path(seen)
+    path = lidar_path(seen.scans, seen.registration, seen.guesses, unbroken=True)
+    motion = _common_motion(seen, path)
+    if motion is not None:
+        return _moving_start(seen, _held_path(seen, seen.guesses, motion), motion)
+    _check_path(seen, path)
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
     if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
-        moving = _path_at_speed(seen, path) if rest.determined else None  # else the start says what is not shown
-        return _static_start(seen, rest) if moving is None else _moving_start(seen, moving)
+        return _static_start(seen, rest)
     return _moving_start(seen, path)
 
 
-def _path_at_speed(seen: _Beginning, path: LidarPath) -> LidarPath | None:
-    """The path of a platform that moves although its scans fit at rest; None where nothing speaks for that."""
-    guesses = gyro_guesses(seen.imu, seen.extrinsic.R_imu_lidar)
-    velocity = better_speed(path, seen.scans, seen.registration, guesses)
-    if velocity is None:
+def _common_motion(seen: _Beginning, path: LidarPath) -> Sequence[Twist] | None:
+    """The motion that explains what changes from scan to scan, where the path does not show it."""
+    found = not _broken(path) and len(path) == len(seen.scans)
+    if found and well_known(path):
         return None
-    other = lidar_path(seen.scans, seen.registration, guesses, undistort=True, velocity=velocity, unbroken=True)
-    if _broken(other) or not other_explains_better(seen.scans, path.poses, other.poses, seen.registration):
-        raise seen.not_moving(
-            "the surroundings do not show how fast the platform moves: the first scans fit clearly better at "
-            f"{np.linalg.norm(velocity):.1f} m/s than at rest, and the next ones show no such path"
-        )
-    return other
+    motion = common_motion(seen.scans, seen.guesses[0], seen.up_lidar)
+    if motion is None:
+        return None
+    if isinstance(motion, str):
+        raise _NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion}{WAITING}")
+    held = _held_path(seen, seen.guesses, motion.twists())
+    if found and one_speed(path, held):
+        return None
+    way = held.p_path_lidar[-1] - held.p_path_lidar[0]
+    return motion.twists(way / np.linalg.norm(way))
+
+
+def _held_path(seen: _Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
+    """The path that follows a motion along its way, and the scans across it."""
+    path = lidar_path(seen.scans, seen.registration, guesses, undistort=True, expected=motion, held=True, unbroken=True)
+    if _broken(path):
+        raise seen.not_moving("the first scans do not overlap enough for a moving start")
+    return path
 
 
 def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
@@ -144,6 +158,9 @@ class _Beginning:
         self.registration: RegistrationConfig = with_cells_for(self.scans[0], config)
         self.imu = joined_imu(frames)
         self.extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
+        self.guesses = gyro_guesses(self.imu, self.extrinsic.R_imu_lidar)
+        up = self.extrinsic.R_imu_lidar.T @ self.imu.accel.mean(axis=0)
+        self.up_lidar: NDArray[np.float64] = up / max(float(np.linalg.norm(up)), 1e-9)
         self.duration_s = (self.scans[-1].end_ns - self.scans[0].start_ns) * 1e-9
         self.accel_norm = float(np.linalg.norm(self.imu.accel.mean(axis=0)))
         self.gyro_std, self.accel_std = float(self.imu.gyro.std(axis=0).max()), float(self.imu.accel.std(axis=0).max())
@@ -188,16 +205,14 @@ def _check_accelerometer(norm: float) -> None:
         )
 
 
-def _first_path(seen: _Beginning) -> LidarPath:
-    """How the LiDAR moved, from its scans, unbroken."""
-    path = lidar_path(seen.scans, seen.registration, gyro_guesses(seen.imu, seen.extrinsic.R_imu_lidar), unbroken=True)
+def _check_path(seen: _Beginning, path: LidarPath) -> None:
+    """Whether the scans show how the LiDAR moved, unbroken, and the IMU was there."""
     if _broken(path) or len(path) < min(len(seen.frames), 3):
         raise _NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
     time_ns = seen.imu.time_ns
     within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
     if len(path) < 2 or within < _FEWEST_SAMPLES:
         raise _NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{WAITING}")
-    return path
 
 
 def _broken(path: LidarPath) -> bool:
@@ -250,17 +265,22 @@ def _static_start(seen: _Beginning, rest: Rest) -> Start:
     )
 
 
-def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
+def _moving_start(seen: _Beginning, path: LidarPath, motion: Sequence[Twist] | None = None) -> Start:
+    """The start of a platform in motion; on a path that follows `motion`, where that and not the registrations show its speed."""
     if len(seen.frames) < _MIN_MOVING_SCANS:
         raise seen.not_moving(f"{len(seen.frames)} scans are not enough for a moving start")
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
     imu, scans = seen.imu, seen.scans
     steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
-    guesses = gyro_guesses(steady, seen.extrinsic.R_imu_lidar)
-    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(path), unbroken=True)
+    guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
+    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(first), unbroken=True)
+    if motion is not None and (_broken(path) or not one_speed(path, first)):
+        path = _held_path(seen, guesses, motion)
+    else:
+        motion = None
     if _broken(path):
         raise seen.not_moving("the first scans do not overlap enough for a moving start")
-    drift = path_drift(path, scans, seen.registration, guesses[0])
+    drift = path_drift(path, scans, seen.registration, guesses[0]) if motion is None else None
     if drift is not None:
         raise seen.not_moving(
             f"the path of the LiDAR drifts: one of its last scans lies {np.linalg.norm(drift[3:]) * 100:.0f} cm and "
@@ -272,9 +292,12 @@ def _moving_start(seen: _Beginning, path: LidarPath) -> Start:
         path = turned_by_gyroscope(path, imu, seen.extrinsic.R_imu_lidar, gyro_bias(path, imu, seen.extrinsic))
     fit = _checked_fit(seen, path)
     state, covariance = moving_state(seen.frames, path, not_shown, imu, fit, seen.extrinsic, seen.config)
+    if motion is not None:  # what is wrong with the speed is wrong with it all the time
+        along = state.v_world_imu / np.linalg.norm(state.v_world_imu)
+        covariance[T_V : T_V + 3, T_V : T_V + 3] += _COMMON_M_S**2 * np.outer(along, along)
     sigma = _checked_speed(seen, state, covariance)
     speed = float(np.linalg.norm(state.v_world_imu))
-    other = other_speed(path, scans, seen.registration, guesses)
+    other = other_speed(path, scans, seen.registration, guesses) if motion is None else None
     if other is not None:
         raise seen.not_moving(
             "the surroundings do not show how fast the platform moves: the scans fit about as "
