@@ -266,12 +266,12 @@ def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespa
 def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     draw = campaign.draws.draw(seed)
     short = replace(draw, duration_s=4.0)
-    monkeypatch.setattr(campaign.run, "draw", lambda _: short)
+    monkeypatch.setattr(campaign.run, "draw", lambda _, **__: short)
     line = campaign.run.run_seed(seed)
     assert (line["verdict"], line["exit_code"]) == ("right", 0)
     assert line["worst_m"] < 0.05
     spoiled = replace(short, kinds=replace(short.kinds, fault="accel_unit", bag="true"), spoiled=faults.imu_in_g())
-    monkeypatch.setattr(campaign.run, "draw", lambda _: spoiled)
+    monkeypatch.setattr(campaign.run, "draw", lambda _, **__: spoiled)
     seen_through = campaign.run.run_seed(seed)
     assert (seen_through["verdict"], seen_through["bag"]) == ("right", "true")
     text = campaign.report.report([line, seen_through | {"verdict": "silent", "reasons": ["error"]}])

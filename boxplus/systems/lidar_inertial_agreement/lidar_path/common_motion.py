@@ -28,6 +28,7 @@ _MOST_RAW, _MOST_VOTERS = 8000, 800
 _FAR_M = 60.0  # beyond it neighbouring rays are metres apart
 _NEIGHBOURS, _NEAR_M, _THICKEST_M, _FLAT = 8, 1.0, 0.06, 0.05
 _SAME_M, _CLOSE_M = 0.3, 0.15  # from one of them, a point is there again
+_WELL_M = 0.08  # that a motion is off in the median, where it explains what changes
 _LEVEL_M = 0.5  # that two points differ in height which vote: rings are sparse
 _CELL_M, _CANDIDATES, _ROUNDS = 0.2, 12, 4
 _SLOWEST_M_S, _FASTEST_M_S = 8.0, 36.0  # below it registrations find the way, above it no car that is mapped drives
@@ -156,7 +157,7 @@ def _most_common(pairs: Sequence[ChangedPoints], level: NDArray[np.float64]) -> 
 
 
 def explains_changes(scans: Sequence[Scan], turning: Turning, twists: Sequence[Twist]) -> bool:
-    """Whether a motion explains what changes from scan to scan, all around and better than by chance.
+    """Whether a motion, of 8 m/s and more, explains what changes from scan to scan: all around, well, and better than by chance.
 
     Args:
         scans: consecutive sweeps.
@@ -168,7 +169,11 @@ def explains_changes(scans: Sequence[Scan], turning: Turning, twists: Sequence[T
         pair, (rate, velocity) = changed_points(scans[k], scans[k + 1], turning), twists[k + 1]
         pairs.append(pair)
         velocities.append(so3.exp(0.5 * pair.seconds * rate) @ velocity)
-    return _believed(pairs, np.array(velocities))
+    if np.linalg.norm(velocities, axis=1).min() < _SLOWEST_M_S or not _believed(pairs, np.array(velocities)):
+        return False
+    missing = np.concatenate([pair.shifts(velocity)[1] for pair, velocity in zip(pairs, velocities, strict=True)])
+    along = velocities[0] / np.linalg.norm(velocities[0])
+    return bool(abs(np.median(missing @ along)) * pairs[0].seconds < _WELL_M)
 
 
 def _voted(pairs: Sequence[ChangedPoints], level: NDArray[np.float64]) -> list[NDArray[np.float64]]:

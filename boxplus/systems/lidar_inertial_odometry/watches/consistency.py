@@ -37,6 +37,7 @@ _ONE_SCAN = 100.0  # no single scan counts for more: it takes several to contrad
 _LOST_STREAK = 3
 _LEAST_FITTING = 0.6  # of the points with a plane lie on it; 0.92 at least on sound runs
 _FASTEST_M_S = 120.0
+_FAST_M_S, _THIN_MAP_NS = 8.0, 1_500_000_000
 _LARGEST_BIAS = 0.1, 0.7  # rad/s, m/s²: more than an inertial sensor in order has, and as known as three deviations
 _MEASUREMENT_SIGMA = np.repeat([1e-3, 0.01], 3)  # rad, m: of a registration, beside the prediction's covariance
 
@@ -78,6 +79,7 @@ class Consistency:
         self._previous_start_ns: int | None = None
         self._first_biases: NDArray[np.float64] | None = None
         self._steady, self._corrections = SteadyBias(config.gyro_bias_walk), Corrections()
+        self._corrected_from_ns: int | None = None
         self._told: set[str] = set()
 
     @property
@@ -245,8 +247,12 @@ class Consistency:
         # A mounting that is still being found moves what the IMU predicts, and no correction is white.
         sought = not self._mounting_given and not self.mounting_borne_out
         gap = frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES
+        if self._corrected_from_ns is None:  # a map as thick as a scan, metres from the next one, pulls fast ones back and forth
+            fast = float(np.linalg.norm(update.posterior.x[V : V + 3])) > _FAST_M_S
+            self._corrected_from_ns = frame.scan.end_ns + (_THIN_MAP_NS if fast else 0)
+        thin = frame.scan.end_ns < self._corrected_from_ns
         # Of a scan off the map nothing is taken up, and the next one wants the same again.
-        if sought or gap or self.lost or not update.posterior.valid:
+        if sought or gap or thin or self.lost or not update.posterior.valid:
             self._corrections.clear()
             return []
         return self._contradicting("pushes", self._corrections.update(frame.scan.end_ns, correction, update))
