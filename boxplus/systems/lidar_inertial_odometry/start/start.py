@@ -116,7 +116,7 @@ def _start(seen: _Beginning) -> Start:
 def _common_motion(seen: _Beginning, path: LidarPath) -> Sequence[Twist] | None:
     """The motion that explains what changes from scan to scan, where the path does not show it."""
     found = not _broken(path) and len(path) == len(seen.scans)
-    if found and well_known(path):
+    if not seen.guesses or (found and well_known(path)):  # without a gyroscope changes by turning are not told apart
         return None
     motion = common_motion(seen.scans, seen.guesses[0], seen.up_lidar)
     if motion is None:
