@@ -25,7 +25,7 @@ _ONE_M_S, _ONE_SHARE = 1.0, 0.05  # two speeds are one
 
 def well_known(path: LidarPath) -> bool:
     """Whether the scene shows the positions of a path along every axis, so well that no other speed need be looked for."""
-    return _least_known(path)[0] < _SURE_M
+    return len(path) > 1 and _least_known(path)[0] < _SURE_M
 
 
 def one_speed(path: LidarPath, other: LidarPath) -> bool:

@@ -121,11 +121,11 @@ def _common_motion(seen: _Beginning, path: LidarPath) -> Sequence[Twist] | None:
     motion = common_motion(seen.scans, seen.guesses[0], seen.up_lidar)
     if motion is None:
         return None
-    if isinstance(motion, str):
-        raise _NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion}{WAITING}")
     held = _held_path(seen, seen.guesses, motion.twists())
     if found and one_speed(path, held):
         return None
+    if motion.doubt:
+        raise _NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
     way = held.p_path_lidar[-1] - held.p_path_lidar[0]
     return motion.twists(way / np.linalg.norm(way))
 
