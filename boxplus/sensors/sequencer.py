@@ -6,6 +6,7 @@ Everything that cannot be used is counted by reason; nothing is dropped silently
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -248,3 +249,10 @@ class Sequencer:
         if len(self._imu) != 1:
             self._imu = deque([ImuSamples.joined(self._imu)])
         return self._imu[0]
+
+
+def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
+    """The IMU samples of several frames, each once."""
+    imu = ImuSamples.joined(frame.imu for frame in frames)
+    time, first = np.unique(imu.time_ns, return_index=True)
+    return ImuSamples(time, imu.gyro[first], imu.accel[first])

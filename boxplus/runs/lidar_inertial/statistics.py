@@ -13,7 +13,7 @@ from boxplus.runs.run_facts import Gap, WarningFacts
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
-from boxplus.systems.lidar_inertial_odometry.start.start import WAITING
+from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 

@@ -23,7 +23,7 @@ from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer
+from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer, joined_imu
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
@@ -39,7 +39,7 @@ from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
-from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start, joined_imu
+from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency

@@ -11,7 +11,7 @@ from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, nodes_within, thinned, undistorted
 
-_MOST_RAW = 8000
+_MOST_RAW, _MOST_COMPARED = 8000, 32000  # points of a scan; at rest, fewer of them are not the same ones from scan to scan
 _FAR_M = 60.0  # beyond it neighbouring rays are metres apart
 _NEIGHBOURS, _NEAR_M, _THICKEST_M, _FLAT = 8, 1.0, 0.06, 0.05
 _SAME_M = 0.3  # from one of them, a point is there again
@@ -60,6 +60,17 @@ def changed_points(first: Scan, second: Scan, turning: Turning) -> ChangedPoints
     return ChangedPoints(before[old], after[new], since_before[old], since_after[new] + seconds, seconds)
 
 
+def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
+    """The share of the second scan's points that the first has nothing of: none at rest where nothing moves.
+
+    Args:
+        first, second: in order of time.
+        turning: how the LiDAR turned.
+    """
+    (before, _), (after, _), _ = _both(first, second, turning, _MOST_COMPARED)
+    return float(_unexplained(after[:: -(-len(after) // _MOST_RAW)], before).mean())
+
+
 def stay_and_go(
     scans: tuple[Scan, Scan], turning: Turning, velocity: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[int, int]:
@@ -97,20 +108,20 @@ def _standing(p: NDArray[np.float64], axis: NDArray[np.float64], up: NDArray[np.
     return np.asarray(standing)
 
 
-def _still(scan: Scan, turning: Turning) -> _Still:
+def _still(scan: Scan, turning: Turning, most: int) -> _Still:
     """Points (N, 3) [m] without the turning within the scan, and their times (N,) since its middle [s]."""
-    scan = thinned(scan, _MOST_RAW)
+    scan = thinned(scan, most)
     middle = (scan.start_ns + scan.end_ns) // 2
     p = undistorted(scan, nodes_within(scan, middle, np.zeros(3), np.zeros(3), turning), middle)
     return p.astype(np.float64), np.asarray((scan.time_ns - middle) * 1e-9, np.float64)
 
 
-def _both(first: Scan, second: Scan, turning: Turning) -> tuple[_Still, _Still, float]:
+def _both(first: Scan, second: Scan, turning: Turning, most: int = _MOST_RAW) -> tuple[_Still, _Still, float]:
     """Two scans without their turning, along the axes in the middle of the first, and the seconds between their middles."""
     middles = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in (first, second)])
     R = turning(middles)
-    after, since_after = _still(second, turning)
-    return _still(first, turning), (after @ (R[0].T @ R[1]).T, since_after), float(middles[1] - middles[0]) * 1e-9
+    after, since_after = _still(second, turning, most)
+    return _still(first, turning, most), (after @ (R[0].T @ R[1]).T, since_after), float(middles[1] - middles[0]) * 1e-9
 
 
 def _there(p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:

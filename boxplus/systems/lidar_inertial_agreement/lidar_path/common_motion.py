@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points, stay_and_go
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
+    ChangedPoints,
+    changed_points,
+    changed_share,
+    stay_and_go,
+)
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 
@@ -41,6 +46,7 @@ _APART_M, _ANOTHER = 0.5, 0.8  # a shift that is another one, and its share of t
 _LANES_M, _BEYOND = 6.0, 0.6  # aside: where the traffic next to a platform is, and the share of the matches beyond it
 _PLACE_M, _FEWEST_PLACES = 2.0, 70  # beyond it: at rest among traffic up to 46, in streets from 75 on
 _STAYING, _FEWEST_STAYING = 0.35, 20  # of those that go by the common motion, and at least; on drives up to 0.26
+_CHANGING, _FEWEST_AT_REST = 0.003, 60  # of all points; and of what stands, that stay: by chance, on drives, up to 49 do
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +115,21 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
             doubt = doubt or f"what changes fits {_text(other)} m/s (LiDAR axes) about as well as {_text(velocity)} m/s"
     pairs = [first.get(k) or _pair(scans, k, turning, R_first[k]) for k in range(len(scans) - 1)]
     return CommonMotion(pairs, R_first, velocity, level, doubt)
+
+
+def rest_in_doubt(scans: Sequence[Scan], turning: Turning, axis: NDArray[np.float64], up_lidar: NDArray[np.float64]) -> bool:
+    """Whether points change from scan to scan, though they show no motion, and little of what stands on the ground shows rest.
+
+    Args:
+        scans: consecutive sweeps, at least 6.
+        turning: how the LiDAR turned.
+        axis: (3,) unit vector along which rest is least known, along the LiDAR's axes in the middle of the first scan.
+        up_lidar: (3,) unit vector, roughly upwards, likewise.
+    """
+    pairs = [(scans[k], scans[k + 1]) for k in _PAIRS if k + 1 < len(scans)]
+    if not pairs or np.mean([changed_share(*pair, turning) for pair in pairs]) < _CHANGING:
+        return False
+    return sum(stay_and_go(pair, turning, _SLOWEST_M_S * axis, up_lidar)[0] for pair in pairs) < _FEWEST_AT_REST
 
 
 def _pair(scans: Sequence[Scan], k: int, turning: Turning, R: NDArray[np.float64]) -> ChangedPoints:
@@ -227,12 +248,16 @@ def _matched(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> i
 
 
 def _around(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> int:
-    """In how many of twelve sectors around the LiDAR, in the plane in which they mostly are, a few points are there again."""
-    found: set[int] = set()
+    """In how many of twelve sectors around the LiDAR a few points are there again, in its plane or, if it is tilted, theirs."""
     matched = [pair.p_after[again] for pair, again in zip(pairs, _again(pairs, velocity), strict=True)]
     towards = np.concatenate(matched)
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-    plane = np.linalg.eigh(towards.T @ towards)[1][:, 1:]
+    return max(_sectors(matched, plane) for plane in (np.eye(3)[:, :2], np.linalg.eigh(towards.T @ towards)[1][:, 1:]))
+
+
+def _sectors(matched: Sequence[NDArray[np.float64]], plane: NDArray[np.float64]) -> int:
+    """In how many sectors of a plane, spanned by two columns (3, 2), there are a few points of any list of them."""
+    found: set[int] = set()
     for p in matched:
         ahead, aside = (p @ plane).T
         sector = ((np.arctan2(aside, ahead) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS

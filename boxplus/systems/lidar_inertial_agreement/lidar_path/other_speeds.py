@@ -28,6 +28,12 @@ def well_known(path: LidarPath) -> bool:
     return len(path) > 1 and _least_known(path)[0] < _SURE_M
 
 
+def least_known_axis(path: LidarPath) -> NDArray[np.float64]:
+    """(3,) unit vector along which the scene shows the positions of a path, of two poses at least, the least."""
+    axis: NDArray[np.float64] = _least_known(path)[1][:, 0]
+    return axis
+
+
 def one_speed(path: LidarPath, other: LidarPath) -> bool:
     """Whether two paths through the same scans are about as fast, in about the same direction."""
     velocity = _mean_velocity(other)

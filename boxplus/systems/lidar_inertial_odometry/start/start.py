@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -11,29 +11,30 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.filtering.nav_state import T_V, NavState
-from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion, rest_in_doubt
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import one_speed, other_speed, well_known
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
+    least_known_axis,
+    one_speed,
+    other_speed,
+    well_known,
+)
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
 _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
-_QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
-_FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
-_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
 _MIN_MOVING_SCANS = 8
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
@@ -44,8 +45,6 @@ _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
 _LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
 _COMMON_M_S = 0.2  # standard deviation of a speed that what changes from scan to scan shows
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
-WAITING = "; waiting for more data"
-"""How a refusal ends that the next scans may lift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,38 +82,48 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     Raises:
         InputError: the accelerometer reports in g, was taken for one that does, or shows no gravity.
     """
-    seen = _Beginning(frames, config)
+    seen = Beginning(frames, config)
     _check_accelerometer(seen.accel_norm)
     try:
         return _start(seen)
-    except _NotYet as reason:
+    except NotYet as reason:
         refusal = str(reason)
     newest = _newest(frames, config.start_duration)
     if len(newest) < _MUCH_SHORTER * len(frames):
         try:
-            return _start(_Beginning(newest, config))
-        except _NotYet:
+            return _start(Beginning(newest, config))
+        except NotYet:
             pass
     return refusal
 
 
-def _start(seen: _Beginning) -> Start:
+def _start(seen: Beginning) -> Start:
     """The start that fits all that has been seen."""
     path = lidar_path(seen.scans, seen.registration, seen.guesses, unbroken=True)
     motion = _common_motion(seen, path)
-    if motion is not None:
-        return _moving_start(seen, _held_path(seen, seen.guesses, motion), motion)
+    if motion is not None and not motion.shown:
+        return _moving_start(seen, _held_path(seen, seen.guesses, motion.twists), motion)
     _check_path(seen, path)
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
+    if rest.at_rest and motion is None and rest.determined:
+        rest = _doubted(seen, path, rest)
     if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
         return _static_start(seen, rest)
-    return _moving_start(seen, path)
+    return _moving_start(seen, path, motion)
 
 
-def _common_motion(seen: _Beginning, path: LidarPath) -> Sequence[Twist] | None:
-    """The motion that explains what changes from scan to scan, where the path does not show it."""
+@dataclass(frozen=True, slots=True)
+class _Common:
+    """The motion that explains what changes from scan to scan: to every scan, and whether the path shows it too."""
+
+    twists: Sequence[Twist]
+    shown: bool
+
+
+def _common_motion(seen: Beginning, path: LidarPath) -> _Common | None:
+    """The motion that explains what changes from scan to scan, where the path alone does not show it well."""
     found = not _broken(path) and len(path) == len(seen.scans)
     if not seen.guesses or (found and well_known(path)):  # without a gyroscope changes by turning are not told apart
         return None
@@ -122,15 +131,26 @@ def _common_motion(seen: _Beginning, path: LidarPath) -> Sequence[Twist] | None:
     if motion is None:
         return None
     held = _held_path(seen, seen.guesses, motion.twists())
-    if found and one_speed(path, held):
+    shown = found and one_speed(path, held)
+    if motion.doubt and shown:
         return None
     if motion.doubt:
-        raise _NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
+        raise NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
     way = held.p_path_lidar[-1] - held.p_path_lidar[0]
-    return motion.twists(way / np.linalg.norm(way))
+    return _Common(motion.twists(way / np.linalg.norm(way)), shown)
 
 
-def _held_path(seen: _Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
+def _doubted(seen: Beginning, path: LidarPath, rest: Rest) -> Rest:
+    """Rest that is not known along the axis that is known least, where more changes than rest explains."""
+    if len(path) < 2 or well_known(path) or not seen.guesses:
+        return rest
+    axis = least_known_axis(path)
+    if not rest_in_doubt(seen.scans, seen.guesses[0], axis, seen.up_lidar):
+        return rest
+    return replace(rest, open_axes=axis[None])
+
+
+def _held_path(seen: Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
     """The path that follows a motion along its way, and the scans across it."""
     path = lidar_path(seen.scans, seen.registration, guesses, undistort=True, expected=motion, held=True, unbroken=True)
     if _broken(path):
@@ -143,44 +163,6 @@ def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
     times = np.array([frame.scan.start_ns for frame in frames])
     enough = int(np.searchsorted(times, frames[-1].scan.end_ns - round(seconds * 1e9), side="right")) - 1
     return frames[max(min(enough, len(frames) - _MIN_MOVING_SCANS), 0) :]
-
-
-class _NotYet(Exception):
-    """Why there is no start yet; a sentence."""
-
-
-class _Beginning:
-    """What a start has to go by: some scans, the IMU samples around them, and what has been found of both."""
-
-    def __init__(self, frames: Sequence[Frame], config: LioConfig) -> None:
-        self.frames, self.config = frames, config
-        self.scans: list[Scan] = [frame.scan for frame in frames]
-        self.registration: RegistrationConfig = with_cells_for(self.scans[0], config)
-        self.imu = joined_imu(frames)
-        self.extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
-        self.guesses = gyro_guesses(self.imu, self.extrinsic.R_imu_lidar)
-        up = self.extrinsic.R_imu_lidar.T @ self.imu.accel.mean(axis=0)
-        self.up_lidar: NDArray[np.float64] = up / max(float(np.linalg.norm(up)), 1e-9)
-        self.duration_s = (self.scans[-1].end_ns - self.scans[0].start_ns) * 1e-9
-        self.accel_norm = float(np.linalg.norm(self.imu.accel.mean(axis=0)))
-        self.gyro_std, self.accel_std = float(self.imu.gyro.std(axis=0).max()), float(self.imu.accel.std(axis=0).max())
-        self.evidence = (
-            f"gyro std {self.gyro_std:.3f} rad/s, accelerometer std {self.accel_std:.2f} m/s² around {self.accel_norm:.2f} m/s²"
-        )
-
-    def note(self, rest: Rest) -> None:
-        self.evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
-
-    def imu_is_quiet(self, rest: Rest) -> bool:
-        """Whether the IMU shows nothing but vibration and biases, as it does at rest and at a constant speed."""
-        if self.gyro_std >= _QUIET_GYRO or len(self.imu) < _FEWEST_QUIET_SAMPLES:
-            return False
-        turning = rest.open_turns @ self.extrinsic.R_imu_lidar.T @ self.imu.gyro.mean(axis=0)
-        turns = bool(np.linalg.norm(turning) > _QUIET_TURN * np.sqrt(len(turning)))
-        return not turns and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
-
-    def not_moving(self, why: str) -> _NotYet:
-        return _NotYet(f"not at rest ({self.evidence}), and {why}{WAITING}")
 
 
 def _check_accelerometer(norm: float) -> None:
@@ -205,21 +187,21 @@ def _check_accelerometer(norm: float) -> None:
         )
 
 
-def _check_path(seen: _Beginning, path: LidarPath) -> None:
+def _check_path(seen: Beginning, path: LidarPath) -> None:
     """Whether the scans show how the LiDAR moved, unbroken, and the IMU was there."""
     if _broken(path) or len(path) < min(len(seen.frames), 3):
-        raise _NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
+        raise NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
     time_ns = seen.imu.time_ns
     within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
     if len(path) < 2 or within < _FEWEST_SAMPLES:
-        raise _NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{WAITING}")
+        raise NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{WAITING}")
 
 
 def _broken(path: LidarPath) -> bool:
     return bool(path.failed or path.segment[-1] != path.segment[0])
 
 
-def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
+def _check_gyroscope(seen: Beginning, path: LidarPath, rest: Rest) -> None:
     """Whether the gyroscope turns as the LiDAR does, but for a bias, about the axes where the scene shows how it does.
 
     At rest it is to show nothing; a LiDAR that sees little may turn on its own.
@@ -239,15 +221,15 @@ def _check_gyroscope(seen: _Beginning, path: LidarPath, rest: Rest) -> None:
         if opposite
         else "its unit, its sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little"
     )
-    raise _NotYet(
+    raise NotYet(
         f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: {why}{WAITING}"
     )
 
 
-def _static_start(seen: _Beginning, rest: Rest) -> Start:
+def _static_start(seen: Beginning, rest: Rest) -> Start:
     low, high = _REST_ACCEL_NORM
     if not low <= seen.accel_norm <= high:
-        raise _NotYet(
+        raise NotYet(
             f"at rest, but the accelerometer shows {seen.accel_norm:.2f} m/s², not one gravity: check its unit and scale"
         )
     state, covariance = static_state(seen.imu, seen.extrinsic, seen.config)
@@ -265,8 +247,8 @@ def _static_start(seen: _Beginning, rest: Rest) -> Start:
     )
 
 
-def _moving_start(seen: _Beginning, path: LidarPath, motion: Sequence[Twist] | None = None) -> Start:
-    """The start of a platform in motion; on a path that follows `motion`, where that and not the registrations show its speed."""
+def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = None, follow: bool = False) -> Start:
+    """The start of a platform in motion, on a path that follows `motion` where that and not the registrations show its speed."""
     if len(seen.frames) < _MIN_MOVING_SCANS:
         raise seen.not_moving(f"{len(seen.frames)} scans are not enough for a moving start")
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
@@ -274,13 +256,12 @@ def _moving_start(seen: _Beginning, path: LidarPath, motion: Sequence[Twist] | N
     steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
     guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
     path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(first), unbroken=True)
-    if motion is not None and (_broken(path) or not one_speed(path, first)):
-        path = _held_path(seen, guesses, motion)
-    else:
-        motion = None
+    follow = motion is not None and (follow or _broken(path) or not one_speed(path, first))
+    if motion is not None and follow:
+        path = _held_path(seen, guesses, motion.twists)
     if _broken(path):
         raise seen.not_moving("the first scans do not overlap enough for a moving start")
-    drift = path_drift(path, scans, seen.registration, guesses[0]) if motion is None else None
+    drift = path_drift(path, scans, seen.registration, guesses[0]) if not follow else None
     if drift is not None:
         raise seen.not_moving(
             f"the path of the LiDAR drifts: one of its last scans lies {np.linalg.norm(drift[3:]) * 100:.0f} cm and "
@@ -292,12 +273,14 @@ def _moving_start(seen: _Beginning, path: LidarPath, motion: Sequence[Twist] | N
         path = turned_by_gyroscope(path, imu, seen.extrinsic.R_imu_lidar, gyro_bias(path, imu, seen.extrinsic))
     fit = _checked_fit(seen, path)
     state, covariance = moving_state(seen.frames, path, not_shown, imu, fit, seen.extrinsic, seen.config)
-    if motion is not None:  # what is wrong with the speed is wrong with it all the time
+    if follow:  # what is wrong with the speed is wrong with it all the time
         along = state.v_world_imu / np.linalg.norm(state.v_world_imu)
         covariance[T_V : T_V + 3, T_V : T_V + 3] += _COMMON_M_S**2 * np.outer(along, along)
     sigma = _checked_speed(seen, state, covariance)
     speed = float(np.linalg.norm(state.v_world_imu))
-    other = other_speed(path, scans, seen.registration, guesses) if motion is None else None
+    other = other_speed(path, scans, seen.registration, guesses) if not follow else None
+    if other is not None and motion is not None:
+        return _moving_start(seen, first, motion, follow=True)
     if other is not None:
         raise seen.not_moving(
             "the surroundings do not show how fast the platform moves: the scans fit about as "
@@ -308,7 +291,7 @@ def _moving_start(seen: _Beginning, path: LidarPath, motion: Sequence[Twist] | N
     return Start("moving", scans[0].end_ns, state, covariance, seen.duration_s, text)
 
 
-def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
+def _checked_fit(seen: Beginning, path: LidarPath) -> TranslationFit:
     """Velocity, gravity and bias from path and accelerometer, where both fit each other."""
     fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
@@ -324,7 +307,7 @@ def _checked_fit(seen: _Beginning, path: LidarPath) -> TranslationFit:
     return fit
 
 
-def _checked_speed(seen: _Beginning, state: NavState, covariance: NDArray[np.float64]) -> float:
+def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.float64]) -> float:
     """The largest standard deviation of the velocity [m/s], where that was found."""
     variances, axes = np.linalg.eigh(covariance[T_V : T_V + 3, T_V : T_V + 3])
     sigma = float(np.sqrt(variances[-1]))
@@ -343,13 +326,6 @@ def _first_velocity(path: LidarPath) -> NDArray[np.float64]:
     seconds = (path.time_ns[last] - path.time_ns[0]) * 1e-9
     velocity: NDArray[np.float64] = (path.p_path_lidar[last] - path.p_path_lidar[0]) / seconds
     return velocity
-
-
-def _shaken_only(imu: ImuSamples) -> bool:
-    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree."""
-    parts = np.array_split(imu.accel, _PARTS)
-    means = np.array([part.mean(axis=0) for part in parts if len(part)])
-    return bool(means.std(axis=0).max() < _STEADY_ACCEL)
 
 
 def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -371,10 +347,3 @@ def _undecided(axes: NDArray[np.float64]) -> str:
 
 def _axis_text(axis: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{value:+.2f}" for value in axis) + ")"
-
-
-def joined_imu(frames: Sequence[Frame]) -> ImuSamples:
-    """The IMU samples of several frames, each once."""
-    imu = ImuSamples.joined(frame.imu for frame in frames)
-    time, first = np.unique(imu.time_ns, return_index=True)
-    return ImuSamples(time, imu.gyro[first], imu.accel[first])

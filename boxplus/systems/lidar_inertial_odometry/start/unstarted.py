@@ -6,14 +6,13 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
-from boxplus.sensors.sequencer import Frame
+from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane, untilted_plane
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem_of
-from boxplus.systems.lidar_inertial_odometry.start.start import joined_imu
 
 _STRETCH_S = 4.0  # as long as the comparisons of a run: a start is sought in less, and shows less
 _ENDS_AGO_S = (0.0, 2.0, 4.0)  # overlapping: a path that breaks, or knows too few attitudes, may do better two seconds on

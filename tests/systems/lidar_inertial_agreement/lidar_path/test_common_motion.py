@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.simulation import Scenario, Simulation, SpinningLidar
-from boxplus.simulation.motions import manoeuvres
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
+from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import (
-    ChangedPoints,
     CommonMotion,
     common_motion,
     explains_changes,
+    rest_in_doubt,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
@@ -27,9 +31,28 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @lru_cache(maxsize=4)
-def highway(speed: float, seconds: float = 1.1) -> Simulation:
+def highway(speed: float, seconds: float = 1.1, tilt: float = 0.0) -> Simulation:
     motion = manoeuvres.constant_velocity(seconds + 1.0, (-20.0, 0.5, 1.8), (speed, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.4])))
-    return Simulation(Scenario("highway", sites.highway(500.0, seed=3), motion, LIDAR, T_imu_lidar=np.eye(4)), 3, seconds)
+    mounting = np.eye(4)
+    mounting[:3, :3] = so3.exp(np.array([0.0, tilt, 0.0]))
+    return Simulation(Scenario("highway", sites.highway(500.0, seed=3), motion, LIDAR, T_imu_lidar=mounting), 3, seconds)
+
+
+def among_traffic(seed: int) -> tuple[list[Scan], ImuSamples]:
+    """At rest on a highway between two lanes of vehicles of one speed and direction."""
+    random = np.random.default_rng(seed)
+    speed, count = random.uniform(9.0, 22.0), int(random.integers(8, 18))
+    x, length = np.sort(random.uniform(-70.0, 50.0, count)), random.uniform(4.0, 16.0, count)
+    lane, height = random.choice([-3.6, 3.6], count), np.where(length > 8.0, 4.0, 1.5)
+    road, rest = list(sites.highway(400.0, seed=seed).solids), trajectories.at_rest(4.0, (0.0, 0.0, 1.8))
+    scans = []
+    for k in range(11):
+        vehicles = [
+            box((x[i] + speed * k * 0.1, lane[i], 0.5 * height[i] + 0.3), (length[i], 2.4, height[i])) for i in range(count)
+        ]
+        simulation = Simulation(Scenario("traffic", World([*road, *vehicles]), rest, LIDAR, ImuModel(), np.eye(4)), seed, 2.0)
+        scans.append(simulation.scan(k))
+    return scans, ImuSamples.joined(event for event in simulation.events() if isinstance(event, ImuSamples))
 
 
 @pytest.mark.slow
@@ -78,22 +101,42 @@ def test_an_estimate_that_explains_what_changes_has_not_gone_astray() -> None:
     assert explained_scans(path, scans, true_twists(simulation, scans), CONFIG).astray is None
 
 
+@pytest.mark.slow
+def test_the_traffic_on_both_sides_of_a_platform_at_rest_is_no_motion_of_its_own() -> None:
+    """Some of it goes by as the surroundings would, and says so; in other scenes nothing goes by, or more stays."""
+    motions = []
+    for seed in range(20, 44, 3):
+        scans, imu = among_traffic(seed)
+        motions.append(common_motion(scans, gyro_guesses(imu, np.eye(3))[0], UP))
+    doubts = [motion.doubt for motion in motions if motion is not None]
+    assert all(doubts)
+    assert any("traffic beside a platform at rest" in doubt for doubt in doubts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tilt", [0.35, -0.3])
+def test_a_tilted_lidar_sees_what_changes_all_around(tilt: float) -> None:
+    simulation = highway(18.0, tilt=tilt)
+    scans, imu = data(simulation)
+    R_imu_lidar = simulation.T_imu_lidar[:3, :3]
+    motion = common_motion(scans, gyro_guesses(imu, R_imu_lidar)[0], R_imu_lidar.T @ UP)
+    assert isinstance(motion, CommonMotion) and not motion.doubt
+    true = R_imu_lidar.T @ so3.exp(np.array([0.0, 0.0, -0.4])) @ [18.0, 0.0, 0.0]
+    assert np.linalg.norm(motion.velocity - true) < 1.0
+
+
+@pytest.mark.slow
+def test_rest_is_in_doubt_where_points_change_and_nothing_that_stands_stays() -> None:
+    """On this highway the registrations rest at 26 m/s; at rest nothing changes, and where traffic passes posts stay."""
+    axis = so3.exp(np.array([0.0, 0.0, -0.4])) @ [1.0, 0.0, 0.0]
+    for speed in (26.0, 0.0):
+        scans, imu = data(highway(speed))
+        assert rest_in_doubt(scans, gyro_guesses(imu, np.eye(3))[0], axis, UP) == (speed > 0.0)
+    scans, imu = among_traffic(32)
+    assert changed_share(scans[0], scans[1], gyro_guesses(imu, np.eye(3))[0]) > 0.01
+    assert not rest_in_doubt(scans, gyro_guesses(imu, np.eye(3))[0], np.array([1.0, 0.0, 0.0]), UP)
+
+
 def test_too_few_scans_say_nothing() -> None:
     scans, imu = data(highway(12.0))
     assert common_motion(scans[:5], gyro_guesses(imu, np.eye(3))[0], UP) is None
-
-
-def test_the_shift_that_is_missing_is_found() -> None:
-    random = np.random.default_rng(1)
-    p = random.uniform(-20.0, 20.0, (200, 3))
-    since = random.uniform(-0.05, 0.05, 200)
-    velocity = np.array([15.0, 2.0, 0.0])
-    # Standing points, as seen from where the LiDAR is when it sees them.
-    pair = ChangedPoints(p - since[:, None] * velocity, p - (since + 0.1)[:, None] * velocity, since, since + 0.1, 0.1)
-    again, missing = pair.shifts(velocity)
-    assert again.all()
-    np.testing.assert_allclose(missing, 0.0, atol=1e-3)  # the map keeps single precision
-    again, missing = pair.shifts(velocity - [0.5, 0.0, 0.0])
-    np.testing.assert_allclose(np.median(missing, axis=0), [0.5, 0.0, 0.0], atol=1e-3)
-    none = ChangedPoints(p[:0], p, since[:0], since, 0.1)
-    assert not none.shifts(velocity)[0].any() and none.shifts(velocity)[1].shape == (0, 3)

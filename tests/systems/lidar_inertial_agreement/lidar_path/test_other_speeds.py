@@ -11,7 +11,7 @@ from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import other_speed, well_known
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 SPEED = 2.4
@@ -48,3 +48,11 @@ def test_a_speed_over_open_ground_is_right_or_not_known_or_not_the_only_one(seed
 def test_in_a_room_there_is_one_speed() -> None:
     _, other, found, _ = circle(worlds.room((24.0, 20.0, 5.0)), 1.5)
     assert other is None and abs(np.linalg.norm(found) / SPEED - 1.0) < 0.1
+
+
+@pytest.mark.slow
+def test_a_path_of_one_pose_is_not_well_known() -> None:
+    simulation, *_ = circle(worlds.room((24.0, 20.0, 5.0)), 1.5)
+    scans, imu = data(simulation)
+    path = lidar_path(scans[:1], CONFIG, gyro_guesses(imu, simulation.T_imu_lidar[:3, :3]))
+    assert len(path) == 1 and not well_known(path)

@@ -1,0 +1,69 @@
+"""What a start has to go by, and what it says where that is not enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import NavState
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
+from boxplus.sensors.sequencer import Frame, joined_imu
+from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
+from boxplus.systems.lidar_inertial_agreement.rest import Rest
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+
+_QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
+_FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
+_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
+WAITING = "; waiting for more data"
+"""How a refusal ends that the next scans may lift."""
+
+
+class NotYet(Exception):
+    """Why there is no start yet; a sentence."""
+
+
+class Beginning:
+    """What a start has to go by: some scans, the IMU samples around them, and what has been found of both."""
+
+    def __init__(self, frames: Sequence[Frame], config: LioConfig) -> None:
+        self.frames, self.config = frames, config
+        self.scans: list[Scan] = [frame.scan for frame in frames]
+        self.registration: RegistrationConfig = with_cells_for(self.scans[0], config)
+        self.imu = joined_imu(frames)
+        self.extrinsic = NavState.identity(None if config.T_imu_lidar is None else np.array(config.T_imu_lidar))
+        self.guesses = gyro_guesses(self.imu, self.extrinsic.R_imu_lidar)
+        up = self.extrinsic.R_imu_lidar.T @ self.imu.accel.mean(axis=0)
+        self.up_lidar: NDArray[np.float64] = up / max(float(np.linalg.norm(up)), 1e-9)
+        self.duration_s = (self.scans[-1].end_ns - self.scans[0].start_ns) * 1e-9
+        self.accel_norm = float(np.linalg.norm(self.imu.accel.mean(axis=0)))
+        self.gyro_std, self.accel_std = float(self.imu.gyro.std(axis=0).max()), float(self.imu.accel.std(axis=0).max())
+        self.evidence = (
+            f"gyro std {self.gyro_std:.3f} rad/s, accelerometer std {self.accel_std:.2f} m/s² around {self.accel_norm:.2f} m/s²"
+        )
+
+    def note(self, rest: Rest) -> None:
+        self.evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
+
+    def imu_is_quiet(self, rest: Rest) -> bool:
+        """Whether the IMU shows nothing but vibration and biases, as it does at rest and at a constant speed."""
+        if self.gyro_std >= _QUIET_GYRO or len(self.imu) < _FEWEST_QUIET_SAMPLES:
+            return False
+        turning = rest.open_turns @ self.extrinsic.R_imu_lidar.T @ self.imu.gyro.mean(axis=0)
+        turns = bool(np.linalg.norm(turning) > _QUIET_TURN * np.sqrt(len(turning)))
+        return not turns and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
+
+    def not_moving(self, why: str) -> NotYet:
+        return NotYet(f"not at rest ({self.evidence}), and {why}{WAITING}")
+
+
+def _shaken_only(imu: ImuSamples) -> bool:
+    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree."""
+    parts = np.array_split(imu.accel, _PARTS)
+    means = np.array([part.mean(axis=0) for part in parts if len(part)])
+    return bool(means.std(axis=0).max() < _STEADY_ACCEL)
