@@ -64,7 +64,7 @@ def tilted_plane(
     return (
         f"by the accelerometer and the given T_imu_lidar, the plane that makes up most of a scan is {np.degrees(tilt):.0f} deg "
         f"from level and from upright (median of {len(tilts)} scans): check T_imu_lidar, and that the topics are those of this "
-        "mounting, unless the ground slopes as much"
+        "mounting, unless the ground slopes as much or the platform brakes, speeds up or turns all the time"
     )
 
 
