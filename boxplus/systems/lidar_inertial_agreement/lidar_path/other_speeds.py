@@ -36,8 +36,8 @@ def least_known_axis(path: LidarPath) -> NDArray[np.float64]:
 
 def one_speed(path: LidarPath, other: LidarPath) -> bool:
     """Whether two paths through the same scans are about as fast, in about the same direction."""
-    velocity = _mean_velocity(other)
-    return bool(np.linalg.norm(_mean_velocity(path) - velocity) < _ONE_M_S + _ONE_SHARE * np.linalg.norm(velocity))
+    velocity = mean_velocity(other)
+    return bool(np.linalg.norm(mean_velocity(path) - velocity) < _ONE_M_S + _ONE_SHARE * np.linalg.norm(velocity))
 
 
 def _least_known(path: LidarPath) -> tuple[float, NDArray[np.float64]]:
@@ -47,8 +47,11 @@ def _least_known(path: LidarPath) -> tuple[float, NDArray[np.float64]]:
     return float(sigma), np.linalg.eigh(information.mean(axis=0))[1]
 
 
-def _mean_velocity(path: LidarPath) -> NDArray[np.float64]:
-    velocity: NDArray[np.float64] = (path.p_path_lidar[-1] - path.p_path_lidar[0]) / ((path.time_ns[-1] - path.time_ns[0]) * 1e-9)
+def mean_velocity(path: LidarPath, most_intervals: int | None = None) -> NDArray[np.float64]:
+    """(3,) over a path of two poses at least, or over its first intervals only, in the frame of its first pose [m/s]."""
+    last = len(path) - 1 if most_intervals is None else min(most_intervals, len(path) - 1)
+    seconds = float(path.time_ns[last] - path.time_ns[0]) * 1e-9
+    velocity: NDArray[np.float64] = (path.p_path_lidar[last] - path.p_path_lidar[0]) / seconds
     return velocity
 
 
@@ -65,7 +68,7 @@ def other_speed(
     if sigma < _SURE_M:
         return None
     seconds = (path.time_ns[-1] - path.time_ns[0]) * 1e-9
-    velocity = _mean_velocity(path)
+    velocity = mean_velocity(path)
     for away in _APART_M_S:
         for axis in (axes[:, 0], -axes[:, 0], axes[:, 1], -axes[:, 1]):
             start = velocity + away * axis
@@ -75,5 +78,5 @@ def other_speed(
             apart = other.p_path_lidar[-1] - path.p_path_lidar[-1]
             sure = apart @ path.information[-1, 3:, 3:] @ apart > _DEVIATIONS**2
             if sure and np.linalg.norm(apart) > _ANOTHER_M_S * seconds and other.cost.sum() < _AS_WELL * path.cost.sum():
-                return _mean_velocity(other)
+                return mean_velocity(other)
     return None

@@ -18,6 +18,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import co
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
+    mean_velocity,
     one_speed,
     other_speed,
     well_known,
@@ -36,6 +37,7 @@ _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
 _IN_G = (0.8, 1.25)
 _STANDARD_G = 9.80665
 _MIN_MOVING_SCANS = 8
+_FIRST = 3  # intervals between scans, of which the velocity is taken that undistorts the first one
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
@@ -255,7 +257,7 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = Non
     imu, scans = seen.imu, seen.scans
     steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
     guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
-    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=_first_velocity(first), unbroken=True)
+    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=mean_velocity(first, _FIRST), unbroken=True)
     follow = motion is not None and (follow or _broken(path) or not one_speed(path, first))
     if motion is not None and follow:
         path = _held_path(seen, guesses, motion.twists)
@@ -318,14 +320,6 @@ def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.floa
             "more or less"
         )
     return sigma
-
-
-def _first_velocity(path: LidarPath) -> NDArray[np.float64]:
-    """(3,) over the first scans [m/s]."""
-    last = min(3, len(path) - 1)
-    seconds = (path.time_ns[last] - path.time_ns[0]) * 1e-9
-    velocity: NDArray[np.float64] = (path.p_path_lidar[last] - path.p_path_lidar[0]) / seconds
-    return velocity
 
 
 def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
