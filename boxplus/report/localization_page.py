@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
+from boxplus.report.page import warning_lines
 from boxplus.report.palette import INK, STATUS
 from boxplus.report.plots import plain
 from boxplus.report.skeleton import html_table, picture, tiles, warnings_section, write_html
@@ -58,7 +59,8 @@ def _body(own: LocalizationFolder, result: LocalizationResult) -> str:
     said = [*against, *summary.warnings, *(f"lost at {text}" for text in summary.losses)]
     notes = "".join(f"<li>{escape(text)}</li>" for text in summary.map_report)
     map_section = f"<section><h2>The map</h2><ul>{notes}</ul></section>"
-    parts = [head, warnings_section([escape(text) for text in said]), _overview(own, result), _timeline(own)]
+    lines = [*(escape(text) for text in said), *(f"odometry: {line}" for line in warning_lines(result.odometry.warnings))]
+    parts = [head, warnings_section(lines), _overview(own, result), _timeline(own)]
     if summary.best_candidates:
         rows = [(text,) for text in summary.best_candidates]
         parts.append(f"<section><h2>The best candidates, and why not</h2>{html_table(rows, ('of the last search',))}</section>")

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
+from boxplus.report.page import warning_lines
 from boxplus.report.palette import INK, STATUS
 from boxplus.report.plots import plain
 from boxplus.report.skeleton import html_table, picture, tiles, warnings_section, write_html
@@ -55,6 +56,7 @@ def _body(result: SlamResult) -> str:
     warnings = [escape(text) for text in summary.warnings]
     if summary.contradiction is not None:
         warnings.insert(0, escape(summary.contradiction))
+    warnings += [f"odometry: {line}" for line in warning_lines(result.odometry.warnings)]
     parts = [head, warnings_section(warnings), _overview(result), _earth(result), _table(result), *_pictures(result)]
     return "\n".join(parts)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli.lidar.mounting import find_mounting, print_evidence
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -159,9 +160,7 @@ def run(
     from boxplus.cli.interrupt import stop_on_interrupt
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
-    from boxplus.recordings.info import Evidence
     from boxplus.runs.lidar_inertial.earlier_run import finished_run
-    from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
     from boxplus.runs.lidar_inertial.odometry_run import run_odometry
     from boxplus.runs.run_folder import RunFolder, claim_run_folder
 
@@ -178,19 +177,14 @@ def run(
         own = RunFolder(folder)
         if standing != "finished":
             own = stack.enter_context(claim_run_folder(folder, overwrite=overwrite, resume=resume))
-        with terminal.status("comparing gyroscope and LiDAR to find the extrinsic"):
-            began = time.perf_counter()
-            extrinsic = choose_extrinsic(opened, config.odometry, should_stop=asked)
-            mounting_s = time.perf_counter() - began
+        began = time.perf_counter()
+        extrinsic = find_mounting(terminal, opened, config.odometry, asked)
+        mounting_s = time.perf_counter() - began
         if standing == "finished":
             summary = finished_run(own, opened, config, extrinsic)
             terminal.say(f"{folder.name}: finished before, and left as it is")
         else:
-            mounting = Evidence(
-                "T_imu_lidar", extrinsic.source, "warning" if extrinsic.warning else "ok", extrinsic.warning or extrinsic.text
-            )
-            found = [entry for entry in opened.info.evidence if entry.key != "T_imu_lidar"]
-            terminal.print_evidence(opened.info, [*found, mounting])
+            print_evidence(terminal, opened, extrinsic)
             with terminal.progress() as progress:
                 summary = run_odometry(
                     opened,

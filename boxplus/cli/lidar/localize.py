@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus._words import counted
+from boxplus.cli.lidar.mounting import find_mounting, print_evidence
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -86,13 +87,15 @@ def localize(
         ):
             with terminal.status("opening the map"):
                 opened_map = open_saved_map(saved, run_config.local_maps)
-            terminal.print_evidence(opened.info, opened.info.evidence)
+            extrinsic = find_mounting(terminal, opened, run_config.odometry, should_stop)
+            print_evidence(terminal, opened, extrinsic)
             with terminal.progress() as progress:
                 result = run_localization(
                     opened,
                     claimed,
                     opened_map,
                     run_config,
+                    extrinsic=extrinsic,
                     accept_doubts=accept_doubts,
                     progress=progress,
                     should_stop=should_stop,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from boxplus.cli.lidar.mounting import find_mounting, print_evidence
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import (
     RESULTS,
@@ -115,7 +116,8 @@ def slam(
             open_recording(recording, run_config.recording) as opened,
             claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
         ):
-            terminal.print_evidence(opened.info, opened.info.evidence)
+            extrinsic = find_mounting(terminal, opened, run_config.odometry, should_stop)
+            print_evidence(terminal, opened, extrinsic)
             with terminal.progress() as progress:
                 result = run_slam(
                     opened,
@@ -123,6 +125,7 @@ def slam(
                     run_config,
                     forbidden=forbidden,
                     forced=forced,
+                    extrinsic=extrinsic,
                     resume=resume,
                     progress=progress,
                     view=shown,

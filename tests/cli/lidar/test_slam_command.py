@@ -36,7 +36,7 @@ def test_threads_are_those_of_the_file_unless_an_option_says_otherwise(
         assert config.scans.frame == "world"
         raise InputError("a run", "enough of it", "stop")
 
-    info = SimpleNamespace(path=Path("walk.bag"), format="ros1", duration_s=1.0, message_count=1, evidence=[])
+    info = SimpleNamespace(path=Path("walk.bag"), format="ros1", duration_s=1.0, message_count=1, evidence=[], imu_topic="")
     monkeypatch.setattr(boxplus.recordings, "open_recording", lambda *_: nullcontext(SimpleNamespace(info=info)))
     monkeypatch.setattr(boxplus.runs.slam.slam_run, "run_slam", run_slam)
     (tmp_path / "settings.yaml").write_text("odometry: {threads: 3}\n")

@@ -21,6 +21,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.report import load_report, write_report
 from boxplus.report.slam_page import write_slam_report
 from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.run_facts import WarningFacts
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import read_loop_decisions
@@ -106,6 +107,15 @@ def test_the_head_of_the_report_says_what_is_not_to_be_trusted(finished: Finishe
     page = write_slam_report(replace(finished.result, folder=copy, summary=summary)).read_text(encoding="utf-8")
     assert '<span class="state failed">finished</span> not to be trusted · loops closed' in page
     assert "fixes jump by 3.0 m" in page and summary.describe_state().endswith("fixes jump by 3.0 m")
+
+
+def test_the_report_repeats_the_warnings_of_the_odometry(finished: Finished, tmp_path: Path) -> None:
+    warnings = [WarningFacts(text="no point matched < 3 scans", count=2, first_s=1.5)]
+    odometry = finished.result.odometry.model_copy(update={"warnings": warnings})
+    copy = SlamFolder(tmp_path)
+    shutil.copy(finished.folder.gnss, copy.gnss)
+    page = write_slam_report(replace(finished.result, folder=copy, odometry=odometry)).read_text(encoding="utf-8")
+    assert "odometry: no point matched &lt; 3 scans <small>(2 times, first at 1.5 s)" in page
 
 
 def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> None:
