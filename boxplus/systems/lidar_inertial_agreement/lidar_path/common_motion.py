@@ -23,11 +23,10 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
     ChangedPoints,
     changed_points,
-    changed_share,
-    stay_and_go,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
+from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest, stay_and_go
 
 FEWEST_SCANS = 6
 _PAIRS = 0, 2, 4  # first scans of those that vote
@@ -46,7 +45,6 @@ _APART_M, _ANOTHER = 0.5, 0.8  # a shift that is another one, and its share of t
 _LANES_M, _BEYOND = 6.0, 0.6  # aside: where the traffic next to a platform is, and the share of the matches beyond it
 _PLACE_M, _FEWEST_PLACES = 2.0, 70  # beyond it: at rest among traffic up to 46, in streets from 75 on
 _STAYING, _FEWEST_STAYING = 0.35, 20  # of those that go by the common motion, and at least; on drives up to 0.26
-_CHANGING, _FEWEST_AT_REST = 0.003, 60  # of all points; and of what stands, that stay: by chance, on drives, up to 49 do
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +103,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     own = [(R.T @ velocity, R.T @ up_lidar) for R in R_first]
     counts = [stay_and_go((scans[k], scans[k + 1]), turning, *own[k]) for k in _PAIRS]
     stay, go = np.sum(counts, axis=0).tolist()
-    if stay > max(go, _FEWEST_STAYING):
+    if stay > max(go, _FEWEST_STAYING) or shows_rest(scans, velocity / np.linalg.norm(velocity), up_lidar):
         return None
     doubt = _traffic(voting, velocity, up_lidar)
     if stay > max(_STAYING * go, _FEWEST_STAYING):
@@ -115,21 +113,6 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
             doubt = doubt or f"what changes fits {_text(other)} m/s (LiDAR axes) about as well as {_text(velocity)} m/s"
     pairs = [first.get(k) or _pair(scans, k, turning, R_first[k]) for k in range(len(scans) - 1)]
     return CommonMotion(pairs, R_first, velocity, level, doubt)
-
-
-def rest_in_doubt(scans: Sequence[Scan], turning: Turning, axis: NDArray[np.float64], up_lidar: NDArray[np.float64]) -> bool:
-    """Whether points change from scan to scan, though they show no motion, and little of what stands on the ground shows rest.
-
-    Args:
-        scans: consecutive sweeps, at least 6.
-        turning: how the LiDAR turned.
-        axis: (3,) unit vector along which rest is least known, along the LiDAR's axes in the middle of the first scan.
-        up_lidar: (3,) unit vector, roughly upwards, likewise.
-    """
-    pairs = [(scans[k], scans[k + 1]) for k in _PAIRS if k + 1 < len(scans)]
-    if not pairs or np.mean([changed_share(*pair, turning) for pair in pairs]) < _CHANGING:
-        return False
-    return sum(stay_and_go(pair, turning, _SLOWEST_M_S * axis, up_lidar)[0] for pair in pairs) < _FEWEST_AT_REST
 
 
 def _pair(scans: Sequence[Scan], k: int, turning: Turning, R: NDArray[np.float64]) -> ChangedPoints:
@@ -143,7 +126,7 @@ def _slowest(pairs: Sequence[ChangedPoints]) -> float:
 
 
 def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: NDArray[np.float64]) -> str:
-    """Whether what changes is where traffic beside a platform at rest would be."""
+    """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not."""
     along = velocity / np.linalg.norm(velocity)
     aside = np.cross(up, along)
     matched = np.concatenate([pair.p_after[again] for pair, again in zip(pairs, _again(pairs, velocity), strict=True)])
@@ -160,7 +143,7 @@ def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: 
 
 
 def explains_changes(scans: Sequence[Scan], turning: Turning, twists: Sequence[Twist]) -> bool:
-    """Whether a motion, of 8 m/s and more, explains what changes from scan to scan: all around, well, and better than by chance.
+    """Whether a motion, as fast as one that is looked for, explains what changes: all around, well, and better than by chance.
 
     Args:
         scans: consecutive sweeps.

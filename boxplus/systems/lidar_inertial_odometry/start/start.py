@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,8 @@ from boxplus.filtering.nav_state import T_V, NavState
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion, rest_in_doubt
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
@@ -26,6 +28,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
+from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -41,6 +44,10 @@ _FIRST = 3  # intervals between scans, of which the velocity is taken that undis
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
+_COMPARED, _CHANGING = (
+    3,
+    0.003,
+)  # pairs of scans, and the share of their points that changes: at rest where nothing moves none does
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
@@ -109,8 +116,8 @@ def _start(seen: Beginning) -> Start:
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
-    if rest.at_rest and motion is None and rest.determined:
-        rest = _doubted(seen, path, rest)
+    if rest.at_rest:
+        rest = _with_standing_things(seen, path, rest, motion is not None)
     if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
         return _static_start(seen, rest)
     return _moving_start(seen, path, motion)
@@ -142,14 +149,18 @@ def _common_motion(seen: Beginning, path: LidarPath) -> _Common | None:
     return _Common(motion.twists(way / np.linalg.norm(way)), shown)
 
 
-def _doubted(seen: Beginning, path: LidarPath, rest: Rest) -> Rest:
-    """Rest that is not known along the axis that is known least, where more changes than rest explains."""
-    if len(path) < 2 or well_known(path) or not seen.guesses:
-        return rest
-    axis = least_known_axis(path)
-    if not rest_in_doubt(seen.scans, seen.guesses[0], axis, seen.up_lidar):
-        return rest
-    return replace(rest, open_axes=axis[None])
+def _with_standing_things(seen: Beginning, path: LidarPath, rest: Rest, in_motion: bool) -> Rest:
+    """Rest, by what stands on the ground too: open axes that it closes, or one where much changes and little stays."""
+
+    def shown(axis: NDArray[np.float64]) -> bool:
+        return bool(abs(axis @ seen.up_lidar) < _UPRIGHT) and shows_rest(seen.scans, axis, seen.up_lidar)
+
+    axes = [axis for axis in rest.open_axes if not shown(axis)]
+    if rest.determined and not in_motion and len(path) > 1 and not well_known(path) and seen.guesses:
+        least, pairs = least_known_axis(path), pairwise(seen.scans[: _COMPARED + 1])
+        changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
+        axes = [] if changing < _CHANGING or shown(least) else [least]
+    return replace(rest, open_axes=np.array(axes).reshape(-1, 3))
 
 
 def _held_path(seen: Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
