@@ -67,7 +67,8 @@ def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
         turning: how the LiDAR turned.
     """
     (before, _), (after, _), _ = both_scans(first, second, turning, MOST_COMPARED)
-    return float(_unexplained(after[:: -(-len(after) // _MOST_RAW)], before).mean())
+    after = after[:: max(-(-len(after) // _MOST_RAW), 1)]
+    return float(_unexplained(after, before).mean()) if len(before) and len(after) else 0.0
 
 
 def _still(scan: Scan, turning: Turning, most: int) -> _Still:

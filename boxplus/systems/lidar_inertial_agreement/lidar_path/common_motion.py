@@ -44,6 +44,7 @@ _BY_CHANCE = 0.45  # of the matches, on average; on highways and in streets up t
 _APART_M, _ANOTHER = 0.5, 0.8  # a shift that is another one, and its share of the matches
 _LANES_M, _BEYOND = 6.0, 0.6  # aside: where the traffic next to a platform is, and the share of the matches beyond it
 _PLACE_M, _FEWEST_PLACES = 2.0, 70  # beyond it: at rest among traffic up to 46, in streets from 75 on
+_MOST_GOING = 20  # points that may seem to go by at rest: what goes by tells of a motion, whatever keeps pace with it
 _STAYING, _FEWEST_STAYING = 0.35, 20  # of those that go by the common motion, and at least; on drives up to 0.26
 
 
@@ -103,10 +104,11 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     own = [(R.T @ velocity, R.T @ up_lidar) for R in R_first]
     counts = [stay_and_go((scans[k], scans[k + 1]), turning, *own[k]) for k in _PAIRS]
     stay, go = np.sum(counts, axis=0).tolist()
-    if stay > max(go, _FEWEST_STAYING) or shows_rest(scans, velocity / np.linalg.norm(velocity), up_lidar):
+    rests = stay > max(go, _FEWEST_STAYING) or shows_rest(scans, velocity / np.linalg.norm(velocity), up_lidar)
+    if rests and go <= _MOST_GOING:
         return None
     doubt = _traffic(voting, velocity, up_lidar)
-    if stay > max(_STAYING * go, _FEWEST_STAYING):
+    if rests or stay > max(_STAYING * go, _FEWEST_STAYING):
         doubt = f"of what stands on the ground, {stay} points stay and {go} go by, as at {np.linalg.norm(velocity):.0f} m/s"
     for other, also in candidates:
         if also > _ANOTHER * matched and float(np.linalg.norm(other - velocity)) * voting[0].seconds > _APART_M:
@@ -137,7 +139,7 @@ def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: 
     if beyond >= _BEYOND or places >= _FEWEST_PLACES:
         return ""
     return (
-        f"{1.0 - beyond:.0%} of what changes as at {np.linalg.norm(velocity):.0f} m/s lies within {_LANES_M:.0f} m of the way, "
+        f"{1.0 - beyond:.0%} of what goes by as at {np.linalg.norm(velocity):.0f} m/s lies within {_LANES_M:.0f} m of the way, "
         "where traffic beside a platform at rest would be"
     )
 

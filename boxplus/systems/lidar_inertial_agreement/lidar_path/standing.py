@@ -23,20 +23,20 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, thinned
 
-_NEAREST_M = 5.0  # nearer, it may be a part of the platform
+_ASIDE_M = 6.0  # of the way; nearer to it are the platform's own parts, and vehicles that keep pace with it
 _UPRIGHT_M, _SHORT_M = 0.1, 0.25  # standard deviations of what stands, upwards and along the way
-_ALONG_M, _FREE_M = (0.8, 3.0), 0.35  # nothing else is there along the way, this near to the line along it
+_FREE_FROM_M, _FREE_TO_M, _FREE_M = 0.8, 3.0, 0.35  # nothing else is there along the way, this near to the line along it
+_FASTEST_M_S = 36.0  # what stands at equal distances is the same from scan to scan where it goes by one of them
 _UNMOVED_M = 0.15
-_FEWEST_UNMOVED, _LEAST_UNMOVED = 60, 0.3  # points, and their share of what stands; on drives up to 49, 0.07 of it
-_PLACE_M, _FEWEST_PLACES = 2.0, 6  # that are not parts of one thing
+_FEWEST_UNMOVED, _LEAST_UNMOVED = 60, 0.3  # points, and their share of what stands
+_PLACE_M, _FEWEST_PLACES, _FEWEST_A_SIDE = 4.0, 6, 2  # on the ground, in all and on either side of the way
+_FEWEST_SCANS, _LEAST_SPAN_S = 6, 0.8
 
 
 def stay_and_go(
     scans: tuple[Scan, Scan], turning: Turning, velocity: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[int, int]:
     """How many points of what stands on the ground stay where they are, and how many go by a velocity.
-
-    What stands is upright, and short along the way: a post, a trunk, a corner. It cannot be the same from every place of the way.
 
     Args:
         scans: two neighbouring ones.
@@ -52,38 +52,44 @@ def stay_and_go(
 
 
 def shows_rest(scans: Sequence[Scan], axis: NDArray[np.float64], up: NDArray[np.float64]) -> bool:
-    """Whether what stands on the ground stays where it is, from the first scan to three much later ones.
+    """Whether what stands on the ground, on both sides of the way, stays where it is, from the first scan to three later ones.
+
+    Slower than 0.15 m in the time of the scans nothing shows.
 
     Args:
-        scans: consecutive sweeps; the LiDAR does not turn.
+        scans: consecutive sweeps; the LiDAR does not turn. Fewer than 6, or less than 0.8 s, show nothing.
         axis, up: (3,) unit vectors, along its axes: the way along which rest is asked for, across the vertical.
     """
-    first, *later = (thinned(scan, MOST_COMPARED).p_lidar.astype(np.float64) for scan in _far_apart(scans))
-    for p in later:
-        p = p[_standing(p, axis, up)]
-        unmoved = p[are_there(p, first, _UNMOVED_M)]
-        places = len(np.unique(np.round(unmoved / _PLACE_M), axis=0))
-        if len(unmoved) < max(_FEWEST_UNMOVED, _LEAST_UNMOVED * len(p)) or places < _FEWEST_PLACES:
-            return False
-    return len(later) > 0
-
-
-def _far_apart(scans: Sequence[Scan]) -> list[Scan]:
-    """The first one, and three later ones: what stands at equal distances looks the same from some places."""
+    seconds = (scans[-1].start_ns - scans[0].start_ns) * 1e-9
+    if len(scans) < _FEWEST_SCANS or seconds < _LEAST_SPAN_S:
+        return False
+    reach = max(_FREE_TO_M, _FASTEST_M_S * seconds / (len(scans) - 1) + _FREE_M)
+    on_ground = np.stack([axis, np.cross(up, axis)], axis=1)
     last = len(scans) - 1
-    return [scans[k] for k in sorted({0, (last + 1) // 2, max(last - 1, 0), last})]
+    first, *later = (thinned(scans[k], MOST_COMPARED).p_lidar.astype(np.float64) for k in (0, (last + 1) // 2, last - 1, last))
+    for p in later:
+        p = p[_standing(p, axis, up, reach)]
+        unmoved = p[are_there(p, first, _UNMOVED_M)]
+        places = np.unique(np.round(unmoved @ on_ground / _PLACE_M), axis=0)
+        sides = np.count_nonzero(places[:, 1] > 0.0), np.count_nonzero(places[:, 1] < 0.0)
+        enough = len(unmoved) >= max(_FEWEST_UNMOVED, _LEAST_UNMOVED * len(p))
+        if not enough or len(places) < _FEWEST_PLACES or min(sides) < _FEWEST_A_SIDE:
+            return False
+    return True
 
 
-def _standing(p: NDArray[np.float64], axis: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (N,) are of something upright that is short along an axis (3,), with nothing like it along that axis."""
+def _standing(
+    p: NDArray[np.float64], axis: NDArray[np.float64], up: NDArray[np.float64], reach_m: float = _FREE_TO_M
+) -> NDArray[np.bool_]:
+    """Which points (N,) are of something upright that is short along an axis (3,), with nothing like it along that, in reach."""
     neighbours = tree_of(p).nearest(p, NEIGHBOURS).points
-    distance = np.linalg.norm(p, axis=1)
-    standing = np.isfinite(neighbours).all(axis=(1, 2)) & (distance > _NEAREST_M) & (distance < FAR_M)
+    standing = np.isfinite(neighbours).all(axis=(1, 2)) & (np.linalg.norm(p, axis=1) < FAR_M)
+    standing &= np.abs(p @ np.cross(up, axis)) > _ASIDE_M
     standing[standing] = np.linalg.norm(neighbours[standing, -1] - p[standing], axis=1) < NEAR_M
     spread = neighbours[standing]
     standing[standing] = ((spread @ up).std(axis=1) > _UPRIGHT_M) & ((spread @ axis).std(axis=1) < _SHORT_M)
     # Along the axis shrunk so far that a piece of line becomes as short as it is wide.
-    middle, half = 0.5 * (_ALONG_M[1] + _ALONG_M[0]), 0.5 * (_ALONG_M[1] - _ALONG_M[0])
+    middle, half = 0.5 * (reach_m + _FREE_FROM_M), 0.5 * (reach_m - _FREE_FROM_M)
     shrunk = p - np.outer(p @ axis, axis) * (1.0 - _FREE_M / half)
     tree = tree_of(shrunk)
     for away in (-middle, middle):

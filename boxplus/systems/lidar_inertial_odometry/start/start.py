@@ -44,10 +44,8 @@ _FIRST = 3  # intervals between scans, of which the velocity is taken that undis
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
-_COMPARED, _CHANGING = (
-    3,
-    0.003,
-)  # pairs of scans, and the share of their points that changes: at rest where nothing moves none does
+_COMPARED = 3  # pairs of scans
+_CHANGING, _OTHER_RAYS = 0.003, 0.2  # share of points that change: none at rest where nothing moves; other rays, of a rosette
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
@@ -159,7 +157,8 @@ def _with_standing_things(seen: Beginning, path: LidarPath, rest: Rest, in_motio
     if rest.determined and not in_motion and len(path) > 1 and not well_known(path) and seen.guesses:
         least, pairs = least_known_axis(path), pairwise(seen.scans[: _COMPARED + 1])
         changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
-        axes = [] if changing < _CHANGING or shown(least) else [least]
+        is_level = bool(abs(least @ seen.up_lidar) < _UPRIGHT)
+        axes = [least] if _CHANGING < changing < _OTHER_RAYS and is_level and not shown(least) else []
     return replace(rest, open_axes=np.array(axes).reshape(-1, 3))
 
 
@@ -268,8 +267,9 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = Non
     imu, scans = seen.imu, seen.scans
     steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
     guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
-    path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=mean_velocity(first, _FIRST), unbroken=True)
-    follow = motion is not None and (follow or _broken(path) or not one_speed(path, first))
+    if not follow:
+        path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=mean_velocity(first, _FIRST), unbroken=True)
+        follow = motion is not None and (_broken(path) or not one_speed(path, first))
     if motion is not None and follow:
         path = _held_path(seen, guesses, motion.twists)
     if _broken(path):

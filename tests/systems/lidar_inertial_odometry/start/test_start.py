@@ -96,22 +96,19 @@ def test_a_street_that_looks_alike_at_rest_is_searched_for_a_speed(speed: float,
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("channels", "seed", "speed", "kind", "undecided"),
-    [(32, 0, 22.0, "moving", False), (32, 2, 0.0, "static", False), (16, 2, 22.0, "static", True)],
+    ("seed", "speed", "kind"),
+    [(0, 22.0, "moving"), (2, 0.0, "static")],
 )
-def test_on_a_highway_what_stands_tells_rest_from_motion(
-    channels: int, seed: int, speed: float, kind: str, undecided: bool
-) -> None:
-    """At rest the second one's registrations leave the way open, and posts close it; the third shows neither."""
-    steps, fov = {16: (900, (-15.0, 15.0)), 32: (512, (-25.0, 15.0))}[channels]
-    lidar = SpinningLidar(channels=channels, azimuth_steps=steps, vertical_fov_deg=fov)
+def test_on_a_highway_what_stands_tells_rest_from_motion(seed: int, speed: float, kind: str) -> None:
+    """At rest the second one's registrations leave the way open, and posts close it."""
+    lidar = SpinningLidar(channels=32, azimuth_steps=512, vertical_fov_deg=(-25.0, 15.0))
     drive = manoeuvres.constant_velocity(2.6, (40.0 * seed, 0.3, 1.8), (speed, 0.0, 0.0), so3.exp(np.array([0.02, -0.01, 0.3])))
     scenario = Scenario("highway", sites.highway(500.0, seed=seed), drive, lidar, T_imu_lidar=np.eye(4))
     simulation = simulate(scenario, duration_s=1.4)
     found = find_start(frames(simulation.events()), config(simulation))
     assert isinstance(found, Start)
     assert found.kind == kind
-    assert ("taken as at rest" in found.warning) == undecided == bool(len(found.unshown_axes))
+    assert not found.warning and not len(found.unshown_axes)
     if kind == "moving":
         assert abs(np.linalg.norm(found.state.v_world_imu) - speed) < 0.5
 
