@@ -116,8 +116,12 @@ def slam(
             open_recording(recording, run_config.recording) as opened,
             claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
         ):
-            extrinsic = find_mounting(terminal, opened, run_config.odometry, should_stop)
-            print_evidence(terminal, opened, extrinsic)
+            extrinsic = None
+            if resume and claimed.odometry_is_finished():  # nothing is asked of its mounting any more
+                terminal.print_evidence(opened.info, opened.info.evidence)
+            else:
+                extrinsic = find_mounting(terminal, opened, run_config.odometry, should_stop)
+                print_evidence(terminal, opened, extrinsic)
             with terminal.progress() as progress:
                 result = run_slam(
                     opened,

@@ -19,6 +19,7 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import plane_directions, plane_normals
 
 _SCANS, _MOST_POINTS = 10, 5000
@@ -52,7 +53,7 @@ def tilted_plane(
     std = 0.5 * float(np.arccos(np.clip(ups[1] @ ups[2], -1.0, 1.0)))
     tilts = []
     for k in np.unique(np.linspace(0, len(scans) - 1, _SCANS).astype(int)):
-        middle_ns = np.array([(scans[k].start_ns + scans[k].end_ns) // 2])
+        middle_ns = np.array([middle_of(scans[k])])
         R_first_lidar = attitude.at(middle_ns)[0] @ R_imu_lidar
         tilts += _tilts(scans[k], R_first_lidar.T @ ups[0], config)
     if len(tilts) < _FEWEST_SCANS:
@@ -86,7 +87,7 @@ def untilted_plane(scans: Sequence[Scan], imu: ImuSamples, config: RegistrationC
         found = _main_plane(scans[k], config)
         if found is not None:
             axes.append(found if not axes or found @ axes[0] > 0.0 else -found)
-            times_ns.append((scans[k].start_ns + scans[k].end_ns) // 2)
+            times_ns.append(middle_of(scans[k]))
     if len(axes) < _FEWEST_OF_TILT:
         return None
     seen = _spread(float(np.linalg.norm(np.mean(axes, axis=0))))

@@ -21,6 +21,7 @@ from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 
 _SCANS, _MOST_MAP_POINTS, _MOST_POINTS = 12, 5000, 4000
 _NEIGHBOURS = 15
@@ -135,7 +136,7 @@ def _up(path: LidarPath, imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> t
 
 def _normals(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> NDArray[np.float64]:
     """(N, 3) normals where the surroundings are plane, by several scans together."""
-    middle_ns = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans])
+    middle_ns = np.array([middle_of(scan) for scan in scans])
     chosen = np.unique(np.linspace(0, len(path) - 1, _SCANS).astype(int))
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)

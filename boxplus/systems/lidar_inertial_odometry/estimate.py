@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import signed
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.nav_state import NavState
 
@@ -55,7 +56,7 @@ class WeakDirection:
         parts = []
         for name, vector, frame in (("position", self.translation_world, "world"), ("rotation", self.rotation_imu, "IMU")):
             if np.linalg.norm(vector) > _PART:
-                parts.append(f"{name} along ({vector[0]:+.2f}, {vector[1]:+.2f}, {vector[2]:+.2f}) in the {frame} frame")
+                parts.append(f"{name} along {signed(vector, 2)} in the {frame} frame")
         return " with ".join(parts)
 
 

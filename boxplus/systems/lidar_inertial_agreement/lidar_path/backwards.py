@@ -13,13 +13,12 @@ import numpy as np
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import (
-    middle_of,
     one_motion,
     other_explains_better,
     scans_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 
 _ABOUT_THE_SAME = 0.1, 0.5  # rad and m: drift over some seconds
 

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, nodes_within, thinned, undistorted
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
+    Turning,
+    middle_of,
+    nodes_within,
+    thinned,
+    undistorted,
+)
 
 MOST_COMPARED = 32000  # points of a scan: with fewer of them, others are left from scan to scan, even at rest
 _MOST_RAW = 8000
@@ -74,14 +80,14 @@ def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
 def _still(scan: Scan, turning: Turning, most: int) -> _Still:
     """Points (N, 3) [m] without the turning within the scan, and their times (N,) since its middle [s]."""
     scan = thinned(scan, most)
-    middle = (scan.start_ns + scan.end_ns) // 2
+    middle = middle_of(scan)
     p = undistorted(scan, nodes_within(scan, middle, np.zeros(3), np.zeros(3), turning), middle)
     return p.astype(np.float64), np.asarray((scan.time_ns - middle) * 1e-9, np.float64)
 
 
 def both_scans(first: Scan, second: Scan, turning: Turning, most: int = _MOST_RAW) -> tuple[_Still, _Still, float]:
     """Two scans without their turning, along the axes in the middle of the first, and the seconds between their middles."""
-    middles = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in (first, second)])
+    middles = np.array([middle_of(first), middle_of(second)])
     R = turning(middles)
     after, since_after = _still(second, turning, most)
     return _still(first, turning, most), (after @ (R[0].T @ R[1]).T, since_after), float(middles[1] - middles[0]) * 1e-9

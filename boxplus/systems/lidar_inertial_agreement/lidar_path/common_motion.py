@@ -18,31 +18,34 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import signed
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
-    ChangedPoints,
-    changed_points,
-)
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest, stay_and_go
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
+from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import (
+    ASIDE_M,
+    FASTEST_M_S,
+    FEWEST_SCANS,
+    shows_rest,
+    stay_and_go,
+)
 
-FEWEST_SCANS = 6
 _PAIRS = 0, 2, 4  # first scans of those that vote
 _MOST_VOTERS = 800
 _CLOSE_M = 0.15  # from one of them, a point is there again where the motion is nearly right
 _WELL_M, _WELL_SHARE = 0.08, 0.1  # that a motion is off in the median, where it explains what changes
 _LEVEL_M = 0.5  # that two points differ in height which vote: rings are sparse
 _CELL_M, _MOST_CELLS, _CANDIDATES, _ROUNDS = 0.2, 400, 16, 4
-_SLOWEST_M_S, _SLOWEST_M, _FASTEST_M_S = 8.0, 0.6, 36.0  # slower, or by less, registrations find the way; no mapped car is faster
+_SLOWEST_M_S, _SLOWEST_M = 8.0, 0.6  # slower, or by less, registrations find the way
 _FEWEST_MATCHED, _LEAST_SHARE = 60, 0.08  # of the points that changed; in woods, turning, another motion had 0.04
 _FEWEST_AGAIN = 5
 _SECTORS, _LEAST_AROUND, _A_FEW = 12, 7, 3  # of a full turn, and points in each
 _ELSEWHERE, _ELSEWHERE_M = 0.5, 1.5  # of a shift, and metres at least: bushes are as large
 _BY_CHANCE = 0.45  # of the matches, on average; on highways and in streets up to 0.42, in rain and noise at rest from 0.68 on
 _APART_M, _ANOTHER = 0.5, 0.8  # a shift that is another one, and its share of the matches
-_LANES_M, _BEYOND = 6.0, 0.6  # aside: where the traffic next to a platform is, and the share of the matches beyond it
+_BEYOND = 0.6  # share of the matches beyond where the traffic next to a platform is
 _PLACE_M, _FEWEST_PLACES = 2.0, 70  # beyond it: at rest among traffic up to 46, in streets from 75 on
 _MOST_GOING = 20  # points that may seem to go by at rest: what goes by tells of a motion, whatever keeps pace with it
 _STAYING, _FEWEST_STAYING = 0.35, 20  # of those that go by the common motion, and at least; on drives up to 0.26
@@ -91,7 +94,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     if len(scans) < FEWEST_SCANS:
         return None
     level = np.eye(3) - np.outer(up_lidar, up_lidar)
-    R = turning(np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans]))
+    R = turning(np.array([middle_of(scan) for scan in scans]))
     R_first = np.swapaxes(R[:1], 1, 2) @ R
     first = {k: _pair(scans, k, turning, R_first[k]) for k in _PAIRS}
     voting = list(first.values())
@@ -99,7 +102,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     if not candidates:
         return None
     velocity, matched = max(candidates, key=lambda candidate: candidate[1])
-    if not _slowest(voting) < np.linalg.norm(velocity) < _FASTEST_M_S or not _believed(voting, velocity):
+    if not _slowest(voting) < np.linalg.norm(velocity) < FASTEST_M_S or not _believed(voting, velocity):
         return None
     own = [(R.T @ velocity, R.T @ up_lidar) for R in R_first]
     counts = [stay_and_go((scans[k], scans[k + 1]), turning, *own[k]) for k in _PAIRS]
@@ -112,7 +115,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
         doubt = f"of what stands on the ground, {stay} points stay and {go} go by, as at {np.linalg.norm(velocity):.0f} m/s"
     for other, also in candidates:
         if also > _ANOTHER * matched and float(np.linalg.norm(other - velocity)) * voting[0].seconds > _APART_M:
-            doubt = doubt or f"what changes fits {_text(other)} m/s (LiDAR axes) about as well as {_text(velocity)} m/s"
+            doubt = doubt or f"what changes fits {signed(other, 1)} m/s (LiDAR axes) about as well as {signed(velocity, 1)} m/s"
     pairs = [first.get(k) or _pair(scans, k, turning, R_first[k]) for k in range(len(scans) - 1)]
     return CommonMotion(pairs, R_first, velocity, level, doubt)
 
@@ -131,15 +134,15 @@ def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: 
     """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not."""
     along = velocity / np.linalg.norm(velocity)
     aside = np.cross(up, along)
-    matched = np.concatenate([pair.p_after[again] for pair, again in zip(pairs, _again(pairs, velocity), strict=True)])
+    matched = np.concatenate(_again(pairs, velocity))
     across = matched @ aside
-    far = np.abs(across) > _LANES_M
+    far = np.abs(across) > ASIDE_M
     places = np.unique(np.round(np.stack([across, matched @ along])[:, far] / _PLACE_M), axis=1).shape[1]
     beyond = float(far.mean())
     if beyond >= _BEYOND or places >= _FEWEST_PLACES:
         return ""
     return (
-        f"{1.0 - beyond:.0%} of what goes by as at {np.linalg.norm(velocity):.0f} m/s lies within {_LANES_M:.0f} m of the way, "
+        f"{1.0 - beyond:.0%} of what goes by as at {np.linalg.norm(velocity):.0f} m/s lies within {ASIDE_M:.0f} m of the way, "
         "where traffic beside a platform at rest would be"
     )
 
@@ -175,7 +178,7 @@ def _voted(pairs: Sequence[ChangedPoints], level: NDArray[np.float64]) -> list[N
         apart = (pair.p_before[i][:, None] - pair.p_after[j][None]).reshape(-1, 3)
         flat = apart @ level
         length, height = np.linalg.norm(flat, axis=1), np.linalg.norm(apart - flat, axis=1)
-        near = (seconds > 0.0) & (length < _FASTEST_M_S * seconds) & (height < _LEVEL_M)
+        near = (seconds > 0.0) & (length < FASTEST_M_S * seconds) & (height < _LEVEL_M)
         votes.append(flat[near] / seconds[near, None])
     cell = _CELL_M / pairs[0].seconds
     cells, counts = np.unique(np.round(np.concatenate(votes) / cell), axis=0, return_counts=True)
@@ -212,9 +215,10 @@ def _settled(pair: ChangedPoints, velocity: NDArray[np.float64]) -> NDArray[np.f
 
 def _believed(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> bool:
     """Whether a velocity (3,), or one a pair (n, 3), explains enough, all around, and better than by chance."""
-    matched = _matched(pairs, velocity)
+    again = _again(pairs, velocity)
+    matched = sum(map(len, again))
     enough = max(_FEWEST_MATCHED, _LEAST_SHARE * sum(len(pair.p_after) for pair in pairs))
-    if matched < enough or _around(pairs, velocity) < _LEAST_AROUND:
+    if matched < enough or _around(again) < _LEAST_AROUND:
         return False
     speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
     away = velocity * np.maximum(_ELSEWHERE, _ELSEWHERE_M / pairs[0].seconds / np.maximum(speed, 1e-9))
@@ -222,22 +226,22 @@ def _believed(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> 
     return bool(by_chance <= _BY_CHANCE * matched)
 
 
-def _again(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
+def _again(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The later points of every pair (m, 3) that are there again at a velocity (3,), or one a pair (n, 3)."""
     velocities = np.broadcast_to(velocity, (len(pairs), 3))
-    return [pair.shifts(own)[0] for pair, own in zip(pairs, velocities, strict=True)]
+    return [pair.p_after[pair.shifts(own)[0]] for pair, own in zip(pairs, velocities, strict=True)]
 
 
 def _matched(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> int:
     """How many points are there again."""
-    return sum(int(again.sum()) for again in _again(pairs, velocity))
+    return sum(map(len, _again(pairs, velocity)))
 
 
-def _around(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64]) -> int:
+def _around(again: Sequence[NDArray[np.float64]]) -> int:
     """In how many of twelve sectors around the LiDAR a few points are there again, in its plane or, if it is tilted, theirs."""
-    matched = [pair.p_after[again] for pair, again in zip(pairs, _again(pairs, velocity), strict=True)]
-    towards = np.concatenate(matched)
+    towards = np.concatenate(again)
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-    return max(_sectors(matched, plane) for plane in (np.eye(3)[:, :2], np.linalg.eigh(towards.T @ towards)[1][:, 1:]))
+    return max(_sectors(again, plane) for plane in (np.eye(3)[:, :2], np.linalg.eigh(towards.T @ towards)[1][:, 1:]))
 
 
 def _sectors(matched: Sequence[NDArray[np.float64]], plane: NDArray[np.float64]) -> int:
@@ -248,7 +252,3 @@ def _sectors(matched: Sequence[NDArray[np.float64]], plane: NDArray[np.float64])
         sector = ((np.arctan2(aside, ahead) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
         found |= set(np.flatnonzero(np.bincount(sector, minlength=_SECTORS) >= _A_FEW).tolist())
     return len(found)
-
-
-def _text(velocity: NDArray[np.float64]) -> str:
-    return "(" + ", ".join(f"{value:+.1f}" for value in velocity) + ")"

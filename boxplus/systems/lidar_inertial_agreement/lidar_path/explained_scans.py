@@ -23,7 +23,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import explains_changes
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Poses, Twist
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface_distances
 
 _WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, paths that ride with a pattern 1.6 to 6
@@ -97,11 +97,6 @@ def scans_of(time_ns: NDArray[np.int64], scans: Sequence[Scan]) -> list[Scan]:
     """The scans whose middles are at `time_ns` (K,)."""
     middles = {middle_of(scan): scan for scan in scans}
     return [middles[time] for time in time_ns.tolist()]
-
-
-def middle_of(scan: Scan) -> int:
-    """When a path has its pose [ns]."""
-    return (scan.start_ns + scan.end_ns) // 2
 
 
 def other_explains_better(scans: Sequence[Scan], own: Poses, other: Poses, config: RegistrationConfig) -> bool:

@@ -29,6 +29,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     Turning,
     align,
     honest_information,
+    middle_of,
     nodes_within,
     thinned,
     undistorted,
@@ -203,7 +204,7 @@ class LidarMotion:
             return
         self._lasted_s.append((scan.end_ns - scan.start_ns) * 1e-9)
         scan = thinned(scan, MOST_RAW)
-        middle_ns = (scan.start_ns + scan.end_ns) // 2
+        middle_ns = middle_of(scan)
         if self._previous_ns is None:
             self._begin(scan, middle_ns)
             return
@@ -269,7 +270,7 @@ class LidarMotion:
     def _map_of(self, first: Scan, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> IkdTree:
         """The map that a first scan makes for a LiDAR that moves like this."""
         tree = IkdTree(cell_size=self._config.map_cell, rebuild="inplace")
-        first_ns = (first.start_ns + first.end_ns) // 2
+        first_ns = middle_of(first)
         still = undistorted(first, self._nodes(first, first_ns, rate, velocity), first_ns)
         tree.insert(self._map_filter(still)[1].astype(np.float64), downsample=True)
         return tree

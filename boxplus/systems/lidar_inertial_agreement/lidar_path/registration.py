@@ -111,6 +111,11 @@ def with_held(information: NDArray[np.float64], axis: NDArray[np.float64]) -> ND
     return held
 
 
+def middle_of(scan: Scan) -> int:
+    """When a path has its pose of a scan [ns]."""
+    return (scan.start_ns + scan.end_ns) // 2
+
+
 def thinned(scan: Scan, most: int) -> Scan:
     """Every n-th point, so that at most `most` stay."""
     stride = -(-len(scan) // most)

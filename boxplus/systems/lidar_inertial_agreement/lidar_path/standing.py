@@ -23,14 +23,14 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, thinned
 
-_ASIDE_M = 6.0  # of the way; nearer to it are the platform's own parts, and vehicles that keep pace with it
+ASIDE_M = 6.0  # of the way; nearer to it are the platform's own parts, and vehicles that keep pace with it
 _UPRIGHT_M, _SHORT_M = 0.1, 0.25  # standard deviations of what stands, upwards and along the way
 _FREE_FROM_M, _FREE_TO_M, _FREE_M = 0.8, 3.0, 0.35  # nothing else is there along the way, this near to the line along it
-_FASTEST_M_S = 36.0  # what stands at equal distances is the same from scan to scan where it goes by one of them
+FASTEST_M_S = 36.0  # no mapped car is faster; what stands at equal distances looks the same where it goes by one of them
 _UNMOVED_M = 0.15
 _FEWEST_UNMOVED, _LEAST_UNMOVED = 60, 0.3  # points, and their share of what stands
 _PLACE_M, _FEWEST_PLACES, _FEWEST_A_SIDE = 4.0, 6, 2  # on the ground, in all and on either side of the way
-_FEWEST_SCANS, _LEAST_SPAN_S = 6, 0.8
+FEWEST_SCANS, _LEAST_SPAN_S = 6, 0.8
 
 
 def stay_and_go(
@@ -61,9 +61,9 @@ def shows_rest(scans: Sequence[Scan], axis: NDArray[np.float64], up: NDArray[np.
         axis, up: (3,) unit vectors, along its axes: the way along which rest is asked for, across the vertical.
     """
     seconds = (scans[-1].start_ns - scans[0].start_ns) * 1e-9
-    if len(scans) < _FEWEST_SCANS or seconds < _LEAST_SPAN_S:
+    if len(scans) < FEWEST_SCANS or seconds < _LEAST_SPAN_S:
         return False
-    reach = max(_FREE_TO_M, _FASTEST_M_S * seconds / (len(scans) - 1) + _FREE_M)
+    reach = max(_FREE_TO_M, FASTEST_M_S * seconds / (len(scans) - 1) + _FREE_M)
     on_ground = np.stack([axis, np.cross(up, axis)], axis=1)
     last = len(scans) - 1
     first, *later = (thinned(scans[k], MOST_COMPARED).p_lidar.astype(np.float64) for k in (0, (last + 1) // 2, last - 1, last))
@@ -84,7 +84,7 @@ def _standing(
     """Which points (N,) are of something upright that is short along an axis (3,), with nothing like it along that, in reach."""
     neighbours = tree_of(p).nearest(p, NEIGHBOURS).points
     standing = np.isfinite(neighbours).all(axis=(1, 2)) & (np.linalg.norm(p, axis=1) < FAR_M)
-    standing &= np.abs(p @ np.cross(up, axis)) > _ASIDE_M
+    standing &= np.abs(p @ np.cross(up, axis)) > ASIDE_M
     standing[standing] = np.linalg.norm(neighbours[standing, -1] - p[standing], axis=1) < NEAR_M
     spread = neighbours[standing]
     standing[standing] = ((spread @ up).std(axis=1) > _UPRIGHT_M) & ((spread @ axis).std(axis=1) < _SHORT_M)

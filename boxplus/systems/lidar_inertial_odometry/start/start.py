@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import signed
 from boxplus.errors import InputError
 from boxplus.filtering.nav_state import T_V, NavState
 from boxplus.sensors.imu import ImuSamples
@@ -149,17 +150,26 @@ def _common_motion(seen: Beginning, path: LidarPath) -> _Common | None:
 
 def _with_standing_things(seen: Beginning, path: LidarPath, rest: Rest, in_motion: bool) -> Rest:
     """Rest, by what stands on the ground too: open axes that it closes, or one where much changes and little stays."""
+    if not rest.determined:
+        return replace(rest, open_axes=np.array([axis for axis in rest.open_axes if not _stands(seen, axis)]).reshape(-1, 3))
+    if in_motion or len(path) < 2 or well_known(path) or not seen.guesses:
+        return rest
+    least = least_known_axis(path)
+    if not _is_level(seen, least):
+        return rest
+    pairs = pairwise(seen.scans[: _COMPARED + 1])
+    changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
+    in_doubt = _CHANGING < changing < _OTHER_RAYS and not _stands(seen, least)
+    return replace(rest, open_axes=least[None]) if in_doubt else rest
 
-    def shown(axis: NDArray[np.float64]) -> bool:
-        return bool(abs(axis @ seen.up_lidar) < _UPRIGHT) and shows_rest(seen.scans, axis, seen.up_lidar)
 
-    axes = [axis for axis in rest.open_axes if not shown(axis)]
-    if rest.determined and not in_motion and len(path) > 1 and not well_known(path) and seen.guesses:
-        least, pairs = least_known_axis(path), pairwise(seen.scans[: _COMPARED + 1])
-        changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
-        is_level = bool(abs(least @ seen.up_lidar) < _UPRIGHT)
-        axes = [least] if _CHANGING < changing < _OTHER_RAYS and is_level and not shown(least) else []
-    return replace(rest, open_axes=np.array(axes).reshape(-1, 3))
+def _stands(seen: Beginning, axis: NDArray[np.float64]) -> bool:
+    """Whether what stands on the ground shows rest along an axis (3,) of the LiDAR, across the vertical."""
+    return _is_level(seen, axis) and shows_rest(seen.scans, axis, seen.up_lidar)
+
+
+def _is_level(seen: Beginning, axis: NDArray[np.float64]) -> bool:
+    return bool(abs(axis @ seen.up_lidar) < _UPRIGHT)
 
 
 def _held_path(seen: Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
@@ -327,7 +337,7 @@ def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.floa
     if sigma > _UNKNOWN_SPEED:
         axis = (state.R_world_imu @ seen.extrinsic.R_imu_lidar).T @ axes[:, -1]
         raise seen.not_moving(
-            f"the surroundings do not show how fast the platform moves along {_axis_text(axis)} (LiDAR axes): {sigma:.0f} m/s "
+            f"the surroundings do not show how fast the platform moves along {signed(axis, 2)} (LiDAR axes): {sigma:.0f} m/s "
             "more or less"
         )
     return sigma
@@ -344,11 +354,7 @@ def _undecided(axes: NDArray[np.float64]) -> str:
         return ""
     return (
         "the surroundings do not show whether the platform moves along "
-        f"{' and '.join(_axis_text(axis) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
+        f"{' and '.join(signed(axis, 2) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
         "at a constant speed it would be as quiet, so the position along it is called weak and its standard deviation grows by "
         "10 m/s until something shows the speed"
     )
-
-
-def _axis_text(axis: NDArray[np.float64]) -> str:
-    return "(" + ", ".join(f"{value:+.2f}" for value in axis) + ")"
