@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.scan import Scan
@@ -23,6 +23,9 @@ FAR_M = 60.0  # beyond it neighbouring rays are metres apart
 NEIGHBOURS, NEAR_M, _THICKEST_M, _FLAT = 8, 1.0, 0.06, 0.05
 _SAME_M = 0.3  # from one of them, a point is there again
 _FEWEST_ALL = 5
+_ALONE_M = 0.5  # farther from all others of its scan, a point is rain, dust or a mixed pixel
+_REPEATED, _SAMPLED = 0.75, 1000  # of the distance of neighbouring rays; rosettes 2 and more
+_CLOSE_RAD = 0.005  # a ray passes a point
 
 _Still = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -66,15 +69,50 @@ def changed_points(first: Scan, second: Scan, turning: Turning) -> ChangedPoints
 
 
 def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
-    """The share of the second scan's points that the first has nothing of: none at rest where nothing moves.
+    """The share of the second scan's points that the first has nothing of: about none at rest where nothing moves.
+
+    A LiDAR that draws other lines in every scan (rosettes) sees for the first time what was there before: of its points those
+    count which rays of the first scan passed closely, and went on. None counts that is alone in its own scan, as rain, dust and
+    mixed pixels are.
 
     Args:
         first, second: in order of time.
         turning: how the LiDAR turned.
     """
-    (before, _), (after, _), _ = both_scans(first, second, turning, MOST_COMPARED)
-    after = after[:: max(-(-len(after) // _MOST_RAW), 1)]
-    return float(_unexplained(after, before).mean()) if len(before) and len(after) else 0.0
+    (before, _), (every, _), _ = both_scans(first, second, turning, MOST_COMPARED)
+    if min(len(before), len(every)) < NEIGHBOURS:
+        return 0.0
+    after = every[:: -(-len(every) // _MOST_RAW)]
+    changed = after[_unexplained(after, before)]
+    changed = changed[tree_of(every).nearest(changed, 2).distances[:, 1] < _ALONE_M]
+    if not _rays_repeat(first, second):
+        changed = changed[_passed_by(changed, before)]
+    return len(changed) / len(after)
+
+
+def _rays_repeat(first: Scan, second: Scan) -> bool:
+    """Whether two scans look in the same directions: those of the second lie nearer to the first's than to one another."""
+    tree, other = tree_of(_rays(first.p_lidar)[0]), _rays(second.p_lidar)[0]
+    some = other[:: max(len(other) // _SAMPLED, 1)]
+    own = tree_of(other).nearest(some, 2).distances[:, 1]
+    return bool(np.median(tree.nearest(some, 1).distances) < _REPEATED * np.median(own))
+
+
+def _passed_by(p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie where rays of another scan, next to them, went on to something clearly farther, as (N,)."""
+    from scipy.spatial import KDTree  # takes a third of a second to import
+
+    rays, ranges = _rays(other)
+    towards, far = _rays(p)
+    apart, which = KDTree(rays).query(towards, NEIGHBOURS)
+    return np.asarray((far < ranges[which].min(axis=1) - _SAME_M) & (apart[:, 0] < _CLOSE_RAD))
+
+
+def _rays(p: ArrayLike) -> _Still:
+    """Directions (N, 3) and distances (N,)."""
+    p = np.asarray(p, np.float64)
+    distance = np.maximum(np.linalg.norm(p, axis=1), 1e-9)
+    return p / distance[:, None], distance
 
 
 def _still(scan: Scan, turning: Turning, most: int) -> _Still:

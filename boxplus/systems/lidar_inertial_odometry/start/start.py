@@ -46,7 +46,7 @@ _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _UPRIGHT = 0.9  # cosine
 _COMPARED = 3  # pairs of scans
-_CHANGING, _OTHER_RAYS = 0.003, 0.35  # share of points that change: at rest, none and of a rosette 0.39; on drives up to 0.23
+_CHANGING = 0.0025  # share of points that change, of a rosette at rest too; on drives 0.003 and more
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
@@ -159,7 +159,7 @@ def _with_standing_things(seen: Beginning, path: LidarPath, rest: Rest, in_motio
         return rest
     pairs = pairwise(seen.scans[: _COMPARED + 1])
     changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
-    in_doubt = _CHANGING < changing < _OTHER_RAYS and not _stands(seen, least)
+    in_doubt = changing > _CHANGING and not _stands(seen, least)
     return replace(rest, open_axes=least[None]) if in_doubt else rest
 
 
